@@ -108,7 +108,8 @@ def compared(folder: Path, name: str, kinds: list[str], live: int) -> dict:
     def log_likelihood(values: np.ndarray) -> float:
         nonlocal calls
         calls += 1
-        found = misfit.predicted(misfit.predictions.group, labels, values[None], slopes=False)
+        predictions = misfit.predictions
+        found = predictions.of(predictions.group.at(labels, values)[None])
         rows = misfit.noise.noise_units(found.columns)
         square = misfit.chi_square(rows[0])
         return -0.5 * square if np.isfinite(square) else -1e100

@@ -75,7 +75,9 @@ SUB_ROOMS = {
     "diagnose.checks": {
         *("diagnose.misfit", "diagnose.search", "diagnose.priors", "diagnose.evidence"),
     },
-    "diagnose.laws": {"diagnose.misfit", "diagnose.search", "diagnose.checks"},
+    "diagnose.laws": {
+        *("diagnose.misfit", "diagnose.search", "diagnose.checks", "diagnose.priors"),
+    },
     "io.calculix": {"io.files", "io.reduction"},
     "io.laboratory": {"io.files", "io.units"},
     "io.exchange": {
@@ -99,7 +101,7 @@ SUB_ROOMS = {
     "io.reduction": {
         *("io.columns", "io.files", "io.rows", "io.tables", "io.toml_table", "io.units"),
     },
-    "diagnose.design": {"diagnose.misfit", "diagnose.search"},
+    "diagnose.design": {"diagnose.misfit", "diagnose.search", "diagnose.priors"},
     "condense.elements": {"condense.load_cases"},
     # A study is made of computations, which know nothing of where and how often they run.
     "study.computations": set(),

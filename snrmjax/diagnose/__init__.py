@@ -9,7 +9,7 @@
    law. They say how an error of amplitude moves the force, by how much levels differ, and the noise
    where none is stated (`misfit.reference`). Every hypothesis is weighed by these alike
    (`misfit.weighted_misfit`); errors of levels and of the model's own parameters are shared rows.
-   Fits begin at the records without the errors that these curves find (`misfit.corrected_records`).
+   Fits begin at the records without the errors that these curves find (`misfit.effect_fit`).
 4. `search.model_search.find_effects` fits effects alone, in pairs and in threes. `answers` compares
    the likeliest, and nothing at all, each with the records that are corrected for the errors that
    it finds in them itself, until nothing moves; with many harmonics for kinks and slip; and with

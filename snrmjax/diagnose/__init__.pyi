@@ -1,8 +1,7 @@
-from .completed_model import CompletedStatus
 from .decide import Verdict
 from .design.discriminating_test import DiscriminatingTest
 from .diagnosis import diagnose_model
-from .diagnosis_result import Answer, Diagnosis, Estimate
+from .diagnosis_result import Answer, CompletedStatus, Diagnosis, Estimate
 from .response_prediction import LevelPredictions, LevelResponse, predict_levels
 
 __all__ = [

@@ -6,19 +6,14 @@ from typing import NamedTuple
 import numpy as np
 
 from snrmjax.diagnose import evidence, priors
-from snrmjax.diagnose.checks.cross_validation import rms_misfit
-from snrmjax.diagnose.checks.patterns import neighbour_noise
+from snrmjax.diagnose.checks.residuals import neighbour_noise, rms_misfit
 from snrmjax.diagnose.decide import most_probable
-from snrmjax.diagnose.misfit.corrected_records import (
-    already_added,
-    likely_errors,
-    with_harmonics,
-    without_errors,
-)
 from snrmjax.diagnose.misfit.effect_fit import (
     EffectFit,
     at_phases_of,
     baseline_fit,
+    likely_errors,
+    without_errors,
 )
 from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
 from snrmjax.diagnose.misfit.predictions import Predictions
@@ -34,10 +29,7 @@ from snrmjax.model.effects import EFFECTS
 
 _NEAR_ANSWERS, _NEAREST_ANSWERS = 12, 4  # whose effects are looked for again
 _WITHOUT_LAST_HARMONIC = (AbstractKinked, AbstractHysteresis)
-_ROUNDS, _NEAR = 3, 0.8  # in search of unstated noise: at most, and share of it that is as much
-_CORRECTIONS = 6  # of the records, at most
-_STRAIGHT = 0.003  # relative or rad, within which the misfit is straight
-_BETTER = 0.9  # share of χ² that is left with many harmonics
+_NEAR = 0.8  # share of noise that is as much
 
 
 class Answered(NamedTuple):
@@ -75,10 +67,6 @@ class Search(NamedTuple):
         near = {kind for kinds in answers for kind in kinds}
         return self._replace(kinds=tuple(kind for kind in self.kinds if kind in near))
 
-    def found(self, misfit: WeightedMisfit) -> FoundEffects:
-        """The effects that explain a misfit."""
-        return find_effects(misfit, self.scales, self.kinds, self.further_starts)
-
     def answered(self, predictions: Predictions) -> Answered:
         """What is missing; where no noise is stated, with noise as large as what is left.
 
@@ -89,14 +77,14 @@ class Search(NamedTuple):
         stated, reference = predictions.chosen.noise_stated, predictions.reference
         if not stated:
             alone = baseline_fit(misfit)
-            least = float(np.sqrt(neighbour_noise(at_phases_of(misfit, alone), alone).variance))
+            least = float(np.sqrt(neighbour_noise(at_phases_of(misfit, alone), alone)))
             size = least
             if reference is not None:
                 size = reference.posterior.hyper.noise / ASSUMED_ERROR
             least = min(least, size)
             misfit = weighted_misfit(predictions.with_errors_scaled(size / predictions.error_scale))
-        found, winner = self.found(misfit), None
-        for _ in range(0 if stated else _ROUNDS):
+        found, winner = find_effects(misfit, *self[:3]), None
+        for _ in range(0 if stated else 3):
             winner = self.refined(found.misfit, found.fit)
             factor = max(rms_misfit(*winner), least / misfit.predictions.error_scale)
             if _NEAR < factor < 1 / _NEAR:
@@ -104,7 +92,7 @@ class Search(NamedTuple):
             misfit = weighted_misfit(misfit.predictions.with_errors_scaled(factor))
             # Smaller noise may need effects that larger noise hid; larger noise needs no others.
             search = self.near(found) if factor > 1 else self
-            found, winner = search.found(misfit), None
+            found, winner = find_effects(misfit, *search[:3]), None
         best = found.fit
 
         def refined(misfit: WeightedMisfit, fit: EffectFit) -> tuple[WeightedMisfit, EffectFit]:
@@ -120,9 +108,11 @@ class Search(NamedTuple):
         curves may miss a kink.
         """
         found = self._corrected(misfit, fit)
-        if found is not None and is_noise(*found):
-            return found
-        none = np.zeros_like(already_added(misfit.predictions))
+        if found is not None:
+            freedom = found[0].n_rows - len(found[1].values)
+            if chi_square_p_value(found[1].chi_square, freedom) > priors.REJECTED:
+                return found
+        none = np.zeros_like(misfit.predictions.added)
         plain = without_errors(misfit, fit, self.data, none)
         other = self._corrected(plain, refitted(plain, self.scales, fit))
         both = [pair for pair in (found, other) if pair is not None]
@@ -132,15 +122,15 @@ class Search(NamedTuple):
         self, misfit: WeightedMisfit, fit: EffectFit
     ) -> tuple[WeightedMisfit, EffectFit] | None:
         """The fit where nothing moves any more; None where no errors explain the records."""
-        moved = np.inf
-        for _ in range(_CORRECTIONS):
+        moved, straight = np.inf, 0.003  # relative or rad
+        for _ in range(6):
             if not np.isfinite(fit.chi_square):
                 return None
             added = likely_errors(misfit, fit.rows)
             if np.max(np.abs(added), initial=0.0) > priors.FARTHEST_ERROR:
                 return None
-            moved = np.max(np.abs(added - already_added(misfit.predictions)), initial=0.0)
-            if moved < _STRAIGHT:
+            moved = np.max(np.abs(added - misfit.predictions.added), initial=0.0)
+            if moved < straight:
                 return misfit, fit
             misfit = without_errors(misfit, fit, self.data, added)
             fit = refitted(misfit, self.scales, fit)
@@ -155,7 +145,8 @@ def best_answer(search: Search, predictions: Predictions) -> Answered:
     answered = search.answered(predictions)
     answered = with_more_harmonics(answered, search.among(answered, _NEAREST_ANSWERS))
     alike = any(EFFECTS[kind].is_linear for kind in answered.found.fit.kinds)
-    if not (alike or leaves_more_than_noise(answered)) or not levels_may_differ(predictions):
+    stated = all(std > 0 for std in predictions.given.level_stds)
+    if stated or predictions.reference is None or not (alike or leaves_more_than_noise(answered)):
         return answered
     now = (answered.coarse or answered.found).misfit.predictions
     near = search.among(answered, _NEAR_ANSWERS)
@@ -177,17 +168,12 @@ def with_more_harmonics(answered: Answered, search: Search) -> Answered:
     stated = found.misfit.predictions.chosen.noise_stated
     if not kinked or (stated and not leaves_more_than_noise(answered)):
         return answered
-    many = with_harmonics(found.misfit.predictions, search.data, MANY_HARMONICS)
+    now = found.misfit.predictions
+    many = now.of_records(search.data, now.added, MANY_HARMONICS)
     winner = refitted(weighted_misfit(many), search.scales, found.fit)
-    if winner.chi_square > _BETTER * found.fit.chi_square:
+    if winner.chi_square > 0.9 * found.fit.chi_square:
         return answered
     return search.answered(many)._replace(coarse=found)
-
-
-def is_noise(misfit: WeightedMisfit, fit: EffectFit) -> bool:
-    """Whether a fit leaves no more than the noise is taken to be."""
-    freedom = misfit.n_rows - len(fit.values)
-    return chi_square_p_value(fit.chi_square, freedom) > priors.REJECTED
 
 
 def leaves_more_than_noise(answered: Answered) -> bool:
@@ -197,9 +183,3 @@ def leaves_more_than_noise(answered: Answered) -> bool:
         return answered.found.p_value < priors.REJECTED
     size = ASSUMED_ERROR * predictions.error_scale
     return bool(_NEAR * size > predictions.reference.posterior.hyper.noise)
-
-
-def levels_may_differ(predictions: Predictions) -> bool:
-    """Whether errors of levels that nobody stated, and smooth curves hide, may be in the way."""
-    stated = all(std > 0 for std in predictions.given.level_stds)
-    return predictions.reference is not None and not stated

@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from snrmjax.diagnose import priors
-from snrmjax.diagnose.checks.cross_validation import HeldOutLevels, missed_levels
 from snrmjax.diagnose.checks.doubts import (
+    WIDER,
     Doubt,
     acts_both_ways,
     doubts,
@@ -22,9 +22,8 @@ from snrmjax.diagnose.checks.doubts import (
     part_of,
     wider_than_measured,
 )
-from snrmjax.diagnose.checks.level_forces import LevelForces
-from snrmjax.diagnose.checks.patterns import left_curve, pattern
-from snrmjax.diagnose.checks.shared_gains import doubts_on_gains
+from snrmjax.diagnose.checks.gains import LevelForces, doubts_on_gains
+from snrmjax.diagnose.checks.residuals import HeldOutLevels, left_curve, missed_levels, pattern
 from snrmjax.diagnose.evidence import NOISE_REJECTED, NONE, UNKNOWN, Weights
 from snrmjax.diagnose.misfit.effect_fit import baseline_fit
 from snrmjax.diagnose.search.locating import Located, power_of_answer
@@ -162,11 +161,16 @@ def decide(
     structure = pattern(misfit, fit) if found.p_value < priors.REJECTED else None
     of_noise, outside = probabilities.get(NOISE_REJECTED, 0.0), probabilities.get(UNKNOWN, 0.0)
     if of_noise > 0.5 and structure is None:
-        return Judgement(Verdict.NOISE_REJECTED, (_of_noise(found),), (), probabilities)
+        times = float(np.sqrt(fit.chi_square / (misfit.n_rows - len(fit.values))))
+        size = "overstated" if times < 1 else "understated"
+        said = f"the misfit is {times:.2g} times the stated noise, without a pattern: it is {size}."
+        return Judgement(Verdict.NOISE_REJECTED, (said,), (), probabilities)
     if outside + (of_noise if structure is not None else 0.0) >= priors.NO_ANSWER:
         left = structure or left_curve(misfit, fit)
         reasons = ("no effect of the library explains what is left.", *([left] if left else []))
-        return Judgement(Verdict.UNKNOWN, reasons, (), _without_noise(probabilities))
+        # What is left has a pattern, and so is no noise of any size.
+        kept = {name: p for name, p in probabilities.items() if name != NOISE_REJECTED}
+        return Judgement(Verdict.UNKNOWN, reasons, (), _else_unknown(kept))
     if not fit.kinds:
         return Judgement(Verdict.NOTHING_MISSING, (), (), probabilities)
     every = imitations_of(found, located)
@@ -175,10 +179,21 @@ def decide(
     if rival is not None:
         every.append(rival.doubt)
     if not every and outside > priors.NO_DOUBT:
-        every.append(_outside(found, outside))
+        said = left_curve(misfit, fit) or "what is left is small, but smoother than noise."
+        every.append(
+            Doubt(
+                f"a law outside the library has a probability of {100 * outside:.0f} %: {said}",
+                WIDER,
+                identical=True,
+            )
+        )
     reasons = tuple(one.reason for one in every)
     if any(one.refutes for one in every):
-        return Judgement(Verdict.UNKNOWN, reasons, tuple(every), _refuted(probabilities))
+        kept = {
+            name: p if name in (NONE, NOISE_REJECTED) else priors.OPEN * p
+            for name, p in probabilities.items()
+        }
+        return Judgement(Verdict.UNKNOWN, reasons, tuple(every), _else_unknown(kept))
     unclear = every or any(len(group) > 1 for group in found.classes)
     verdict = Verdict.AMBIGUOUS if unclear else Verdict.NAMED
     return Judgement(verdict, reasons, tuple(every), probabilities)
@@ -206,40 +221,8 @@ def imitations_of(found: FoundEffects, located: tuple[Located, ...]) -> list[Dou
     )
 
 
-def _refuted(probabilities: Mapping[str, float]) -> dict[str, float]:
-    """Probabilities where the answers given are refuted: most of theirs is that of `unknown`."""
-    kept = {name: p for name, p in probabilities.items() if name in (NONE, NOISE_REJECTED)}
-    others = {
-        name: priors.OPEN * p
-        for name, p in probabilities.items()
-        if name not in (NONE, NOISE_REJECTED, UNKNOWN)
-    }
-    found = {**kept, **others}
+def _else_unknown(kept: Mapping[str, float]) -> dict[str, float]:
+    """Probabilities of answers that are kept; the rest is that of a law outside the library."""
+    found = {name: p for name, p in kept.items() if name != UNKNOWN}
     found[UNKNOWN] = 1.0 - sum(found.values())
     return dict(sorted(found.items(), key=lambda pair: -pair[1]))
-
-
-def _without_noise(probabilities: Mapping[str, float]) -> dict[str, float]:
-    """Probabilities where what is left has a pattern, and so is no noise of any size."""
-    found = {name: p for name, p in probabilities.items() if name != NOISE_REJECTED}
-    found[UNKNOWN] = 1.0 - sum(p for name, p in found.items() if name != UNKNOWN)
-    return dict(sorted(found.items(), key=lambda pair: -pair[1]))
-
-
-def _of_noise(found: FoundEffects) -> str:
-    """Why the noise is not as stated, in words."""
-    n = found.misfit.n_rows - len(found.fit.values)
-    times = float(np.sqrt(found.fit.chi_square / n))
-    size = "overstated" if times < 1 else "understated"
-    return f"the misfit is {times:.2g} times the stated noise, without a pattern: it is {size}."
-
-
-def _outside(found: FoundEffects, probability: float) -> Doubt:
-    """The doubt that a misfit leaves which is small, but smooth as that of another law."""
-    curve = left_curve(found.misfit, found.fit)
-    said = "what is left is small, but smoother than noise." if curve is None else curve
-    return Doubt(
-        f"a law outside the library has a probability of {100 * probability:.0f} %: {said}",
-        "widen the range of levels at both ends and record the second and third harmonics",
-        identical=True,
-    )

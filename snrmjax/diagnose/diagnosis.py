@@ -1,7 +1,6 @@
 """The whole diagnosis: locate the misfit, find effects that explain it, and check the answer."""
 
 import dataclasses
-from collections.abc import Mapping
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,48 +8,51 @@ from jaxtyping import Float
 
 from snrmjax.diagnose import priors
 from snrmjax.diagnose.answers import Search, best_answer
-from snrmjax.diagnose.checks.cross_validation import (
-    held_out_levels,
-    held_out_places,
-    rms_misfit,
-    without_level,
-)
-from snrmjax.diagnose.checks.level_forces import (
+from snrmjax.diagnose.checks.gains import (
+    gain_found,
     level_gains,
+    notes_on_found_mass,
     notes_on_level_forces,
+    notes_on_stated_parameters,
     suspected_level_forces,
     with_forces_that_acted,
 )
-from snrmjax.diagnose.checks.patterns import neighbour_noise, tolerated
-from snrmjax.diagnose.checks.shared_gains import (
-    gain_found,
-    notes_on_found_mass,
-    notes_on_stated_parameters,
+from snrmjax.diagnose.checks.residuals import (
+    held_out_levels,
+    held_out_places,
+    neighbour_noise,
+    rms_misfit,
+    tolerated,
+    without_level,
 )
-from snrmjax.diagnose.completed_model import CompletedModel, CompletedStatus, completed_model
 from snrmjax.diagnose.decide import Verdict, decide, imitations_of
-from snrmjax.diagnose.design.recommendation import recommendation, recommended_test
+from snrmjax.diagnose.design.discriminating_test import recommendation, recommended_test
 from snrmjax.diagnose.diagnosis_result import (
     Answer,
     Checks,
+    CompletedModel,
+    CompletedStatus,
     Diagnosis,
     Estimate,
     ForceMisfit,
     FormerAnswer,
     Gap,
+    completed_model,
     what_changed,
 )
 from snrmjax.diagnose.laws.law_answer import LawAnswer, law_answer
-from snrmjax.diagnose.misfit.amplitudes import notes_without_phases
-from snrmjax.diagnose.misfit.corrected_records import at_reference
-from snrmjax.diagnose.misfit.drive_voltage import FREE_GAIN_STD, driven_by_voltage, with_first_gain
-from snrmjax.diagnose.misfit.effect_fit import EffectFit, at_phases_of, baseline_fit
+from snrmjax.diagnose.misfit.effect_fit import EffectFit, at_phases_of, at_reference, baseline_fit
+from snrmjax.diagnose.misfit.noise_model import notes_without_phases
 from snrmjax.diagnose.misfit.predictions import Predictions, predictions_of, scales_of
-from snrmjax.diagnose.misfit.reference import with_reference
+from snrmjax.diagnose.misfit.reference import (
+    FREE_GAIN_STD,
+    driven_by_voltage,
+    with_first_gain,
+    with_reference,
+)
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit, weighted_misfit
-from snrmjax.diagnose.search.detection_limits import detection_limits
 from snrmjax.diagnose.search.locating import locate_misfit
-from snrmjax.diagnose.search.model_search import AS_GOOD, FoundEffects
+from snrmjax.diagnose.search.model_search import FoundEffects, detection_limits
 from snrmjax.identify.calibrate.calibration_states import ASSUMED_ERROR
 from snrmjax.measure.phase_convention import naming_wrong_phases
 from snrmjax.measure.states import SteadyStates
@@ -60,9 +62,6 @@ from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import on_one_core
 from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
 
-_LOOSE = 0.1  # relative 1σ of a force's gain, beyond which no close mode is compared
-_LEAST_STATES = 6
-_OTHER_MODE = 0.1  # relative shift of a natural frequency that is no error of a linear test
 _FEW = 2  # effects of an answer beside which no law is drawn
 
 
@@ -80,7 +79,7 @@ def diagnose_model(
     Works in the force balance: the measured fundamental is prescribed, harmonic balance finds the
     other harmonics, and the force that this motion needs is compared with the measured one. The
     library's effects are fitted with the baseline's parameters free inside their stated errors
-    and the levels' errors inside theirs; Schwarz's criterion decides. Answers that a linear mode
+    and the levels' errors inside theirs; their evidence decides. Answers that a linear mode
     nearby could have caused are compared with one.
 
     `force_gain_std` is the relative 1σ of a gain that all forces share: 1 where it is unknown.
@@ -92,7 +91,7 @@ def diagnose_model(
     amplitude explain. Where no effect of the library explains the data, a law that does is drawn
     from them (`laws.law_answer`), if their noise and their forces are known. Where gains of the
     forces of single levels explain the data better than any effects, the answer is found beside
-    them (`level_forces`); where they explain them as well, they are said first.
+    them (`checks.gains`); where they explain them as well, they are said first.
 
     Returns a `Diagnosis`; `decide.decide` has the rules of its verdict. Raises `ValueError`
     for too few states, an unknown force or sensors other than the model's.
@@ -107,7 +106,12 @@ def diagnose_model(
         notes += of_gain
     predictions = predictions_of(model, data, force_gain_std)
     unknown = predictions.chosen.phase_unknown[:, 0]
-    _check_number_of_states(unknown)
+    n, least = len(unknown), 6
+    if 2 * n - unknown.sum() < 2 * least:
+        raise ValueError(
+            f"a diagnosis needs at least {least} usable steady states, or {2 * least} where phases "
+            f"are unknown, not {n}."
+        )
     # Beside an unknown gain nothing says which level's force is off.
     estimable = force_gain_std == 0 and not predictions.chosen.phase_unknown.any()
     predictions = with_reference(predictions)
@@ -126,21 +130,20 @@ def diagnose_model(
     found, weights = answered.found, answered.weights
     as_recorded, rival = found, None
     if predictions.chosen.noise_stated and estimable:
-        rival = suspected_level_forces(
-            found, tolerated(neighbour_noise(found.misfit, found.fit).variance)
-        )
+        rival = suspected_level_forces(found, tolerated(neighbour_noise(found.misfit, found.fit)))
     if rival is not None and rival.is_better:
-        freed = answered.found.misfit.predictions.with_level_forces_free(rival.places)
+        own = found.misfit.predictions
+        freed = dataclasses.replace(own, free_level_forces=rival.places)
         found, weights = search.answered(freed)[:2]
     misfit, fit = at_phases_of(found.misfit, found.fit), found.fit
-    free = locate_misfit(misfit, found.baseline)
-    weights = weights.with_imitations(len(imitations_of(found, free.parts)))
+    located = locate_misfit(misfit, found.baseline)
+    weights = weights.with_imitations(len(imitations_of(found, located)))
     neighbours = neighbour_noise(misfit, fit)
-    levels = held_out_levels(misfit, found.baseline, fit, tolerated(neighbours.variance))
+    levels = held_out_levels(misfit, found.baseline, fit, tolerated(neighbours))
     parameters = _estimates(misfit, fit)
     errors = {name: one.std for name, one in parameters.items()}
     gains = level_gains(misfit, fit)
-    judgement = decide(found, weights, free.parts, levels, errors, None if gains else rival)
+    judgement = decide(found, weights, located, levels, errors, None if gains else rival)
     test = None
     # Without phases the first measurement to recommend is that of the phases.
     if judgement.verdict is Verdict.AMBIGUOUS and not unknown.any():
@@ -164,7 +167,6 @@ def diagnose_model(
         probabilities=dict(judgement.probabilities),
     )
     without, refused = _completed_without_levels(misfit, model, fit)
-    unconverged = _unconverged(found)
     if former is not None:
         notes.append(what_changed(former, answer.probabilities))
     if gain is not None and answer.effects:
@@ -185,7 +187,7 @@ def diagnose_model(
     notes += [*notes_without_phases(chosen, phase, misfit.level_numbers), *predictions.chosen.notes]
     notes += [*notes_on_stated_parameters(misfit, fit), *notes_on_found_mass(misfit, fit)]
     notes += _notes_on_answer(model, completed, refused, fit)
-    notes += _notes_on_fits(found, unconverged)
+    notes += _notes_on_fits(found)
     diagnosis = Diagnosis(
         verdict=judgement.verdict,
         answer=answer,
@@ -199,15 +201,13 @@ def diagnose_model(
             phases=not unknown.any(),
         ),
         discriminating_test=test,
-        located=free.parts,
+        located=located,
         gap=Gap(
             rms_misfit(as_recorded.misfit, as_recorded.baseline),
             rms_misfit(misfit, fit),
             *(levels or (None, None)),
         ),
-        checks=Checks(
-            found.p_value, float(np.sqrt(neighbours.variance)), without, len(unconverged)
-        ),
+        checks=Checks(found.p_value, float(np.sqrt(neighbours)), without),
         detection_limits=detection_limits(misfit, fit, scales, excluded),
         table=found.table,
         notes=tuple(note for note in notes if note),
@@ -227,6 +227,15 @@ def diagnose_model(
 def _with_law(diagnosis: Diagnosis, law: LawAnswer) -> Diagnosis:
     """A diagnosis with a drawn law in place of effects that do not explain the data."""
     misfit, nothing = law.misfit, baseline_fit(law.misfit)
+    # A law has its share of what is outside the library, and of effects in whose place it stands.
+    kept = {
+        name: p
+        for name, p in diagnosis.probabilities.items()
+        if name != Verdict.UNKNOWN.value and len(name.split("+")) <= _FEW
+    }
+    outside = 1 - sum(kept.values())
+    kept |= {"+".join(law.kinds): law.share * outside}
+    kept |= {Verdict.UNKNOWN.value: (1 - law.share) * outside}
     answer = diagnosis.answer._replace(
         effects=law.kinds,
         candidates=((law.kinds[0], *law.rivals), *((kind,) for kind in law.kinds[1:])),
@@ -235,7 +244,7 @@ def _with_law(diagnosis: Diagnosis, law: LawAnswer) -> Diagnosis:
         completed=law.completed,
         completed_status=CompletedStatus.COMPLETED,
         laws=law.laws,
-        probabilities=_with_probability_of_law(diagnosis.probabilities, law),
+        probabilities=dict(sorted(kept.items(), key=lambda pair: -pair[1])),
     )
     checks = diagnosis.checks._replace(
         p_value=law.p_value,
@@ -266,19 +275,9 @@ def _with_probability_of_law(
         for name, p in probabilities.items()
         if name != Verdict.UNKNOWN.value and len(name.split("+")) <= _FEW
     }
-    outside = 1 - sum(apart.values())
-    own, share = "+".join(law.kinds), (1 - priors.NO_CURVE) * law.share
-    found = {**apart, own: share * outside, Verdict.UNKNOWN.value: (1 - share) * outside}
-    return dict(sorted(found.items(), key=lambda pair: -pair[1]))
-
-
-def _check_number_of_states(phase_unknown: np.ndarray) -> None:
-    n_states = len(phase_unknown)
-    if 2 * n_states - phase_unknown.sum() < 2 * _LEAST_STATES:
-        raise ValueError(
-            f"a diagnosis needs at least {_LEAST_STATES} usable steady states, or "
-            f"{2 * _LEAST_STATES} where phases are unknown, not {n_states}."
-        )
+    outside, own = 1 - sum(apart.values()), "+".join(law.kinds)
+    shares = {own: law.share * outside, Verdict.UNKNOWN.value: (1 - law.share) * outside}
+    return dict(sorted((apart | shares).items(), key=lambda pair: -pair[1]))
 
 
 def excluded_kinds(model: Structure, force_gain_std: float, *, phases: bool) -> set[str]:
@@ -286,7 +285,7 @@ def excluded_kinds(model: Structure, force_gain_std: float, *, phases: bool) -> 
     excluded = {effect.kind for effect in model.effects}
     if force_gain_std > 0:  # of a gain that is not known none can be missing, nor of the mass
         excluded |= {kind for kind, effect in EFFECTS.items() if effect.like_force_gain}
-    if force_gain_std > _LOOSE:  # beside a force that may be nothing a mode could be all one sees
+    if force_gain_std > priors.LOOSE_GAIN:
         excluded |= {kind for kind, effect in EFFECTS.items() if effect.follows_force}
     if not phases:
         excluded |= {kind for kind, effect in EFFECTS.items() if effect.only_phase}
@@ -304,9 +303,15 @@ def _notes_on_noise(predictions: Predictions) -> list[str]:
         )
     found = predictions.reference.posterior.differing if predictions.reference else (False,) * 4
     free = np.where(predictions.unstated_levels, predictions.level_sizes, 0.0)
+    units = (100.0, 180 / np.pi, 50.0, 100.0)
+    words = (" % in gain", "° in phase", " % in frequency", " % in damping")
     seen, allowed = (
-        _level_sizes(*np.where(found, free, 0.0)),
-        _level_sizes(*np.where(found, 0.0, free)),
+        ", ".join(
+            f"{unit * size:.2g}{word}"
+            for unit, size, word in zip(units, sizes, words, strict=True)
+            if size > 0
+        )
+        for sizes in (np.where(found, free, 0.0), np.where(found, 0.0, free))
     )
     if seen:
         notes.append(
@@ -321,21 +326,8 @@ def _notes_on_noise(predictions: Predictions) -> list[str]:
     return notes
 
 
-def _level_sizes(gain: float, phase: float, stiffness: float, damping: float) -> str:
-    """1σ of levels' errors in words."""
-    parts = [
-        *([f"{100 * gain:.2g} % in gain"] if gain > 0 else []),
-        *([f"{np.degrees(phase):.2g}° in phase"] if phase > 0 else []),
-        *([f"{50 * stiffness:.2g} % in frequency"] if stiffness > 0 else []),
-        *([f"{100 * damping:.2g} % in damping"] if damping > 0 else []),
-    ]
-    return ", ".join(parts)
-
-
 def _estimates(misfit: WeightedMisfit, fit: EffectFit) -> dict[str, Estimate]:
     """The effects' parameters and their 1σ."""
-    if not fit.labels:
-        return {}
     arms = misfit.noise.decorrelated(fit.slopes.T).T
     size = np.linalg.norm(arms, axis=0)
     size = np.where(size > 0, size, 1.0)
@@ -351,15 +343,15 @@ def _completed_without_levels(
     misfit: WeightedMisfit, model: Structure, fit: EffectFit
 ) -> tuple[dict[int, Structure], list[int]]:
     """By level: the model completed by the other levels; and the levels where that is none."""
-    found, refused = {}, []
+    found, refused, numbers = {}, [], misfit.level_numbers
     for place in held_out_places(misfit) if fit.kinds else ():
-        one = without_level(misfit, fit, place)
-        values = dict(zip(fit.labels, one.values.tolist(), strict=True))
-        completed = completed_model(model, one.baseline, fit.kinds, values)
+        values, baseline = without_level(misfit, fit, place)
+        own, level = dict(zip(fit.labels, values.tolist(), strict=True)), int(numbers[place])
+        completed = completed_model(model, baseline, fit.kinds, own)
         if completed.model is None:
-            refused.append(one.level)
+            refused.append(level)
         else:
-            found[one.level] = completed.model
+            found[level] = completed.model
     return found, refused
 
 
@@ -384,7 +376,7 @@ def _notes_on_answer(
 ) -> list[str]:
     notes = []
     shift = _frequency_shift(model, completed.model or model)
-    if abs(shift) > _OTHER_MODE:
+    if abs(shift) > priors.OTHER_MODE:
         notes.append(
             f"the model's natural frequency is off by {100 * shift:.0f} %: are these measurements "
             "of another mode?"
@@ -412,29 +404,12 @@ def _frequency_shift(model: Structure, completed: Structure) -> float:
     return float(jnp.sqrt(square)) - 1
 
 
-def _unconverged(found: FoundEffects) -> list[float]:
-    """How far each fit without a minimum is behind the best of its step, by the criterion."""
-    return [
-        max(one.gain for one in step) - row.gain
-        for step in found.table
-        for row in step
-        if not row.status.found_minimum
-    ]
-
-
-def _notes_on_fits(found: FoundEffects, behind: list[float]) -> list[str]:
-    notes, rows = [], [row for step in found.table for row in step]
+def _notes_on_fits(found: FoundEffects) -> list[str]:
+    rows = [row for step in found.table for row in step]
     lost = sorted({row.kind for row in rows if row.status is MinimisationStatus.NOT_FINITE})
-    behind = [one for one in behind if np.isfinite(one)]
-    near = sum(one < AS_GOOD for one in behind)
-    if behind:
-        effect = "all were clearly worse than the best, so the answer does not depend on them."
-        if near:
-            effect = f"{near} may be as good as the best, so the answer may depend on them."
-        notes.append(f"{len(behind)} of {len(rows)} trial fits stopped early; {effect}")
-    if lost:
-        notes.append(
-            f"{', '.join(lost)} could not be fitted: with no starting point does the model have "
-            "the measured motions."
-        )
-    return notes
+    if not lost:
+        return []
+    return [
+        f"{', '.join(lost)} could not be fitted: with no starting point does the model have the "
+        "measured motions."
+    ]

@@ -1,33 +1,77 @@
 """What a diagnosis finds: the answer, how well it is known, and what would decide what is open."""
 
+import dataclasses
 import textwrap
 from collections.abc import Iterable, Mapping
+from enum import StrEnum
 from typing import ClassVar, NamedTuple
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from snrmjax.diagnose.checks.cross_validation import HeldOut
-from snrmjax.diagnose.checks.level_forces import LevelGain, level_forces_sentence
-from snrmjax.diagnose.completed_model import CompletedStatus
+from snrmjax.diagnose import priors
+from snrmjax.diagnose.checks.gains import LevelGain, level_forces_sentence
+from snrmjax.diagnose.checks.residuals import HeldOut
 from snrmjax.diagnose.decide import Verdict, verdict_sentence
 from snrmjax.diagnose.design.discriminating_test import DiscriminatingTest
-from snrmjax.diagnose.laws.law_table import DrawnLaw
+from snrmjax.diagnose.laws.law_search import DrawnLaw
 from snrmjax.diagnose.search.locating import Located
 from snrmjax.diagnose.search.model_search import TriedEffect
 from snrmjax.measure.states import SteadyStates
-from snrmjax.model.effects import EFFECTS
+from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
+from snrmjax.model.parameters import parameter_rules, with_parameters
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
 from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.rules import Rule
 
-AS_NOISE = 1.3
-"""Times the noise, up to which a misfit counts as noise; beyond it every 1σ is too small."""
 
-_WIDTH = 98  # of the notes, columns
-_LISTED, _LEAST_LISTED = 5, 0.01  # answers with their probabilities
-_LIKELY = 0.05  # probability from which on an answer is mentioned
+class CompletedStatus(StrEnum):
+    """Whether there is a completed model."""
+
+    COMPLETED = "completed"
+    NOTHING_ADDED = "nothing_added"  # the model as given
+    NOT_PHYSICAL = "not_physical"  # the parameters that fit best are none of a structure
+
+
+class CompletedModel(NamedTuple):
+    """The model with what was found, or why there is none."""
+
+    model: Structure | None
+    status: CompletedStatus
+    reason: str = ""
+
+
+def completed_model(
+    model: Structure,
+    baseline: Mapping[str, float],
+    kinds: tuple[str, ...],
+    values: Mapping[str, float],
+) -> CompletedModel:
+    """The model with effects added and its own parameters at their most likely values.
+
+    Arguments: `baseline` has new values of the model's own parameters, `values` those of the
+    added effects, both by name. Where one of them is none that a structure can have, such as a
+    negative frequency, there is no model but a reason.
+    """
+    if not kinds:
+        return CompletedModel(model, CompletedStatus.NOTHING_ADDED)
+    try:
+        for name, value in baseline.items():
+            for rule in (Rule("finite", np.isfinite), *parameter_rules(model, name)):
+                if not rule.good(value):
+                    raise ValueError(f"`{name}` must be {rule.expected}, but is {value:.4g}.")
+        added = tuple(
+            make_effect(kind, {name: values[f"{kind}.{name}"] for name in effect_parameters(kind)})
+            for kind in kinds
+        )
+    except ValueError as error:
+        return CompletedModel(None, CompletedStatus.NOT_PHYSICAL, str(error))
+    moved = with_parameters(model, tuple(baseline), jnp.array(list(baseline.values())))
+    completed = dataclasses.replace(moved, effects=(*model.effects, *added))
+    return CompletedModel(completed, CompletedStatus.COMPLETED)
 
 
 class Estimate(NamedTuple):
@@ -66,7 +110,6 @@ class Checks(NamedTuple):
     p_value: float  # of the misfit that is left
     noise_scale: float  # that neighbouring states show, over the stated noise
     completed_without: dict[int, Structure]  # by level: completed without a level's states
-    unconverged_fits: int  # of the candidates in the table
 
 
 class ForceMisfit(NamedTuple):
@@ -152,13 +195,13 @@ class Diagnosis(AbstractResult):
         """See `AbstractResult.summary`."""
         gap, inner, outer = self.gap, self.gap.interpolated, self.gap.extrapolated
         lines = [f"Diagnosis: {self.verdict_sentence}"]
-        lines += textwrap.wrap(f"probability: {self.most_probable()}", _WIDTH)
+        lines += textwrap.wrap(f"probability: {self.most_probable()}", 98)
         for name, (value, std) in self.parameters.items():
             stated = unit_of(name)
             unit = "" if stated == "1" else stated
             lines.append(f"{name} = {value:.4g} ± {std:.2g} {unit}".rstrip())
         lines.append(f"misfit: {gap.before:.3g} before, {gap.after:.3g} after, in units of noise")
-        if self.parameters and gap.after > AS_NOISE:
+        if self.parameters and gap.after > priors.AS_NOISE:
             lines[-1] += "; the ± above holds only if the noise is as stated"
         lines += [
             f"level {out.level}, left out: {out.before:.3g} before, {out.after:.3g} after"
@@ -167,31 +210,27 @@ class Diagnosis(AbstractResult):
         ]
         if self.decide_by:
             lines.append(f"to decide: {self.decide_by}")
-        lines.append(f"status: {self._status()}")
-        if self.notes:
-            lines.append("notes:")
-            for note in self.notes:
-                lines += textwrap.wrap(note, _WIDTH, initial_indent="- ", subsequent_indent="  ")
-        return tuple(lines)
-
-    def most_probable(self) -> str:
-        """The answers with the largest probabilities, each once."""
-        listed = [
-            f"{name.replace('+', ' with ')} {probability_in_words(value)}"
-            for name, value in list(self.probabilities.items())[:_LISTED]
-            if value >= _LEAST_LISTED
-        ]
-        return f"{probability_in_words(self.probability)} of this verdict ({', '.join(listed)})"
-
-    def _status(self) -> str:
-        """How the fit and those it was compared with ended."""
-        status = f"fit {_words(self.answer.status)}"
+        status = f"fit {self.answer.status.value.replace('_', ' ')}"
         if self.answer.completed_status is CompletedStatus.NOTHING_ADDED:
             status = "nothing was added to the model"
         elif self.answer.completed_status is CompletedStatus.NOT_PHYSICAL:
             status += ", but no structure can have these parameters: there is no completed model"
-        tried, early = sum(len(step) for step in self.table), self.checks.unconverged_fits
-        return f"{status}; {early} of {tried} compared fits stopped early" if early else status
+        lines.append(f"status: {status}")
+        if self.notes:
+            lines.append("notes:")
+            for note in self.notes:
+                lines += textwrap.wrap(note, 98, initial_indent="- ", subsequent_indent="  ")
+        return tuple(lines)
+
+    def most_probable(self) -> str:
+        """The answers with the largest probabilities, each once."""
+        least = 0.01
+        listed = [
+            f"{name.replace('+', ' with ')} {probability_in_words(value)}"
+            for name, value in list(self.probabilities.items())[:5]
+            if value >= least
+        ]
+        return f"{probability_in_words(self.probability)} of this verdict ({', '.join(listed)})"
 
     def variables(self) -> Mapping[str, Variable]:
         """See `AbstractResult.variables`."""
@@ -204,33 +243,27 @@ class Diagnosis(AbstractResult):
         ranges = np.array([p.velocity_range for p in self.located]).reshape(-1, 2)
         exponent = np.array(powers, dtype=float).reshape(-1, 2)
         names = list(self.parameters)
-        of_row, of_part, of_parameter = ("candidate",), ("part",), ("parameter",)
+        columns = {
+            "candidate": (_texts(row.kind for row in rows), "", "effect compared"),
+            "step": ([number for number, _ in tried], "1", "step of the search"),
+            "gain": ([r.gain for r in rows], "1", "fall of Schwarz's criterion"),
+            "chi_square": ([r.chi_square for r in rows], "1", "χ² that is left"),
+            "fit_status": (_texts(r.status.value for r in rows), "", "end of the fit"),
+            "part": (_texts(p.part for p in self.located), "", "part of the misfit"),
+            "velocity_low_m_s": (ranges[:, 0], "m/s", "lowest velocity affected"),
+            "velocity_high_m_s": (ranges[:, 1], "m/s", "highest velocity affected"),
+            "p_value": ([p.p_value for p in self.located], "1", "by chance"),
+            "exponent": (exponent[:, 0], "1", "power of amplitude"),
+            "exponent_std": (exponent[:, 1], "1", "1σ of the power"),
+            "parameter": (_texts(names), "", "parameter of an effect"),
+            "value": ([p.value for p in self.parameters.values()], "unit", "in `unit`"),
+            "value_std": ([p.std for p in self.parameters.values()], "unit", "1σ, in `unit`"),
+            "unit": (_texts(map(unit_of, names)), "", "of the value"),
+        }
+        of = np.repeat(self.coordinates, (5, 6, 4)).tolist()
         return {
-            "candidate": Variable(of_row, _texts(row.kind for row in rows), "", "effect compared"),
-            "step": Variable(of_row, [number for number, _ in tried], "1", "step of the search"),
-            "gain": Variable(of_row, [r.gain for r in rows], "1", "fall of Schwarz's criterion"),
-            "chi_square": Variable(of_row, [r.chi_square for r in rows], "1", "χ² that is left"),
-            "fit_status": Variable(
-                of_row, _texts(r.status.value for r in rows), "", "end of the fit"
-            ),
-            "part": Variable(
-                of_part, _texts(p.part for p in self.located), "", "part of the misfit"
-            ),
-            "velocity_low_m_s": Variable(of_part, ranges[:, 0], "m/s", "lowest velocity affected"),
-            "velocity_high_m_s": Variable(
-                of_part, ranges[:, 1], "m/s", "highest velocity affected"
-            ),
-            "p_value": Variable(of_part, [p.p_value for p in self.located], "1", "by chance"),
-            "exponent": Variable(of_part, exponent[:, 0], "1", "power of amplitude"),
-            "exponent_std": Variable(of_part, exponent[:, 1], "1", "1σ of the power"),
-            "parameter": Variable(of_parameter, _texts(names), "", "parameter of an effect"),
-            "value": Variable(
-                of_parameter, [p.value for p in self.parameters.values()], "unit", "in `unit`"
-            ),
-            "value_std": Variable(
-                of_parameter, [p.std for p in self.parameters.values()], "unit", "1σ, in `unit`"
-            ),
-            "unit": Variable(of_parameter, _texts(map(unit_of, names)), "", "of the value"),
+            name: Variable((dimension,), *column)
+            for dimension, (name, column) in zip(of, columns.items(), strict=True)
         }
 
     def attributes(self) -> Mapping[str, str | float | int]:
@@ -270,10 +303,6 @@ def _texts(texts: Iterable[str]) -> np.ndarray:
     return np.array(list(texts), dtype=np.str_)
 
 
-def _words(status: MinimisationStatus | CompletedStatus) -> str:
-    return status.value.replace("_", " ")
-
-
 class FormerAnswer(NamedTuple):
     """What a diagnosis of fewer states said."""
 
@@ -285,7 +314,8 @@ class FormerAnswer(NamedTuple):
 
 def what_changed(former: FormerAnswer, probabilities: Mapping[str, float]) -> str:
     """What further states did to the answers that were likely before, in one sentence."""
-    likely = [name for name, p in former.probabilities.items() if p >= _LIKELY]
+    least = 0.05  # of a probability that is mentioned
+    likely = [name for name, p in former.probabilities.items() if p >= least]
     both = [
         f"{name} {100 * former.probabilities[name]:.0f} % → "
         f"{100 * probabilities.get(name, 0):.0f} %"
@@ -295,7 +325,7 @@ def what_changed(former: FormerAnswer, probabilities: Mapping[str, float]) -> st
     new = [
         f"{name} now {100 * p:.0f} %"
         for name, p in probabilities.items()
-        if p >= _LIKELY and name not in former.probabilities
+        if p >= least and name not in former.probabilities
     ]
     before = " and ".join(former.effects) or "no effect"
     return (

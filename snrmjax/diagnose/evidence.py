@@ -37,8 +37,6 @@ from snrmjax.model.effects import EFFECTS, effect_parameters
 NONE, UNKNOWN, NOISE_REJECTED = "none", "unknown", "noise_rejected"
 
 _REFINED = 8  # answers that are made straight at their own errors
-_BESIDE = 6  # answers that are compared with themselves beside a discrepancy
-_NOISES = 57  # of the noise's logarithm, that are summed over
 
 
 class Weighed(NamedTuple):
@@ -95,12 +93,11 @@ class Marginal(NamedTuple):
 class _Sizes(NamedTuple):
     """Sizes over those of the misfit's noise: of levels' errors, of a discrepancy, of noise."""
 
-    densities: tuple[
-        HalfNormalSize | FlatSize | None, ...
-    ]  # of levels' four, then of a discrepancy
+    densities: tuple[HalfNormalSize | FlatSize | None, ...]  # of levels' four, of a discrepancy
     bounds: tuple[tuple[float, float], ...]
-    noise: tuple[Callable[[np.ndarray], np.ndarray], ...]  # ln priors on a grid: right, wrong
-    noise_bounds: tuple[float, float]
+    noise: Float[np.ndarray, " noise"]  # logarithms, which are summed over
+    right: Float[np.ndarray, " noise"]  # ln p of them, for noise as it is stated to be
+    wrong: Float[np.ndarray, " noise"]  # and for noise stated wrong
 
 
 def either(one: Weights, other: Weights, odds: float) -> Weights:
@@ -135,7 +132,10 @@ def weights_of(found: FoundEffects, refined: Refined | None = None) -> Weights:
     weighed = sorted((one for one in every if one is not None), key=lambda one: one.log_weight)
     best = {one.kinds: one for one in weighed}
     done: list[Weighed] = []
-    for kinds in _worth_refining(best):
+    # Nothing, the likeliest effects alone, and then the likeliest answers of any size.
+    order = sorted(best, key=lambda kinds: -best[kinds].log_weight)
+    alone = [kinds for kinds in order if len(kinds) <= 1][:_REFINED]
+    for kinds in dict.fromkeys([*alone, frozenset[str](), *order[:_REFINED]]):
         if refined is None or _is_far_behind(best[kinds], done):
             continue
         misfit, fit = refined(best[kinds].misfit, best[kinds].fit)
@@ -145,7 +145,7 @@ def weights_of(found: FoundEffects, refined: Refined | None = None) -> Weights:
             done.append(again)
     ranked = sorted(best.values(), key=lambda one: -one.log_weight)
     unknown = [np.log(priors.UNNAMED) + one.log_weight for one in ranked if one.kinds]
-    for one in ranked[:_BESIDE]:
+    for one in ranked[:6]:  # each beside a discrepancy too
         directions = list(discrepancies(one.misfit))
         prior = np.log(priors.DISCREPANCY / len(directions)) + _log_prior(len(one.kinds))
         for columns in directions:
@@ -178,13 +178,6 @@ def _is_far_behind(one: Weighed, done: Sequence[Weighed]) -> bool:
     return one.log_weight < best.log_weight - priors.FAR_BEHIND * left
 
 
-def _worth_refining(best: dict[frozenset[str], Weighed]) -> list[frozenset[str]]:
-    """Nothing, the likeliest effects alone, and then the likeliest answers of any size."""
-    ranked = sorted(best, key=lambda kinds: -best[kinds].log_weight)
-    alone = [kinds for kinds in ranked if len(kinds) <= 1][:_REFINED]
-    return list(dict.fromkeys([*alone, frozenset[str](), *ranked[:_REFINED]]))
-
-
 def marginal_of(
     misfit: WeightedMisfit, fit: EffectFit, beside: Float[np.ndarray, "row any"] | None = None
 ) -> Marginal | None:
@@ -200,12 +193,12 @@ def marginal_of(
     known, unknown = np.full(arms.shape[1], -1), np.full(columns.shape[1], len(LEVELS))
     group = np.concatenate([known, noise.shared_kind, unknown])
     left, own = noise.decorrelated(fit.rows), noise.decorrelated(arms.T).T
-    promised = 0.0
-    if own.shape[1]:
-        step = np.linalg.lstsq(own, left, rcond=1e-10)[0]
-        promised = float(np.sum((own @ step) ** 2))
+    promised = float(np.sum((own @ np.linalg.lstsq(own, left, rcond=1e-10)[0]) ** 2))
+    # Of answers under other noise: at a fit that explains its records χ² is the square of their
+    # distance from it, whatever its own slopes are, and these are no part of the units.
+    units = -misfit.n_rows * float(np.log(misfit.predictions.error_scale))
     # The most likely parameters are the fit's; what more a linear step promises is not believed.
-    return Marginal(LinearRows.of(design, fit.rows, _units(misfit)), group, 0.5 * promised)
+    return Marginal(LinearRows.of(design, fit.rows, units), group, 0.5 * promised)
 
 
 class Evidence(NamedTuple):
@@ -213,15 +206,6 @@ class Evidence(NamedTuple):
 
     right: float
     wrong: float
-
-
-def _units(misfit: WeightedMisfit) -> float:
-    """ln of the units of all rows, so that answers under other noise can be compared.
-
-    At a fit that explains its records χ² is the square of their distance from it, whatever its own
-    slopes are: these are no part of the units.
-    """
-    return -misfit.n_rows * float(np.log(misfit.predictions.error_scale))
 
 
 def log_evidence(model: Marginal, sizes: _Sizes) -> Evidence:
@@ -247,15 +231,15 @@ def log_evidence(model: Marginal, sizes: _Sizes) -> Evidence:
                 value, slopes[k] = value + own, slopes[k] + slope
         return value, slopes
 
-    bounds = [sizes.noise_bounds, *(sizes.bounds[place] for place in used)]
+    ends = float(sizes.noise[0]), float(sizes.noise[-1])
+    bounds = [ends, *(sizes.bounds[place] for place in used)]
     found = maximised(with_priors, np.zeros(len(bounds)), bounds)
     others = precision_at(with_priors, found)[1:, 1:]
     volume = 0.5 * (len(others) * np.log(2 * np.pi) - np.linalg.slogdet(others)[1])
     top = with_priors(found)[0] - likelihood(found)[0]
-    grid = np.linspace(*sizes.noise_bounds, _NOISES)
     variance = np.exp(2 * (member @ found[1:]))
-    logs = _over_noise(model.rows, np.exp(grid), variance) + volume + top - model.penalty
-    return Evidence(*(float(logsumexp(logs + prior(grid))) for prior in sizes.noise))
+    logs = _over_noise(model.rows, np.exp(sizes.noise), variance) + volume + top - model.penalty
+    return Evidence(*(float(logsumexp(logs + prior)) for prior in (sizes.right, sizes.wrong)))
 
 
 def _over_noise(
@@ -285,11 +269,22 @@ def discrepancies(misfit: WeightedMisfit) -> Iterator[Float[np.ndarray, "row any
     of_test = hat_functions(order, 8)[noise.state]
     linear = misfit.by_linear
     yield _scaled(np.concatenate([linear[:, [k]] * amplitude for k in (0, 1)], axis=1))
-    harmonics = list(_harmonics(misfit, phase, amplitude))
+    harmonics = []
+    for place, number in enumerate(chosen.orders):  # both parts, that turn with the fundamental
+        first = 2 * (len(chosen.sensors) + place)
+        for turn in (1.0, 1j):
+            unit, columns = turn * np.exp(1j * number * phase), np.zeros((1, *noise.known.shape))
+            columns[0, :, first], columns[0, :, first + 1] = unit.real, unit.imag
+            harmonics.append(noise.noise_units(columns)[0][:, None] * amplitude)
     if harmonics:
         yield _scaled(np.concatenate(harmonics, axis=1))
     yield _scaled(linear[:, [0]] * of_test)
-    yield _scaled(_along_levels(misfit, phase))
+    level, along = np.asarray(chosen.states.level), []
+    for number in np.unique(level):
+        mine, curves = level == number, np.zeros((len(level), 4))
+        curves[mine] = hat_functions(phase[mine], 4)
+        along += [(noise.column == k)[:, None] * curves[noise.state] for k in (0, 1)]
+    yield _scaled(np.concatenate(along, axis=1))
 
 
 def hat_functions(
@@ -298,32 +293,6 @@ def hat_functions(
     """Piecewise linear curves with equally many states between any two knots."""
     at = np.quantile(where, np.linspace(0, 1, knots)) + 1e-9 * np.arange(knots)
     return np.stack([np.interp(where, at, row) for row in np.eye(knots)], axis=1)
-
-
-def _harmonics(
-    misfit: WeightedMisfit, phase: Float[np.ndarray, " state"], amplitude: np.ndarray
-) -> Iterator[np.ndarray]:
-    """Of every harmonic both parts, at phases that turn with the fundamental."""
-    noise, chosen = misfit.noise, misfit.predictions.chosen
-    n_sensors = len(chosen.sensors)
-    for place, number in enumerate(chosen.orders):
-        first = 2 * (n_sensors + place)
-        for turn in (1.0, 1j):
-            unit = turn * np.exp(1j * number * phase)
-            columns = np.zeros(noise.known.shape)
-            columns[:, first], columns[:, first + 1] = unit.real, unit.imag
-            yield noise.noise_units(columns[None])[0][:, None] * amplitude
-
-
-def _along_levels(misfit: WeightedMisfit, phase: Float[np.ndarray, " state"]) -> np.ndarray:
-    noise, level = misfit.noise, np.asarray(misfit.predictions.chosen.states.level)
-    parts = []
-    for number in np.unique(level):
-        mine = level == number
-        curves = np.zeros((len(level), 4))
-        curves[mine] = hat_functions(phase[mine], 4)
-        parts += [(noise.column == k)[:, None] * curves[noise.state] for k in (0, 1)]
-    return np.concatenate(parts, axis=1)
 
 
 def _scaled(columns: np.ndarray) -> np.ndarray:
@@ -341,39 +310,24 @@ def _sizes_of(misfit: WeightedMisfit) -> _Sizes:
         HalfNormalSize(prior.scale / size) if is_free and size > 0 else None
         for prior, size, is_free in zip(LEVELS, predictions.level_sizes, free, strict=True)
     ]
-    ends = [
-        (np.log(1e-3), np.log(1e3)) if density is not None else (0.0, 0.0) for density in levels
-    ]
+    far = float(np.log(1e3))
+    ends = [(-far, far) if density is not None else (0.0, 0.0) for density in levels]
     low, high = np.log(priors.DISCREPANCY_SIZES)
-    flat = FlatSize(low, high)
-    own = (_right_noise, _wrong_noise), (-priors.MOST_NOISE, priors.MOST_NOISE)
-    if not predictions.chosen.noise_stated:
+    reach = priors.MOST_NOISE if predictions.chosen.noise_stated else 2.5
+    noise = np.linspace(-reach, reach, 57)
+    if predictions.chosen.noise_stated:
+        tolerated = (noise >= priors.TOLERATED_NOISE[0]) & (noise <= priors.TOLERATED_NOISE[1])
+        right = np.where(tolerated, -0.5 * (noise / priors.RIGHT_NOISE) ** 2, -np.inf)
+        wrong = np.where(tolerated, -np.inf, 0.0)
+        wrong = wrong - logsumexp(wrong)
+    else:
         taken = ASSUMED_ERROR * predictions.error_scale
         unstated = UNSTATED_NOISE._replace(median=UNSTATED_NOISE.median / taken)
-
-        def of_logarithm(logs: np.ndarray) -> np.ndarray:
-            return _normalised(np.array([unstated.log_density(one)[0] for one in logs]))
-
-        own = (of_logarithm, lambda logs: np.full(len(logs), -np.inf)), (-2.5, 2.5)
-    return _Sizes((*levels, flat), (*ends, (low, high)), *own)
-
-
-def _right_noise(logs: np.ndarray) -> np.ndarray:
-    density = -0.5 * (logs / priors.RIGHT_NOISE) ** 2
-    return _normalised(np.where(_tolerated(logs), density, -np.inf))
-
-
-def _wrong_noise(logs: np.ndarray) -> np.ndarray:
-    return _normalised(np.where(_tolerated(logs), -np.inf, 0.0))
-
-
-def _tolerated(logs: np.ndarray) -> np.ndarray:
-    low, high = priors.TOLERATED_NOISE
-    return (logs >= low) & (logs <= high)
-
-
-def _normalised(logs: np.ndarray) -> np.ndarray:
-    return np.asarray(logs - logsumexp(logs))
+        right = np.array([unstated.log_density(one)[0] for one in noise])
+        wrong = np.full(len(noise), -np.inf)
+    right = right - logsumexp(right)
+    every = (*levels, FlatSize(low, high)), (*ends, (low, high))
+    return _Sizes(*every, noise, right, wrong)
 
 
 def _log_prior(n_effects: int) -> float:

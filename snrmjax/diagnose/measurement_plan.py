@@ -6,11 +6,8 @@ import numpy as np
 
 from snrmjax.diagnose.decide import Verdict
 from snrmjax.diagnose.diagnosis_result import Diagnosis
+from snrmjax.diagnose.misfit.programs import COMPARED
 from snrmjax.measure.states import PHASE_UNKNOWN, SteadyStates, relative_errors, steady_states
-
-_MOST = 24  # states of a level that is measured again
-_WIDER = (0.5, 1.5)  # times the smallest and the largest level, where levels are too few
-_ORDERS = (2, 3)  # harmonics that are asked for where none were recorded
 
 
 class MeasurementPlan(NamedTuple):
@@ -33,7 +30,7 @@ def measurement_plan(diagnosis: Diagnosis) -> MeasurementPlan | None:
     larger level. None for an answer that nothing contradicts, and where a calibration decides.
     """
     test, data = diagnosis.discriminating_test, diagnosis.data
-    known = tuple(order for order in data.harmonic_order if order in _ORDERS)
+    known = tuple(order for order in data.harmonic_order if order in COMPARED)
     if test is not None and test.planned is not None:
         asked = test.harmonics or known
         parts = [(test.planned.frequency, test.planned.force, test.planned.velocity)]
@@ -41,14 +38,16 @@ def measurement_plan(diagnosis: Diagnosis) -> MeasurementPlan | None:
     is_open = diagnosis.verdict in (Verdict.AMBIGUOUS, Verdict.UNKNOWN)
     if not is_open or diagnosis.decide_by is None or test is not None:
         return None
-    levels = _levels_by_size(diagnosis)
-    if set(known) != set(_ORDERS):
+    level = np.asarray(data.level)
+    speed = np.abs(np.asarray(data.velocity)[:, diagnosis.force_misfit.sensor])
+    levels = sorted(set(level.tolist()), key=lambda number: speed[level == number].max())
+    if set(known) != set(COMPARED):
         return MeasurementPlan(
-            _states(diagnosis, [_of_level(diagnosis, levels[-1])]), _ORDERS, None
+            _states(diagnosis, [_of_level(diagnosis, levels[-1])]), COMPARED, None
         )
     parts = [
         _of_level(diagnosis, level, scale)
-        for level, scale in zip((levels[0], levels[-1]), _WIDER, strict=True)
+        for level, scale in zip((levels[0], levels[-1]), (0.5, 1.5), strict=True)
     ]
     return MeasurementPlan(_states(diagnosis, parts), known, None)
 
@@ -56,19 +55,12 @@ def measurement_plan(diagnosis: Diagnosis) -> MeasurementPlan | None:
 _Part = tuple[np.ndarray, np.ndarray, np.ndarray]  # frequency, force, velocity
 
 
-def _levels_by_size(diagnosis: Diagnosis) -> list[int]:
-    """Numbers of the levels, that with the smallest velocities first."""
-    level = np.asarray(diagnosis.data.level)
-    speed = np.abs(np.asarray(diagnosis.data.velocity)[:, diagnosis.force_misfit.sensor])
-    return sorted(set(level.tolist()), key=lambda number: speed[level == number].max())
-
-
 def _of_level(diagnosis: Diagnosis, number: int, scale: float = 1.0) -> _Part:
     """Some states of a level, from low to high frequency, at forces so many times larger."""
     data, sensor = diagnosis.data, diagnosis.force_misfit.sensor
     mine = np.flatnonzero(np.asarray(data.level) == number)
     mine = mine[np.argsort(np.asarray(data.frequency)[mine], kind="stable")]
-    mine = mine[:: -(-len(mine) // _MOST)]
+    mine = mine[:: -(-len(mine) // 24)]
     speed = np.abs(np.asarray(data.velocity)[mine, sensor])
     return np.asarray(data.frequency)[mine], scale * np.asarray(data.force)[mine], scale * speed
 

@@ -58,8 +58,62 @@ AS_GOOD = 0.01
 """Odds to the best answer down to which another one belongs to the class: of a hundred names that
 stand alone one may be wrong."""
 
+DETECTED = 10.0
+"""Gain of Schwarz's criterion from which on an effect counts as detected: odds of 150 to one pay
+for the choice among some thirty effects."""
+
+AS_GOOD_BY_CRITERION = 6.0
+"""Difference of Schwarz's criterion within which two models count as equally good: odds of 20."""
+
 REJECTED = 1e-3
 """Probability by chance below which a check refutes: some thirty checks are made of a test."""
+
+CONTRADICTED = 4.0
+"""1σ between the power of amplitude in the data and that of a law: curves of a few knots are no
+exact powers."""
+
+PULLED = 2.0
+"""1σ of a stated parameter, by which an answer may move it without a word."""
+
+MOVED_GAIN = 0.05
+"""Of the logarithm of a free gain, by which a right law moves what smooth curves gave."""
+
+FAR_GAIN = 3.0
+"""Ratio of a gain to its first value, beyond which the answer has moved it away."""
+
+FAR_MASS = 3.0
+"""1σ of a modal mass of which none is stated, beyond which it explains no gain."""
+
+LOOSE_GAIN = 0.1
+"""Relative 1σ of a force's gain, beyond which no close mode is looked for: beside a force that may
+be nothing a mode could be all that one sees."""
+
+OTHER_MODE = 0.1
+"""Relative shift of a natural frequency that is no error of a linear test."""
+
+TELLING = 16.0
+"""Of χ², that a power of amplitude must explain to be reported: 4σ."""
+
+BEYOND_DATA = 10.0
+"""Times all that was measured: effects that must be larger cannot be detected."""
+
+SAME_FORCE, HELD_RESPONSE = 0.05, 0.2
+"""Relative distance from its level's force up to which a state was measured at it, and share of
+states beyond, from which on a test may hold the response."""
+
+AS_NOISE = 1.3
+"""Times the noise, up to which a misfit counts as noise; beyond it every 1σ is too small."""
+
+FAR_MISSED = 2.0
+"""Times the noise, from which on a top level that was left out proves nothing of a law."""
+
+MISSED, MISSED_BY_ONE = 0.05, 0.01
+"""Probability by chance of a level that was left out: below the first it counts against an answer
+that another law could imitate, below the second against one of several."""
+
+TOLERATED_VARIANCE = 1.7
+"""Over the stated one, that neighbouring states may show: stated too small by a third, noise is no
+sign of further physics."""
 
 OPEN = 0.1
 """Share of their probability that refuted answers keep: checks rest on approximations too."""

@@ -1,23 +1,23 @@
-"""Responses that models predict under the forces of a test, and their resonances."""
+"""Responses that models predict under the forces of a test, and the forces that hold a velocity."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import chain
 from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
 
+from snrmjax.diagnose import priors
 from snrmjax.diagnose.diagnosis_result import Diagnosis
+from snrmjax.identify.calibrate.inverse_force import inverse_force
 from snrmjax.identify.pointwise.missing_resonance import jump_at_resonance
-from snrmjax.measure.states import SteadyStates
+from snrmjax.measure.states import SteadyStates, steady_states
 from snrmjax.model.structures import Structure
 from snrmjax.simulate.continuation.continuation import CurveStatus
 from snrmjax.simulate.continuation.response_curve import ResponseCurve
 from snrmjax.simulate.solutions.forced_response import ResponseSettings, forced_response_batch
 from snrmjax.simulate.virtual_test.recording import acting_force, recorded_curves
-
-ORDER = 5  # harmonics of the responses
-_REACH = 0.3  # of the measured range of frequencies, added at both ends
 
 
 class PhaseResonance(NamedTuple):
@@ -61,11 +61,9 @@ def predict_levels(diagnosis: Diagnosis, model: Structure) -> LevelPredictions:
     """
     if diagnosis.completed is None:
         raise ValueError("there is no completed model to simulate: see the notes of the diagnosis.")
-    data, sensor = diagnosis.data, diagnosis.force_misfit.sensor
-    models = LevelModels(model, diagnosis.completed, diagnosis.checks.completed_without)
-    simulated = level_simulations(models, data, sensor, diagnosis.answer.force_gain)
-    before, after = ([c for one in curves for c in one] for curves in simulated[:2])
-    return LevelPredictions(level_responses(simulated, data, sensor), before, after)
+    sensor, without = diagnosis.force_misfit.sensor, diagnosis.checks.completed_without
+    own = (diagnosis.completed, diagnosis.data, sensor, without, diagnosis.answer.force_gain)
+    return predicted_levels(model, *own)
 
 
 def level_forces(data: SteadyStates, sensor: int = 0) -> dict[int, float]:
@@ -102,40 +100,29 @@ def responses(
     `models` is one for all forces or one for each, with the same kinds of effects.
     """
     frequency = np.asarray(data.frequency)
-    reach = _REACH * (frequency.max() - frequency.min())
+    reach = 0.3 * (frequency.max() - frequency.min())
     ends = (float(frequency.min() - reach), float(frequency.max() + reach))
     each = [models] * len(forces) if isinstance(models, Structure) else list(models)
     loads = [acting_force(model, force) for model, force in zip(each, forces, strict=True)]
-    settings = ResponseSettings(harmonic_order=ORDER, stability=False)
+    settings = ResponseSettings(harmonic_order=5, stability=False)
     batch = forced_response_batch(models, loads, *ends, settings=settings)
     return [recorded_curves(*pair) for pair in zip(each, batch.curves, strict=True)]
 
 
-class Simulated(NamedTuple):
-    """Responses of every level: of both models, and of those completed without a level."""
+def predicted_levels(
+    model: Structure,
+    completed: Structure,
+    data: SteadyStates,
+    sensor: int,
+    without_level: Mapping[int, Structure] = MappingProxyType({}),
+    force_gain: float = 1.0,
+) -> LevelPredictions:
+    """Measured and predicted resonances of every level, under the levels' forces.
 
-    before: list[list[ResponseCurve]]
-    after: list[list[ResponseCurve]]
-    without_level: dict[int, list[ResponseCurve]]
-
-
-class LevelModels(NamedTuple):
-    """The models whose responses are compared with the measured levels."""
-
-    before: Structure  # as given
-    after: Structure  # completed
-    without_level: Mapping[int, Structure] = MappingProxyType({})  # completed without a level
-
-
-def level_simulations(
-    models: LevelModels, data: SteadyStates, sensor: int, force_gain: float = 1.0
-) -> Simulated:
-    """Responses under the levels' forces, before and after.
-
+    A level that was left out of the fit is predicted by the model completed without it;
     `force_gain` is acting force over recorded one for the completed models. One program follows
     all responses: in the model before the effects are there without strength.
     """
-    model, completed, without_level = models
     forces = level_forces(data, sensor)
     every, seen = list(forces.values()), [level for level in forces if level in without_level]
     after = [completed] * len(every) + [without_level[level] for level in seen]
@@ -144,9 +131,24 @@ def level_simulations(
     own = float(modes.natural_frequency[j]), float(modes.damping_ratio[j])
     idle = tuple(e.idle(*own) for e in completed.effects[len(model.effects) :])
     same = dataclasses.replace(model, effects=(*model.effects, *idle))
-    found = responses([*[same] * len(every), *after], data, [*every, *loads])
-    old, new = found[: len(every)], found[len(every) :]
-    return Simulated(old, new[: len(every)], dict(zip(seen, new[len(every) :], strict=True)))
+    found, n = responses([*[same] * len(every), *after], data, [*every, *loads]), len(every)
+    held_out, rows = dict(zip(seen, found[2 * n :], strict=True)), []
+    for (level, force), old, new in zip(forces.items(), found[:n], found[n : 2 * n], strict=True):
+        best = held_out.get(level, new)
+        rows.append(
+            LevelResponse(
+                level,
+                force,
+                measured_resonance(data, level, sensor),
+                simulated_resonance(old, sensor),
+                simulated_resonance(best, sensor),
+                level in held_out,
+                _complete(old) and _complete(best),
+                simulated_resonance(new, sensor),
+            )
+        )
+    curves = (list(chain(*some)) for some in (found[:n], found[n : 2 * n]))
+    return LevelPredictions(rows, *curves)
 
 
 def measured_resonance(data: SteadyStates, level: int, sensor: int) -> PhaseResonance:
@@ -210,32 +212,86 @@ def _in_phase(curve: ResponseCurve, sensor: int) -> list[tuple[float, float]]:
     return found
 
 
-def level_responses(simulated: Simulated, data: SteadyStates, sensor: int) -> list[LevelResponse]:
-    """Measured and predicted resonances of every level.
-
-    A level that was left out of the fit is predicted by the model completed without it.
-    """
-    rows = []
-    for (level, force), old, new in zip(
-        level_forces(data, sensor).items(), simulated.before, simulated.after, strict=True
-    ):
-        own = simulated.without_level.get(level, new)
-        rows.append(
-            LevelResponse(
-                level,
-                force,
-                measured_resonance(data, level, sensor),
-                simulated_resonance(old, sensor),
-                simulated_resonance(own, sensor),
-                level in simulated.without_level,
-                _complete(old) and _complete(own),
-                simulated_resonance(new, sensor),
-            )
-        )
-    return rows
-
-
 def _complete(curves: Sequence[ResponseCurve]) -> bool:
     """Whether a response was traced to the upper end of the range of frequencies."""
     main = [curve for curve in curves if curve.branch == "main"]
     return bool(main) and all(curve.status == CurveStatus.UPPER_END for curve in main)
+
+
+class HeldCurve(NamedTuple):
+    """The force that holds one velocity amplitude, over frequency."""
+
+    level: int
+    velocity: float  # m/s
+    frequency: np.ndarray  # rad/s
+    force: np.ndarray  # N; NaN where no motion was found
+
+
+def held_curves(
+    model: Structure, data: SteadyStates, sensor: int, force_gain: float = 1.0
+) -> list[HeldCurve]:
+    """Forces with which a model holds every level's median velocity, by inverse harmonic balance.
+
+    Arguments: `sensor` whose velocity is held; `force_gain` is acting over recorded force, where
+    the answer is the recorded one.
+    """
+    level, omega = np.asarray(data.level), np.asarray(data.frequency)
+    speed, force = np.abs(np.asarray(data.velocity))[:, sensor], np.asarray(data.force)
+    good = np.asarray(data.measured)[:, sensor] & np.isfinite(force) & (speed > 0)
+    numbers = np.unique(level[good])
+    rows = []
+    for number in numbers:
+        mine = good & (level == number)
+        held = float(np.median(speed[mine]))
+        for one in np.linspace(omega[mine].min(), omega[mine].max(), 81):
+            rows.append((number, one, float(np.median(force[mine])), held))
+    of, at, load, held_speed = (np.array(column) for column in zip(*rows, strict=True))
+    seen = np.arange(len(data.sensors)) == sensor
+    states = steady_states(
+        of.astype(int),
+        at,
+        load,
+        held_speed[:, None] * seen + 0j,
+        sensors=data.sensors,
+        measured=np.tile(seen, (len(of), 1)),
+    )
+    needed = np.abs(np.asarray(inverse_force(model, states, harmonic_order=5).force))
+    return [
+        HeldCurve(int(k), float(held_speed[of == k][0]), at[of == k], needed[of == k] / force_gain)
+        for k in numbers
+    ]
+
+
+def at_curve_force(data: SteadyStates, forces: Iterable[float]) -> np.ndarray:
+    """Which steady states were measured within 5 % of one of some forces (N), or of none known."""
+    force, each = np.asarray(data.force), np.asarray(list(forces))
+    away = np.min(np.abs(force[:, None] / each - 1.0), axis=1)
+    return ~(away > priors.SAME_FORCE)
+
+
+def holds_response(data: SteadyStates, predicted: Sequence[LevelResponse]) -> bool:
+    """Whether the levels of a test hold the response: its force changes, more than velocity.
+
+    A shaker's force that drops at resonance changes too, but the velocity does far more.
+    """
+    if not predicted:
+        return False
+    same = at_curve_force(data, [one.force for one in predicted])
+    return bool(np.mean(~same) > priors.HELD_RESPONSE) and _velocity_is_steadier(data)
+
+
+def _velocity_is_steadier(data: SteadyStates) -> bool:
+    """Whether velocities spread less than forces within most levels, at the sensor that moves most.
+
+    Spreads are ranges of the logarithm between the first and last tenth.
+    """
+    size = np.abs(np.asarray(data.velocity)) * np.asarray(data.measured)
+    speed, force = size[:, int(np.argmax(size.mean(axis=0)))], np.asarray(data.force)
+    good, level = (speed > 0) & (force > 0), np.asarray(data.level)
+    spreads = [
+        float(np.ptp(np.quantile(np.log(one[good & (level == k)]), (0.1, 0.9))))
+        for k in np.unique(level[good])
+        for one in (speed, force)
+    ]
+    pairs = np.reshape(spreads, (-1, 2))
+    return bool(np.median(pairs[:, 0] - pairs[:, 1]) < 0)

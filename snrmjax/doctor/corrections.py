@@ -6,10 +6,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from snrmjax.doctor.checked_states import CheckedStates
 from snrmjax.doctor.findings import Kind
 from snrmjax.doctor.force_checks import deepest_fall
-from snrmjax.doctor.judgement import Judged, judge, likelier
+from snrmjax.doctor.judgement import CheckedStates, Judged, judge, likelier
 from snrmjax.doctor.priors import (
     CLEARLY,
     FORCE_FALLS,
@@ -19,10 +18,6 @@ from snrmjax.doctor.priors import (
     SCATTER,
 )
 from snrmjax.identify.test_model.states import TestStates
-
-_LIMITS = (0.96, 0.93, 0.9, 0.87, 0.84, 0.81)  # of a channel, over its largest recorded fundamental
-_SHARES = (0.2, 0.45, 0.7, 0.85)  # of a transient that are left at the end of a step
-_FLOORS = (4.0, 12.0, 40.0)  # noise of the force's cell over that of all else, at the least force
 
 
 class TestCorrection(NamedTuple):
@@ -41,10 +36,17 @@ def corrections(seen: CheckedStates, states: TestStates, base: Judged) -> Iterat
     Arguments: `states` as they are read; `base` how they fit.
     """
     yield _moving("drift", "frequency", states, base, seen.order - 0.5)
-    yield from _of_files(seen, states, base)
+    for k, levels in enumerate(seen.files):
+        if k > 0 or len(seen.files) > 2:  # of two the first differs as the second from it
+            own = np.isin(states.level, levels)
+            along = own - float(np.mean(own))
+            yield _moving("different_structures", f"file {k + 1}", states, base, along)
     gains = base.posterior.level_errors[:, 0]
     if states.n_levels > 1 and (base.misfit > SCATTER or np.ptp(gains) > GAIN_MATTERS):
-        yield _of_other_gains(states, base)
+        std = (OTHER_GAIN, *states.level_std[1:])
+        judged = _freer(states._replace(force_is_free=True, level_std=std), base)
+        gains = judged.posterior.level_errors[:, 0]
+        yield TestCorrection("volts_as_force", "gain_of_level", judged, gains=tuple(gains.tolist()))
     yield from _clipped(states, base)
     yield from _unsettled(seen, states, base)
     yield from _noisy_force(states, base)
@@ -61,16 +63,6 @@ def _moving(
     """A natural frequency that changes in proportion to something, by `value` (relative)."""
     judged = _freer(states._replace(trend=along, trend_std=MOVES), base)
     return TestCorrection(kind, name, judged, 0.5 * judged.posterior.trend[0])
-
-
-def _of_files(seen: CheckedStates, states: TestStates, base: Judged) -> Iterator[TestCorrection]:
-    """A file whose structure has natural frequencies of its own."""
-    for k, levels in enumerate(seen.files):
-        if k == 0 and len(seen.files) == 2:
-            continue  # it differs from the second as the second from it
-        own = np.isin(states.level, levels)
-        name = f"file {k + 1}"
-        yield _moving("different_structures", name, states, base, own - float(np.mean(own)))
 
 
 class Tried(NamedTuple):
@@ -100,21 +92,18 @@ def likeliest(base: Judged, tried: Sequence[Tried]) -> tuple[float, Judged]:
 def _clipped(states: TestStates, base: Judged) -> Iterator[TestCorrection]:
     """The response or the force cut off at a limit."""
     size, force = np.abs(states.velocity), states.force
-    value, judged = likeliest(base, [_unclipped_response(states, x) for x in _LIMITS])
+    limits = (0.96, 0.93, 0.9, 0.87, 0.84, 0.81)  # over the largest recorded fundamental
+    tried = []
+    for limit in limits:
+        true, stretch = unclipped(size, limit * size.max())
+        errors = states.errors * np.column_stack([np.ones_like(size), stretch, np.ones_like(size)])
+        moved = states._replace(velocity=states.velocity * true / size, errors=errors)
+        tried.append(Tried(limit, moved, float(np.sum(np.log(stretch)))))
+    value, judged = likeliest(base, tried)
     yield TestCorrection("clipped_channel", "velocity", judged, value * float(size.max()))
-    value, judged = likeliest(
-        base,
-        [Tried(x, states._replace(force=unclipped(force, x * force.max())[0])) for x in _LIMITS],
-    )
+    undone = [states._replace(force=unclipped(force, x * force.max())[0]) for x in limits]
+    value, judged = likeliest(base, [Tried(*pair) for pair in zip(limits, undone, strict=True)])
     yield TestCorrection("clipped_channel", "force", judged, value * float(force.max()))
-
-
-def _unclipped_response(states: TestStates, limit: float) -> Tried:
-    size = np.abs(states.velocity)
-    true, stretch = unclipped(size, limit * size.max())
-    errors = states.errors * np.column_stack([np.ones_like(size), stretch, np.ones_like(size)])
-    moved = states._replace(velocity=states.velocity * true / size, errors=errors)
-    return Tried(limit, moved, float(np.sum(np.log(stretch))))
 
 
 def unclipped(
@@ -153,7 +142,7 @@ def _unsettled(seen: CheckedStates, states: TestStates, base: Judged) -> Iterato
         before[mine[1:]] = mine[:-1]
     first = before < 0
     tried = []
-    for share in _SHARES:
+    for share in (0.2, 0.45, 0.7, 0.85):  # of a transient that are left at the end of a step
         rate = -np.log(share) / typical if typical > 0 else 0.0
         left = np.exp((-damping / 2 + 1j * (omega - states.frequency)) * rate)
         left = np.where(first, 0.0, left)
@@ -172,17 +161,9 @@ def _noisy_force(states: TestStates, base: Judged) -> Iterator[TestCorrection]:
         return
     tried = []
     least = float(states.force.min())
-    for ratio in _FLOORS:
+    for ratio in (4.0, 12.0, 40.0):  # the cell's noise over that of all else, at the least force
         floor = ratio * least / states.force
         errors = np.hypot(states.errors, np.stack([floor, 0 * floor, floor], axis=1))
         tried.append(Tried(ratio, states._replace(errors=errors)))
     ratio, judged = likeliest(base, tried)
     yield TestCorrection("force_dropout", "floor", judged, ratio * least * judged.noise)
-
-
-def _of_other_gains(states: TestStates, base: Judged) -> TestCorrection:
-    """A scale of its own for the force of each level."""
-    std = (OTHER_GAIN, *states.level_std[1:])
-    judged = _freer(states._replace(force_is_free=True, level_std=std), base)
-    gains = judged.posterior.level_errors[:, 0]
-    return TestCorrection("volts_as_force", "gain_of_level", judged, gains=tuple(gains.tolist()))

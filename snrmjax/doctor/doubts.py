@@ -3,8 +3,8 @@
 import jax
 import numpy as np
 
-from snrmjax.doctor.checked_states import checked_states, leading_sensor, usable_rows
 from snrmjax.doctor.findings import Finding
+from snrmjax.doctor.judgement import checked_states, leading_sensor, usable_rows
 from snrmjax.doctor.priors import BAND, FAR_DAMPING, FAR_FREQUENCY, FEWEST_STATES
 from snrmjax.doctor.readings import best_reading, misread
 from snrmjax.doctor.scale_findings import is_other_scale, scale_findings
@@ -14,8 +14,6 @@ from snrmjax.identify.pointwise.backbone_points import BackbonePoints
 from snrmjax.measure.phase_convention import wrong_phases
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.structures import Structure
-
-_HERTZ = 2 * np.pi
 
 
 def doubt(
@@ -60,21 +58,14 @@ def _sentence(one: Finding) -> str:
     return f"{one.evidence} To mend it: {one.mend.rstrip('.')}{more}"
 
 
-def _of_levels(points: BackbonePoints) -> list[tuple[float, float]]:
-    """Median natural frequency and damping ratio of each level, the smallest amplitude first."""
-    good = np.asarray(points.usable) & np.isfinite(np.asarray(points.amplitude))
-    level, amplitude = np.asarray(points.level), np.asarray(points.amplitude)
-    natural, damping = np.asarray(points.natural_frequency), np.asarray(points.damping_ratio)
-    found = [
-        (float(np.median(amplitude[mine])), np.median(natural[mine]), np.median(damping[mine]))
-        for mine in (good & (level == k) for k in np.unique(level[good]))
-    ]
-    return [(float(frequency), float(ratio)) for _, frequency, ratio in sorted(found)]
-
-
 def _far(points: BackbonePoints, model: Structure) -> tuple[str, ...]:
     """The lowest level far from the linear mode, and farther than the curves reach."""
-    found = np.array(_of_levels(points))
+    good = np.asarray(points.usable) & np.isfinite(np.asarray(points.amplitude))
+    columns = (points.amplitude, points.natural_frequency, points.damping_ratio)
+    rows, level = np.column_stack([np.asarray(c) for c in columns]), np.asarray(points.level)
+    medians = [np.median(rows[good & (level == k)], axis=0) for k in np.unique(level[good])]
+    # Of each level, the smallest amplitude first.
+    found = np.array(sorted(map(tuple, medians))).reshape(-1, 3)[:, 1:]
     modes = model.modes
     one = modes.mode_of_interest
     own, ratio = float(modes.natural_frequency[one]), float(modes.damping_ratio[one])
@@ -92,7 +83,7 @@ def _far(points: BackbonePoints, model: Structure) -> tuple[str, ...]:
     if not far:
         return ()
     lowest, linear = found[0], (own, ratio)
-    said = [f"{w / _HERTZ:.5g} Hz and {100 * d:.3g} %" for w, d in (lowest, linear)]
+    said = [f"{w / (2 * np.pi):.5g} Hz and {100 * d:.3g} %" for w, d in (lowest, linear)]
     return (
         f"{' and '.join(far)} at small amplitude {'are' if len(far) > 1 else 'is'} not the linear "
         f"mode's: the lowest level has {said[0]}, the model {said[1]}. Name the mode by "

@@ -35,6 +35,15 @@ FORCE_HARMONICS: Kind = "force_harmonics"
 """Of the force that was measured; an effect of the model has this name, too."""
 
 
+_MEANINGS = {
+    "kind": "what is wrong",
+    "severity": "error, warning or info",
+    "where": "file, level, rows or channel",
+    "evidence": "in numbers",
+    "mend": "what mends it",
+}
+
+
 class Repair(NamedTuple):
     """How a table is read again, relative to how it was read: what a command does."""
 
@@ -75,13 +84,7 @@ class Finding(NamedTuple):
 
     def as_dict(self) -> dict[str, str]:
         """What `check.json` has of it."""
-        return {
-            "kind": self.kind,
-            "severity": self.severity,
-            "where": self.where,
-            "evidence": self.evidence,
-            "mend": self.mend,
-        }
+        return {name: getattr(self, name) for name in _MEANINGS}
 
 
 class Checkup(AbstractResult):
@@ -108,14 +111,7 @@ class Checkup(AbstractResult):
         """See `AbstractResult`; a row a finding."""
         at = ("finding",)
         found = {"finding": Variable(at, np.arange(len(self.findings)), "1", "number")}
-        meanings = {
-            "kind": "what is wrong",
-            "severity": "error, warning or info",
-            "where": "file, level, rows or channel",
-            "evidence": "in numbers",
-            "mend": "what mends it",
-        }
-        for name, meaning in meanings.items():
+        for name, meaning in _MEANINGS.items():
             values = np.array([getattr(one, name) for one in self.findings], dtype=str)
             found[name] = Variable(at, values, "", meaning)
         return found

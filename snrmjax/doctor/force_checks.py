@@ -1,10 +1,12 @@
 """The force itself: drop-out at resonance, and harmonics that the structure did not make."""
 
-import numpy as np
+from collections.abc import Iterator
 
-from snrmjax.doctor.checked_states import CheckedStates
+import numpy as np
+from jaxtyping import Int
+
 from snrmjax.doctor.findings import FORCE_HARMONICS, Finding, percent, rows_in_words
-from snrmjax.doctor.judgement import Judged
+from snrmjax.doctor.judgement import CheckedStates, Judged
 from snrmjax.doctor.priors import CERTAIN, CLEARLY, FORCE_FALLS, FORCE_HARMONIC, HELD, TOGETHER
 from snrmjax.identify.test_model.states import TestStates
 from snrmjax.measure.states import SteadyStates
@@ -13,39 +15,38 @@ from snrmjax.model.structures import Structure
 
 def dropout_findings(seen: CheckedStates, where: str) -> list[Finding]:
     """Levels whose force falls where the response is largest, though the response is not held."""
-    rows: list[int] = []
-    worst, said = 0.0, 0
-    states = seen.test
-    for k in range(states.n_levels):
-        mine = np.flatnonzero(states.level == k)
-        if len(mine) < 5:
-            continue
+    states, dropped = seen.test, []
+    for mine, drop, nominal in _falls(states):
         force, mobility = states.force[mine], seen.mobility[mine]
-        size = force * mobility
+        size = np.log(force * mobility)
         # A controlled amplitude wanders by chance; a weak shaker's still peaks at resonance.
-        peaked = (
-            np.ptp(np.log(size)) > HELD
-            and np.corrcoef(np.log(size), np.log(mobility))[0, 1] > TOGETHER
-        )
-        drop, nominal = fall(force, mobility)
+        peaked = np.ptp(size) > HELD and np.corrcoef(size, np.log(mobility))[0, 1] > TOGETHER
         if peaked and drop > FORCE_FALLS:
-            said += 1
-            if drop > worst:
-                worst = drop
-                rows = [int(seen.row[j]) for j in mine[force < nominal * (1 - 0.8 * drop)]]
-    if not said:
+            dropped.append((drop, mine[force < nominal * (1 - 0.8 * drop)]))
+    if not dropped:
         return []
+    worst, at = max(dropped, key=lambda one: one[0])
+    rows = tuple(int(seen.row[j]) for j in at)
     return [
         Finding(
             *("force_dropout", "warning", where),
             f"at resonance the force falls by up to {percent(worst)} of what it is beside it, on "
-            f"{said} of {states.n_levels} levels ({rows_in_words(rows)}): the structure moves the "
-            "shaker.",
+            f"{len(dropped)} of {states.n_levels} levels ({rows_in_words(rows)}): the structure "
+            "moves the shaker.",
             "use the measured force of every state (`force_n`), never the nominal one; or control "
             "the force.",
-            tuple(rows),
+            rows,
         )
     ]
+
+
+def _falls(states: TestStates) -> Iterator[tuple[Int[np.ndarray, " state"], float, float]]:
+    """Of each level of some states these, and what `fall` says of them."""
+    for k in range(states.n_levels):
+        mine, fewest = np.flatnonzero(states.level == k), 5
+        if len(mine) >= fewest:
+            force = states.force[mine]
+            yield mine, *fall(force, np.abs(states.velocity[mine]) / force)
 
 
 def fall(force: np.ndarray, mobility: np.ndarray) -> tuple[float, float]:
@@ -64,13 +65,7 @@ def fall(force: np.ndarray, mobility: np.ndarray) -> tuple[float, float]:
 
 def deepest_fall(states: TestStates) -> float:
     """The largest share of a level's force that is missing at resonance, whatever is held."""
-    falls = [0.0]
-    for k in range(states.n_levels):
-        mine = np.flatnonzero(states.level == k)
-        if len(mine) >= 5:
-            force = states.force[mine]
-            falls.append(fall(force, np.abs(states.velocity[mine]) / force)[0])
-    return max(falls)
+    return max((drop for _, drop, _ in _falls(states)), default=0.0)
 
 
 def harmonic_findings(

@@ -1,29 +1,29 @@
 """How well one mode with any smooth curves explains states, as recorded or as they may be meant.
 
-Every hypothesis is fitted by the one model of a test (`identify.test_model`): its evidence is the
-density of what was recorded, however it is read, so that hypotheses compare directly.
+A table is looked at as one mode at the sensor that moves most. Every hypothesis is fitted by the
+one model of a test (`identify.test_model`): its evidence is the density of what was recorded,
+however it is read, so that hypotheses compare directly.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Complex, Float, Int
 
-from snrmjax.doctor.priors import ANY_MASS, CLEARLY, FITS_WELL, NO_MODE, SCATTER
+from snrmjax.doctor.priors import ANY_MASS, CLEARLY, FITS_WELL, MODAL_MASS, NO_MODE, SCATTER
 from snrmjax.identify.checks.residual_autocorrelation import share_told_by
 from snrmjax.identify.test_model.posterior import TestPosterior, fit_test
 from snrmjax.identify.test_model.priors import LEAST_SHARE
-from snrmjax.identify.test_model.states import TestStates
+from snrmjax.identify.test_model.states import TestStates, state_errors
 from snrmjax.identify.test_model.walk import Rounds
+from snrmjax.measure.states import SteadyStates, relative_errors
+from snrmjax.model.modes import residual_velocity
+from snrmjax.model.structures import Structure
 
-_ROUNDS, _FINE = 6, 16  # of a fit: for most; for what is to be said
-_KNOTS = 24  # of its curves, at most
-_NEARLY = 1.0  # relative, of amplitudes for which fits may go on from one another
-_STAYS = 0.3  # of ln κ, from which on forces are scaled anew: what is linear reaches as far
-_ALLED = 3  # fits of a modal mass from one start, at most
-_MAGNITUDES = (8.0, 1 / 8, 64.0, 1 / 64)  # over the model's
-_GUESSED = 1e3  # its 1σ in the first of them
+_GUESSED = 1e3  # 1σ of a modal mass of which a first fit knows nothing
 
 
 class Judged(NamedTuple):
@@ -125,10 +125,10 @@ class Judged(NamedTuple):
         """
         if start is not None and start is not self:
             own, other = self.states.amplitude, start.states.amplitude
-            if not (start.damped and np.allclose(own, other, rtol=_NEARLY)):
+            if not (start.damped and np.allclose(own, other, rtol=1.0)):
                 return self
         jacobian = self.evidence - self.posterior.log_evidence
-        fit = judge(self.states, jacobian, _FINE, start, discrepancy=discrepancy)
+        fit = judge(self.states, jacobian, 16, start, discrepancy=discrepancy)
         return likelier((self, fit))
 
 
@@ -148,7 +148,7 @@ class Scale(NamedTuple):
 def judge(
     states: TestStates,
     log_jacobian: float = 0.0,
-    rounds: int = _ROUNDS,
+    rounds: int = 6,
     start: Judged | None = None,
     *,
     discrepancy: bool = False,
@@ -161,7 +161,7 @@ def judge(
     """
     for fewer in (rounds, 2, 1):
         first = None if start is None else start.posterior
-        walked = Rounds(fewer, _KNOTS, states.n_levels > 1, first)
+        walked = Rounds(fewer, 24, states.n_levels > 1, first)
         try:
             posterior = fit_test(
                 states, discrepancy=discrepancy, compare_levels=False, rounds=walked
@@ -184,20 +184,20 @@ def any_mass(states: TestStates, log_jacobian: float = 0.0, *, far: bool = False
     found = _about(states, max(abs(mass), 1e-3 * std, 1e-12), log_jacobian)
     if not (far and SCATTER < found.judged.misfit < NO_MODE):
         return found
-    tried = [found, *(_about(states, one, log_jacobian, 1) for one in _MAGNITUDES)]
+    tried = [found, *(_about(states, one, log_jacobian, 1) for one in (8.0, 1 / 8, 64.0, 1 / 64))]
     best = max(tried, key=lambda one: one.judged.evidence)
     return best if best is found else _about(states, best.mass, log_jacobian)
 
 
-def _about(states: TestStates, start: float, log_jacobian: float, steps: int = _ALLED) -> Scale:
+def _about(states: TestStates, start: float, log_jacobian: float, steps: int = 3) -> Scale:
     """The likeliest modal mass from some on: forces are divided by it until it stays."""
-    mass, std = start, np.inf
+    mass, std, reach = start, np.inf, 0.3  # of ln κ, within which it is linear
     for _ in range(steps):
         scale = mass
         judged = judge(with_mass(states, scale)._replace(mass_std=ANY_MASS), log_jacobian)
         step, std = judged.posterior.modal_mass
         mass = scale * max(step, 1 / _GUESSED)
-        if abs(np.log(mass / scale)) < _STAYS:
+        if abs(np.log(mass / scale)) < reach:
             break
     return Scale(judged, mass, std / step if step > 0 else np.inf)
 
@@ -205,3 +205,108 @@ def _about(states: TestStates, start: float, log_jacobian: float, steps: int = _
 def with_mass(states: TestStates, mass: float) -> TestStates:
     """Forces divided by κ."""
     return states._replace(force=states.force / mass)
+
+
+class CheckedStates(NamedTuple):
+    """States of one sensor, and what an error of import or of the test may depend on."""
+
+    test: TestStates  # as recorded, without what moves beside the mode
+    row: Int[np.ndarray, " state"]  # in the table
+    beside: Complex[np.ndarray, " state"]  # m/s, of the other modes
+    order: Float[np.ndarray, " state"]  # of the test, 0 to 1
+    noise: float  # stated 1σ of velocities, relative; NaN where none is
+    files: tuple[tuple[int, ...], ...]  # levels of each table, where there are several
+
+    @property
+    def recorded(self) -> Complex[np.ndarray, " state"]:
+        """Phasors as they stand in the table, with the sign of the mode."""
+        return self.test.velocity + self.beside
+
+    @property
+    def mobility(self) -> Float[np.ndarray, " state"]:
+        """|V|/F."""
+        return np.abs(self.test.velocity) / self.test.force
+
+    def read(self, velocity: Complex[np.ndarray, " state"]) -> TestStates:
+        """The states with other phasors in the place of the recorded ones."""
+        return self.test._replace(velocity=velocity - self.beside)
+
+
+def checked_states(
+    data: SteadyStates,
+    model: Structure | None,
+    sensor: int,
+    rows: Bool[np.ndarray, " state"],
+    files: tuple[tuple[int, ...], ...] = (),
+) -> CheckedStates:
+    """Some rows of a table at one sensor, with what the model says of its mode.
+
+    Without a model the modal constant is one and the other modes are taken to be still. Errors
+    count by their proportions: their common size is always found from the states.
+    """
+    at = np.flatnonzero(rows)
+    # As NumPy's: nothing compiles for the table's own number of states.
+    some: SteadyStates = jax.tree.map(lambda column: np.asarray(column)[at], data)
+    drive = np.isnan(np.asarray(some.force))
+    force = np.where(drive, np.asarray(some.drive), np.asarray(some.force))
+    omega = np.asarray(some.frequency)
+    velocity = np.asarray(some.velocity)[:, sensor]
+    constant, beside = 1.0, np.zeros(len(at), dtype=complex)
+    stds = (0.0, 0.0, 0.0, 0.0)
+    if model is not None:
+        modes = model.modes
+        one = modes.mode_of_interest
+        constant = float(modes.mode_shape[sensor, one] * modes.participation[one])
+        if not drive.any() and (modes.n_modes > 1 or modes.rigid_body_participation.size):
+            beside = np.asarray(residual_velocity(modes, jnp.asarray(omega), jnp.asarray(force)))[
+                :, sensor
+            ]
+        gain, phase, frequency, damping = model.level_stds
+        own, ratio = float(modes.natural_frequency[one]), float(modes.damping_ratio[one])
+        stds = (gain, phase, 2 * frequency / own, damping / max(ratio, 1e-6))
+    sign = -1.0 if constant < 0 else 1.0
+    errors, stated = state_errors(np.asarray(relative_errors(some))[:, sensor])
+    noise = float(np.median(errors[:, 1:])) if stated else np.nan
+    if stated:
+        errors = errors / noise
+    order = np.asarray(some.order)
+    if not np.all(np.isfinite(order)):
+        order = np.linspace(0.0, 1.0, len(at))
+    level = np.unique(np.asarray(some.level), return_inverse=True)[1]
+    test = TestStates(
+        *(level, omega, force, sign * (velocity - beside), errors, False),
+        *(abs(constant) or 1.0, stds, MODAL_MASS),
+    )
+    return CheckedStates(test, at, sign * beside, order, noise, files)
+
+
+def usable_rows(data: SteadyStates, sensor: int) -> Bool[np.ndarray, " state"]:
+    """States that this sensor measured, with a phase and with a force or a drive voltage."""
+    force = np.where(np.isnan(np.asarray(data.force)), np.asarray(data.drive), data.force)
+    velocity = np.asarray(data.velocity)[:, sensor]
+    known = np.asarray(data.measured)[:, sensor] & ~np.asarray(data.phase_unknown)[:, sensor]
+    return known & (np.abs(velocity) > 0) & np.isfinite(force) & (force > 0)
+
+
+def leading_sensor(data: SteadyStates) -> int:
+    """The sensor with most usable states; of several, the one that moves most."""
+    size = np.where(np.asarray(data.measured), np.abs(np.asarray(data.velocity)), 0.0)
+    ranks = [
+        (int(usable_rows(data, k).sum()), float(size[:, k].mean())) for k in range(size.shape[1])
+    ]
+    return ranks.index(max(ranks))
+
+
+def files_of_levels(
+    tables: Sequence[SteadyStates],
+) -> tuple[list[SteadyStates], tuple[tuple[int, ...], ...]]:
+    """The tables with levels of their own, counted from 0, and the levels of each table."""
+    renumbered, groups, first = [], [], 0
+    for given in tables:
+        one: SteadyStates = jax.tree.map(np.asarray, given)
+        numbers = np.unique(np.asarray(one.level))
+        levels = np.searchsorted(numbers, np.asarray(one.level)) + first
+        renumbered.append(one.renumbered(levels - np.asarray(one.level)))
+        groups.append(tuple(range(first, first + len(numbers))))
+        first += len(numbers)
+    return renumbered, tuple(groups)

@@ -72,6 +72,12 @@ CERTAIN = 6.0
 STILL_MOVING = 0.03
 """Change of the response over the force at the end of a step: damping is off as much."""
 
+FEWEST_CYCLES = 3.5
+"""Of a step that is looked at: fewer have no phasor and a transient besides."""
+
+FEW_BLOCKS = 4
+"""Of a step, which have no scatter of their own to compare a change with."""
+
 STEPS_MOVE = 0.3
 """Share of steps that must: a jump or a slow beat may move single ones."""
 

@@ -6,14 +6,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
-from snrmjax.doctor.checked_states import CheckedStates
 from snrmjax.doctor.findings import Finding, Kind, Repair, percent
-from snrmjax.doctor.judgement import Judged, Scale, any_mass, judge
+from snrmjax.doctor.judgement import CheckedStates, Judged, Scale, any_mass, judge
 from snrmjax.doctor.priors import CLEARLY, MODAL_MASS, OTHER_SCALE, SCATTER
 from snrmjax.identify.test_model.states import TestStates
 
 _DEGREES = 180 / np.pi
-_LATTICES, _LATTICE_TURNS = 2, 8  # that go on, and how long at most
 
 Phasors = Complex[np.ndarray, " state"]
 
@@ -128,12 +126,8 @@ class Reading(NamedTuple):
         """With its likeliest modal mass, too, also `far` from the model's."""
         if self.scale is not None or self.as_modelled is None:
             return self
-        return self._replace(scale=any_mass(self.as_modelled.states, _jacobian(self), far=far))
-
-
-def _jacobian(one: Reading) -> float:
-    """Of all states."""
-    return one.judged.evidence - one.judged.posterior.log_evidence
+        jacobian = self.judged.evidence - self.judged.posterior.log_evidence
+        return self._replace(scale=any_mass(self.as_modelled.states, jacobian, far=far))
 
 
 def best_reading(seen: CheckedStates, known_mass: bool) -> tuple[Reading, Reading]:
@@ -241,9 +235,9 @@ def _in_degrees(seen: CheckedStates, known_mass: bool) -> list[Reading]:
         return _judged(IN_DEGREES, states, known_mass, start)
 
     tried = [nearest(guess, None) for guess in _phases_of_amplitudes(seen)]
-    tried = sorted(tried, key=_evidence)[-_LATTICES:]
+    tried = sorted(tried, key=_evidence)[-2:]
     for k, found in enumerate(tried):
-        for _ in range(_LATTICE_TURNS):
+        for _ in range(8):
             # The phase that the curves have at these amplitudes and frequencies.
             judged = found.judged
             omega = judged.states.frequency

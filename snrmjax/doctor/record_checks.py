@@ -1,5 +1,7 @@
 """Time records: limits, transients, harmonics and drop-outs of the force, folded frequencies."""
 
+import itertools
+
 import numpy as np
 from jaxtyping import Float
 
@@ -7,6 +9,8 @@ from snrmjax.doctor.findings import FORCE_HARMONICS, Finding, Repair, percent
 from snrmjax.doctor.force_checks import fall
 from snrmjax.doctor.priors import (
     CERTAIN,
+    FEW_BLOCKS,
+    FEWEST_CYCLES,
     FLAT_TOP,
     FOLDED_LINE,
     FORCE_FALLS,
@@ -19,11 +23,7 @@ from snrmjax.measure.recordings.steps import Step, recognise_steps
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.recordings.tone_track import track_tone
 
-_MOST = 2**23  # samples of a channel that are looked at
-_FEWEST_CYCLES = 3.5  # of a step
-_HIGHEST, _FOLDED = 12, 60  # harmonic of the force; one whose image is looked for
-_FEW_BLOCKS = 4  # of a step, which have no scatter of their own to compare with
-_MAINS = (50.0, 60.0)  # Hz
+_HIGHEST = 12  # harmonic of the force
 
 
 def record_findings(recording: TimeRecording) -> tuple[list[Finding], list[str]]:
@@ -35,7 +35,7 @@ def record_findings(recording: TimeRecording) -> tuple[list[Finding], list[str]]
         for c in recording.channels
         if c.quantity in ("velocity", "acceleration", "displacement")
     ]
-    stop = min(recording.n_samples, _MOST)
+    stop = min(recording.n_samples, 2**23)
     values = {c: recording.values([c], 0, stop)[0] for c in (*forces, *motions)}
     found = [one for c, x in values.items() if (one := _flat_runs(x, f"{name}, channel {c}"))]
     notes = [f"{name}: only the first {stop} samples were looked at."] * (
@@ -55,27 +55,27 @@ def record_findings(recording: TimeRecording) -> tuple[list[Finding], list[str]]
     steps = [
         one
         for one in _joined(steps, rate)
-        if one.stop <= stop
-        and (one.stop - one.start) * one.frequency / (2 * np.pi * rate) >= _FEWEST_CYCLES
+        if one.stop <= stop and _cycles(one, rate) >= FEWEST_CYCLES
     ]
     if not steps:
         return found, [*notes, f"{name}: no step of four cycles was recognised."]
+    where = {c: f"{name}, channel {c}" for c in values}
     clipped = {one.where for one in found}
-    for c, x in values.items():
-        where = f"{name}, channel {c}"
-        if where not in clipped and (one := _flat_cycles(x, steps, rate, where)):
-            found.append(one)
-    found += _harmonics(values[force], steps, rate, f"{name}, channel {force}")
+    flat = [_flat_cycles(values[c], steps, rate, w) for c, w in where.items() if w not in clipped]
+    found += [one for one in flat if one is not None]
+    clipped = {one.where for one in found}
+    found += _harmonics(values[force], steps, rate, where[force])
     for c in motions:
-        where = f"{name}, channel {c}"
-        found += _unsettled(values[force], values[c], steps, rate, where)
-        found += _dropped(values[force], values[c], steps, rate, where)
+        found += _unsettled(values[force], values[c], steps, rate, where[c])
+        found += _dropped(values[force], values[c], steps, rate, where[c])
     for c in (force, *motions):
-        if all(
-            one.where != f"{name}, channel {c}" or one.kind != "clipped_channel" for one in found
-        ):
-            found += _folded(values[c], steps, rate, f"{name}, channel {c}")
+        if where[c] not in clipped:
+            found += _folded(values[c], steps, rate, where[c])
     return found, notes
+
+
+def _cycles(step: Step, rate: float) -> float:
+    return (step.stop - step.start) * step.frequency / (2 * np.pi * rate)
 
 
 def _joined(steps: list[Step], rate: float) -> list[Step]:
@@ -144,24 +144,15 @@ def _middle(step: Step, share: float = 0.5) -> slice:
     return slice(int(step.stop - share * length), int(step.stop - 0.02 * length))
 
 
-def _demodulated(
-    x: np.ndarray, rows: slice, frequency: float, rate: float, order: int = 1
-) -> tuple[np.ndarray, float]:
-    """Phasors of neighbouring cycles against the record's own clock, and cycles of each."""
-    cycle = 2 * np.pi * rate / frequency
-    n = rows.stop - rows.start
+def _demodulated(x: np.ndarray, rows: slice, frequency: float, rate: float) -> np.ndarray:
+    """Phasors of neighbouring cycles against the record's own clock."""
+    cycle, n = 2 * np.pi * rate / frequency, rows.stop - rows.start
     blocks = max(1, min(int(n / cycle), 32))
-    edges = rows.start + np.round(np.arange(blocks + 1) * int(n / cycle / blocks) * cycle).astype(
-        int
-    )
-    time = np.arange(rows.start, edges[-1]) / rate
-    turn = np.exp(-1j * order * frequency * time)
-    part = x[rows.start : edges[-1]]
-    sums = [
-        2 * np.mean((part[a:b] - part[a:b].mean()) * turn[a:b])
-        for a, b in zip(edges[:-1] - rows.start, edges[1:] - rows.start, strict=True)
-    ]
-    return np.array(sums), n / cycle / blocks
+    edges = np.round(np.arange(blocks + 1) * int(n / cycle / blocks) * cycle).astype(int)
+    part = x[rows.start : rows.start + edges[-1]]
+    turn = np.exp(-1j * frequency * (rows.start + np.arange(len(part))) / rate)
+    ends = itertools.pairwise(edges)
+    return np.array([2 * np.mean((part[a:b] - part[a:b].mean()) * turn[a:b]) for a, b in ends])
 
 
 def _flat_cycles(x: np.ndarray, steps: list[Step], rate: float, where: str) -> Finding | None:
@@ -225,10 +216,8 @@ def _unsettled(
     """Steps whose response still moves at their end, more than its blocks scatter."""
     moving, over_noise = [], []
     for one in steps:
-        cycles = (one.stop - one.start) * one.frequency / (2 * np.pi * rate)
-        rows = _middle(one, min(1.0, max(0.3, 5 / cycles)))
-        v, _ = _demodulated(x, rows, one.frequency, rate)
-        f, _ = _demodulated(force, rows, one.frequency, rate)
+        rows = _middle(one, min(1.0, max(0.3, 5 / _cycles(one, rate))))
+        v, f = (_demodulated(c, rows, one.frequency, rate) for c in (x, force))
         if len(v) < 3 or not np.all(np.abs(f) > 0):
             continue
         z = v / f
@@ -239,7 +228,7 @@ def _unsettled(
         jumps = np.diff(rest, 2) if len(rest) > 4 else rest
         noise = float(np.sqrt(np.mean(np.abs(jumps) ** 2) / 6 / np.sum(place**2)))
         change = float(abs(slope) / abs(z[-1]))
-        few = len(v) <= _FEW_BLOCKS
+        few = len(v) <= FEW_BLOCKS
         # Without a scatter of its own a step must move by more.
         believed = change > 2.5 * STILL_MOVING if few else abs(slope) > CERTAIN * noise
         if change > STILL_MOVING:
@@ -317,9 +306,9 @@ def _folded(x: np.ndarray, steps: list[Step], rate: float, where: str) -> list[F
             if size < 2 * CERTAIN * float(np.median(around)):
                 continue
             f = float(hertz[k])
-            if any(abs(f - m * round(f / m)) < 1.0 and f < 8.5 * m for m in _MAINS):
+            if any(abs(f - m * round(f / m)) < 1.0 and f < 8.5 * m for m in (50.0, 60.0)):
                 continue
-            orders = np.arange(int(rate / 2 / f0) + 1, _FOLDED)
+            orders = np.arange(int(rate / 2 / f0) + 1, 60)
             alias = np.abs(orders * f0 - rate * np.round(orders * f0 / rate))
             off = np.abs(alias - f)
             if len(orders) and off.min() < 1.5 * rate / n + 1e-4 * f0 * orders[off.argmin()]:

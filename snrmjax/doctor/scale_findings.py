@@ -1,5 +1,6 @@
 """The modal mass that a table asks for over the model's: rms, units, volts, another shape."""
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -51,9 +52,20 @@ def scale_findings(
     states, stiffness = scale.judged.states, scale.judged.stiffness
     bend = _bend(states, stiffness, model)
     right = bend is not None and abs(np.log(bend)) < OTHER_SCALE * 3
-    units = [one for one in _MIXED_UNITS if abs(off - np.log(one.mass)) < near]
+    units = [one for one in _mixed_units() if abs(off - np.log(one.mass)) < near]
     units = [one for one in units if not (right and one.column == "response")]
-    found = [_wrong_unit(own, units, where)] if units else []
+    found = []
+    if units:
+        words = [f"the {one.column} in {one.unit}, taken for {one.taken_for}" for one in units]
+        right = ", or ".join(f"{one.column}s in {one.unit}" for one in units)
+        found.append(
+            Finding(
+                *("wrong_unit", "error", where),
+                f"{own}: the factor {units[0].mass:.4g} of {', or '.join(words)}.",
+                f"import again, {right}.",
+                repairs=tuple(one.repair for one in units),
+            )
+        )
     severity: Severity = "warning" if units else "error"
     size = "if the units are right" if units else size
     volts = Finding(
@@ -77,7 +89,7 @@ def scale_findings(
     return [*found, *[volts] * (of_force >= of_shape), *[shape] * (of_shape >= of_force)]
 
 
-class MixedUnit(NamedTuple):
+class _MixedUnit(NamedTuple):
     """Numbers of one unit that were read as another's, and what the modal mass then becomes."""
 
     column: str  # "response" or "force"
@@ -86,50 +98,28 @@ class MixedUnit(NamedTuple):
     mass: float  # over the model's
 
     @property
-    def words(self) -> str:
-        """The mistake."""
-        return f"the {self.column} in {self.unit}, taken for {self.taken_for}"
-
-    @property
     def repair(self) -> Repair:
         """Reading with the right unit."""
-        unit = _WRITTEN.get(self.unit, self.unit)
+        written = {"m/s²": "m/s2", "µm": "um", "inches": "in", "pounds": "lbf"}
+        unit = written.get(self.unit, self.unit)
         if self.column == "force":
             return Repair(force=1 / self.mass, force_unit=unit)
         return Repair(response=self.mass, unit=unit)
 
 
-# The likely one first: a number of the small unit read as one of the large, then the reverse.
-_SIZES = (
-    *(("response", "g", "m/s²", 9.80665), ("response", "mm", "m", 1e-3)),
-    *(("response", "µm", "m", 1e-6), ("response", "inches", "m", 0.0254)),
-    *(("force", "mN", "N", 1e-3), ("force", "kN", "N", 1e3), ("force", "pounds", "N", 4.4482216)),
-)
-_WRITTEN = {"m/s²": "m/s2", "µm": "um", "inches": "in", "pounds": "lbf"}
+def _mixed_units() -> Iterator[_MixedUnit]:
+    """κ is force over response: upside down for a force, and where both units change places.
 
-
-def _every_mix_up() -> tuple[MixedUnit, ...]:
-    """κ is force over response: upside down for a force, and where both units change places."""
-    taken, swapped = [], []
-    for column, unit, other, size in _SIZES:
-        mass = size if column == "response" else 1 / size
-        taken.append(MixedUnit(column, unit, other, mass))
-        swapped.append(MixedUnit(column, other, unit, 1 / mass))
-    return (*taken, *swapped)
-
-
-_MIXED_UNITS = _every_mix_up()
-
-
-def _wrong_unit(size: str, units: list[MixedUnit], where: str) -> Finding:
-    words = ", or ".join(one.words for one in units)
-    right = ", or ".join(f"{one.column}s in {one.unit}" for one in units)
-    return Finding(
-        *("wrong_unit", "error", where),
-        f"{size}: the factor {units[0].mass:.4g} of {words}.",
-        f"import again, {right}.",
-        repairs=tuple(one.repair for one in units),
+    The likely one first: a number of the small unit read as one of the large, then the reverse.
+    """
+    every = (
+        *(("response", "g", "m/s²", 9.80665), ("response", "mm", "m", 1e-3)),
+        *(("response", "µm", "m", 1e-6), ("response", "inches", "m", 0.0254)),
+        *(("force", "mN", "N", 1e3), ("force", "kN", "N", 1e-3)),
+        ("force", "pounds", "N", 1 / 4.4482216),
     )
+    yield from (_MixedUnit(*one) for one in every)
+    yield from (_MixedUnit(of, other, unit, 1 / mass) for of, unit, other, mass in every)
 
 
 def _signs(fit: Judged, model: Structure, bend: float | None) -> tuple[int, int]:

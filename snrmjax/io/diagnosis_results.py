@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from snrmjax.diagnose.design.discriminating_test import DiscriminatingTest
 from snrmjax.diagnose.diagnosis_result import Diagnosis
-from snrmjax.diagnose.laws.law_table import DrawnLaw
+from snrmjax.diagnose.laws.law_search import DrawnLaw
 from snrmjax.diagnose.response_prediction import LevelResponse
 from snrmjax.diagnose.search.locating import Located
 from snrmjax.model.effect_metadata import Argument

@@ -10,9 +10,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from snrmjax.diagnose import priors
 from snrmjax.diagnose.diagnosis_result import Diagnosis
-from snrmjax.diagnose.held_velocity import HeldCurve, at_curve_force
-from snrmjax.diagnose.search.model_search import DETECTED
+from snrmjax.diagnose.response_prediction import HeldCurve, at_curve_force
 from snrmjax.io.units import DEGREE, HERTZ
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.effect_base import (
@@ -128,7 +128,7 @@ def candidates_figure(diagnosis: Diagnosis) -> Figure:
     colours = [IDENTIFIED if row.kind in answer else MEASURED for row in rows]
     names, gains = [effect_name(row.kind) for row in rows], [row.gain for row in rows]
     axes.barh(names, gains, color=colours, height=0.7)
-    axes.axvline(DETECTED, color=SIMULATED, linestyle="--", linewidth=0.8)
+    axes.axvline(priors.DETECTED, color=SIMULATED, linestyle="--", linewidth=0.8)
     axes.grid(visible=False, axis="y")
     name_axes(axes, "", "Gain of the information criterion", "")
     return figure

@@ -11,17 +11,19 @@ from matplotlib.figure import Figure
 
 from snrmjax.diagnose.decide import Verdict
 from snrmjax.diagnose.diagnosis import diagnose_model
-from snrmjax.diagnose.diagnosis_result import AS_NOISE, Diagnosis, FormerAnswer
+from snrmjax.diagnose.diagnosis_result import Diagnosis, FormerAnswer
 from snrmjax.diagnose.diagnosis_result import probability_in_words as in_words
 from snrmjax.diagnose.evidence import NOISE_REJECTED, NONE, UNKNOWN
-from snrmjax.diagnose.held_velocity import held_curves, holds_response
+from snrmjax.diagnose.misfit.candidates import scales_of_motions
+from snrmjax.diagnose.priors import AS_NOISE
 from snrmjax.diagnose.response_prediction import (
     LevelResponse,
+    held_curves,
+    holds_response,
     predict_levels,
 )
-from snrmjax.diagnose.search.detection_limits import beyond_data, scales_of_motions
 from snrmjax.diagnose.search.locating import Located
-from snrmjax.diagnose.search.model_search import TriedEffect
+from snrmjax.diagnose.search.model_search import TriedEffect, beyond_data
 from snrmjax.io.diagnosis_results import summarise_diagnosis
 from snrmjax.io.files import write_summary
 from snrmjax.io.models import write_model
@@ -323,8 +325,10 @@ def _step(number_of: int, count: int) -> str:
 def _limits_section(diagnosis: Diagnosis) -> Section:
     rows, misfit, scales = [], diagnosis.force_misfit, None
     if diagnosis.completed is not None:
-        modes = diagnosis.completed.modes
-        scales = scales_of_motions(modes, diagnosis.data, misfit.rows, misfit.sensor)
+        modes, data = diagnosis.completed.modes, diagnosis.data
+        columns = (np.abs(data.velocity[:, misfit.sensor]), data.frequency, data.force)
+        of_states = (np.asarray(column)[misfit.rows] for column in columns)
+        scales = scales_of_motions(modes, misfit.sensor, *of_states)
     for name, limit in sorted(diagnosis.detection_limits.items()):
         kind, parameter = name.split(".", 1)
         size = (number(limit, 2), _unit(kind, parameter))

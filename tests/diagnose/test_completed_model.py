@@ -7,7 +7,7 @@ import pytest
 from truths.balanced_sets import OMEGA, ZETA, balanced, linear_model
 
 import snrmjax as sj
-from snrmjax.diagnose.completed_model import CompletedStatus, completed_model
+from snrmjax.diagnose.diagnosis_result import CompletedStatus, completed_model
 from snrmjax.io.models import read_model
 from snrmjax.report.diagnosis_report import write_diagnosis
 

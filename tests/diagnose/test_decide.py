@@ -17,9 +17,8 @@ from truths.made_up_misfits import (
 )
 
 from snrmjax.diagnose import priors
-from snrmjax.diagnose.checks.cross_validation import HeldOut, HeldOutLevels
-from snrmjax.diagnose.checks.level_forces import LevelForces
-from snrmjax.diagnose.checks.patterns import pattern
+from snrmjax.diagnose.checks.gains import LevelForces
+from snrmjax.diagnose.checks.residuals import HeldOut, HeldOutLevels, pattern
 from snrmjax.diagnose.decide import decide, most_probable
 from snrmjax.diagnose.evidence import Weighed, Weights, weights_of
 from snrmjax.diagnose.misfit.candidates import candidate

@@ -21,16 +21,16 @@ from truths.balanced_sets import (
 )
 
 import snrmjax as sj
-from snrmjax.diagnose.checks.cross_validation import held_out
 from snrmjax.diagnose.checks.doubts import acts_both_ways, even_share
-from snrmjax.diagnose.misfit.candidates import candidate
+from snrmjax.diagnose.checks.residuals import held_out
+from snrmjax.diagnose.misfit.candidates import candidate, parameter_labels
 from snrmjax.diagnose.misfit.effect_fit import (
     baseline_fit,
     fit_effect,
     unfitted,
     with_errors_passed_on,
 )
-from snrmjax.diagnose.misfit.predictions import predictions_of, scales_of
+from snrmjax.diagnose.misfit.predictions import Predictions, predictions_of, scales_of
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit, weighted_misfit
 from snrmjax.diagnose.response_prediction import (
     level_forces,
@@ -188,16 +188,15 @@ def test_a_start_that_is_too_strong_to_have_a_motion_is_known_by_a_weaker_one(mo
     predictions = predictions_of(linear_model(), balanced(quadratic))
     one = candidate("cubic_damping", scales_of(predictions))
     usual = weighted_misfit(predictions).first_change(one)
-    whole = WeightedMisfit.predicted
+    whole, (place,) = Predictions.of, predictions.group.places([parameter_labels(one.kind)[0]])
 
-    def only_weak(self, group, labels, values, *, slopes):
-        found = whole(self, group, labels, values, slopes=slopes)
-        return found._replace(
-            columns=np.where(values[0, 0] > 0.5 * one.unit[0], np.nan, 1) * found[0]
-        )
+    def only_weak(self, values, along=()):
+        found = whole(self, values, along)
+        strong = values[0, place] > 0.5 * one.unit[0]
+        return found._replace(columns=np.where(strong, np.nan, 1) * found.columns)
 
     misfit = weighted_misfit(predictions)
-    monkeypatch.setattr(WeightedMisfit, "predicted", only_weak)
+    monkeypatch.setattr(Predictions, "of", only_weak)
     # A force of first order: what is left is what its harmonics do to each other.
     np.testing.assert_allclose(
         misfit.first_change(one), usual, rtol=0, atol=5e-3 * np.abs(usual).max()
@@ -215,9 +214,9 @@ def test_a_step_that_promises_nothing_is_taken_without_a_look(monkeypatch):
     looked = []
     whole = WeightedMisfit.evaluated
 
-    def counted(self, group, labels, values):
+    def counted(self, labels, values):
         looked.append(len(values))
-        return whole(self, group, labels, values)
+        return whole(self, labels, values)
 
     monkeypatch.setattr(WeightedMisfit, "evaluated", counted)
     # 0.1σ off, χ² is 0.01 above its least: less than what ends a fit.

@@ -9,10 +9,9 @@ from matplotlib.figure import Figure
 from truths.balanced_sets import balanced, linear_model, quadratic
 
 import snrmjax as sj
-from snrmjax.diagnose.completed_model import CompletedStatus
 from snrmjax.diagnose.decide import Verdict, verdict_sentence
-from snrmjax.diagnose.diagnosis import _notes_on_fits, _unconverged
-from snrmjax.diagnose.diagnosis_result import unit_of
+from snrmjax.diagnose.diagnosis import _notes_on_fits
+from snrmjax.diagnose.diagnosis_result import CompletedStatus, unit_of
 from snrmjax.diagnose.search.model_search import TriedEffect
 from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
 
@@ -52,15 +51,11 @@ def test_the_last_line_says_how_the_fits_ended(found):
     nothing = found.answer._replace(
         status=MinimisationStatus.NOT_FITTED, completed_status=CompletedStatus.NOTHING_ADDED
     )
-    early = found.checks._replace(unconverged_fits=3)
-    none = found.checks._replace(unconverged_fits=0)
-    tried = sum(len(step) for step in found.table)
-    for answer, checks, line in (
-        (nothing, none, "status: nothing was added to the model"),
-        (found.answer, none, "status: fit converged"),
-        (found.answer, early, f"status: fit converged; 3 of {tried} compared fits stopped early"),
+    for answer, line in (
+        (nothing, "status: nothing was added to the model"),
+        (found.answer, "status: fit converged"),
     ):
-        one = dataclasses.replace(found, answer=answer, checks=checks, notes=())
+        one = dataclasses.replace(found, answer=answer, notes=())
         assert repr(one).splitlines()[-1].strip() == line
 
 
@@ -85,16 +80,6 @@ def test_a_diagnosis_is_drawn(found):
     assert len(figure.axes[0].collections[0].get_offsets()) == len(found.force_misfit.rows)
 
 
-def test_fits_that_did_not_converge_are_marked_and_counted(found):
-    rows = [row for step in found.table for row in step]
-    unconverged = [row for row in rows if not row.status.found_minimum]
-    assert found.checks.unconverged_fits == len(unconverged)
-    notes = [note for note in found.notes if "stopped early" in note]
-    assert len(notes) == bool(unconverged)
-    if notes:
-        assert notes[0].startswith(f"{len(unconverged)} of {len(rows)} trial fits")
-
-
 def test_effects_that_could_not_be_fitted_are_named():
     def tried(kind, gain, status):
         return TriedEffect(kind, gain, -gain, {}, status)
@@ -106,11 +91,7 @@ def test_effects_that_could_not_be_fitted_are_named():
         tried("one_sided_stop", -np.inf, MinimisationStatus.NOT_FINITE),
     )
     found = SimpleNamespace(table=(step,))
-    unconverged, lost = _notes_on_fits(found, _unconverged(found))
-    assert unconverged == (
-        "2 of 4 trial fits stopped early; 1 may be as good as the best, so the answer may depend "
-        "on them."
-    )
+    (lost,) = _notes_on_fits(found)
     assert lost.startswith("one_sided_stop could not be fitted")
 
 

@@ -130,15 +130,12 @@ def test_evidence_of_a_small_answer_is_the_integral_over_its_sizes():
     grid_noise = np.linspace(-0.6, 0.6, 13)
     density = norm.pdf(grid_noise, scale=0.2)
 
-    def of_noise(logs):
-        found = norm.logpdf(logs, scale=0.2)
-        return found - logsumexp(found)
-
+    noise = np.linspace(-0.6, 0.6, 57)
+    right = norm.logpdf(noise, scale=0.2)
     sizes = _Sizes(
         (None, None, HalfNormalSize(1.0), None, flat),
         ((0, 0), (0, 0), (np.log(1e-3), np.log(1e3)), (0, 0), tuple(bounds)),
-        (of_noise, lambda logs: np.full(len(logs), -np.inf)),
-        (-0.6, 0.6),
+        *(noise, right - logsumexp(right), np.full(len(noise), -np.inf)),
     )
     grids = grid_noise, np.linspace(-6, 3, 40), np.linspace(*bounds, 24)
     scale, *two = np.meshgrid(*grids, indexing="ij")
@@ -163,7 +160,7 @@ def test_evidence_of_an_effect_is_the_integral_over_its_prior(misfit, fit):
     """By quadrature over the strength, every prediction computed anew."""
     one = candidate("quadratic_damping", scales_of(misfit.predictions))
     strength = fit.values[0] * np.linspace(0.5, 1.5, 41)
-    rows, _ = misfit.evaluated(misfit.predictions.group, fit.labels, strength[:, None])
+    rows, _ = misfit.evaluated(fit.labels, strength[:, None])
     shared = misfit.noise.shared
     covariance = np.eye(misfit.n_rows) + shared @ shared.T
     logs = multivariate_normal.logpdf(rows, cov=covariance)

@@ -8,16 +8,15 @@ import pytest
 from truths import one_mode
 
 import snrmjax as sj
-from snrmjax.diagnose.held_velocity import holds_response
+from snrmjax.diagnose import response_prediction
 from snrmjax.diagnose.misfit.predictions import with_idle_effects
 from snrmjax.diagnose.response_prediction import (
-    LevelModels,
     LevelResponse,
     PhaseResonance,
+    holds_response,
     level_forces,
-    level_responses,
-    level_simulations,
     measured_resonance,
+    predicted_levels,
     responses,
     simulated_resonance,
 )
@@ -82,16 +81,16 @@ def test_one_program_simulates_before_after_and_what_has_not_seen_a_level():
         )
         for more in (ZETA, 2 * ZETA)
     )
-    found = level_simulations(LevelModels(model, doubled, {1: tripled}), data, 0)
-    assert [len(part) for part in found] == [2, 2, 1]
-    rows = level_responses(found, data, 0)
+    found = predicted_levels(model, doubled, data, 0, {1: tripled})
+    assert len(found.before) == len(found.after) == 2
+    rows = found.levels
     assert [row.held_out for row in rows] == [False, True]
     for row, factor in zip(rows, (2.0, 3.0), strict=True):
         tip = SHAPE**2 * row.force / (2 * ZETA * OMEGA)
         assert row.before.velocity == pytest.approx(tip, rel=1e-9)
         assert row.after.velocity == pytest.approx(tip / factor, rel=1e-9)
         assert row.completed.velocity == pytest.approx(tip / 2.0, rel=1e-9)  # seen or not
-    louder = level_responses(level_simulations(LevelModels(model, doubled), data, 0, 1.5), data, 0)
+    louder = predicted_levels(model, doubled, data, 0, force_gain=1.5).levels
     for row, same in zip(louder, rows, strict=True):
         assert row.before.velocity == pytest.approx(same.before.velocity, rel=1e-9)
         tip = SHAPE**2 * row.force / (2 * ZETA * OMEGA)
@@ -212,15 +211,20 @@ def test_without_phases_a_resonance_is_the_largest_velocity_over_force():
     assert np.isnan(measured_resonance(side, 0, 0).frequency)
 
 
-def test_a_response_that_ends_early_is_said():
+def test_a_response_that_ends_early_is_said(monkeypatch):
     model, data = linear(), states(linear())
     damped = make_effect("linear_damping_change", {"damping_ratio_change": ZETA})
     doubled = dataclasses.replace(model, effects=(damped,))
-    found = level_simulations(LevelModels(model, doubled), data, 0)
-    assert all(row.complete for row in level_responses(found, data, 0))
-    (curve,) = found.after[1]
-    found.after[1][0] = dataclasses.replace(curve, status=sj.simulate.CurveStatus.POINT_LIMIT)
-    rows = level_responses(found, data, 0)
+    assert all(row.complete for row in predicted_levels(model, doubled, data, 0).levels)
+
+    def ended(*asked):
+        found = responses(*asked)
+        early = sj.simulate.CurveStatus.POINT_LIMIT
+        found[3] = [dataclasses.replace(curve, status=early) for curve in found[3]]
+        return found
+
+    monkeypatch.setattr(response_prediction, "responses", ended)
+    rows = predicted_levels(model, doubled, data, 0).levels
     assert [row.complete for row in rows] == [True, False]
     (note,) = _incomplete(rows)
     assert "level 1 were not traced to the end" in note

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from truths.one_mode import model, noisy, states, table
 
-from snrmjax.doctor.checked_states import checked_states
 from snrmjax.doctor.corrections import Tried, corrections, likeliest
-from snrmjax.doctor.judgement import any_mass, judge, with_mass
+from snrmjax.doctor.judgement import any_mass, checked_states, judge, with_mass
 from snrmjax.doctor.priors import MOVES
 
 

@@ -8,8 +8,7 @@ from scipy.signal import lsim
 from truths.one_mode import CUBIC, OMEGA, SHAPE, ZETA, model, noisy, states, table
 
 import snrmjax as sj
-from snrmjax.doctor.checked_states import checked_states
-from snrmjax.doctor.judgement import Scale, judge, with_mass
+from snrmjax.doctor.judgement import Scale, checked_states, judge, with_mass
 from snrmjax.doctor.scale_findings import is_other_scale
 from snrmjax.measure import Channel, time_recording
 

@@ -6,7 +6,7 @@ import pytest
 from truths.balanced_sets import OMEGA, PARTICIPATION, SHAPE, ZETA, linear_model
 
 import snrmjax as sj
-from snrmjax.diagnose.held_velocity import held_curves
+from snrmjax.diagnose.response_prediction import held_curves
 from snrmjax.io.units import HERTZ
 from snrmjax.report.diagnosis_figures import held_velocity_figure
 

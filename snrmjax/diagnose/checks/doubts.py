@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from snrmjax.diagnose import priors
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
 from snrmjax.diagnose.search.locating import Located
@@ -16,12 +17,6 @@ from snrmjax.model.effect_metadata import Imitation, Shape
 from snrmjax.model.effect_shape import acts_like, shape_of
 from snrmjax.model.effects import EFFECTS
 from snrmjax.model.library.internal_resonances import AbstractInternalResonance
-
-_CONTRADICTED = 4.0  # 1σ between an exponent and the law that was named
-_CURVE = 0.05  # 1σ of an exponent that a free curve of few knots adds
-_EXCLUDED = 2.0  # 1σ from the even part that a damping of one direction has
-_SEEN = 3.0  # 1σ of an even part that is there
-_SAMPLES = 256  # of a cycle
 
 
 class Doubt(NamedTuple):
@@ -54,7 +49,23 @@ def doubts(
     lowest order only; `feeding` are kinds of damping with a negative coefficient, which add
     energy; `wide` are internal resonances wider than the measured range (`wider_than_measured`).
     """
-    found = _of_harmonics(effects, orders, both_ways)
+    found = []
+    mine = [kind for kind in effects if is_drag(kind) and kind not in both_ways]
+    if mine:
+        closer = " with less noise" if 2 in orders else ""
+        found.append(
+            Doubt(
+                f"a damping that acts in one direction only has the same fundamental as {mine[0]}.",
+                f"record harmonic 2 at the largest level{closer}",
+                identical=True,
+            )
+        )
+    imitations = [one for kind in effects for one in EFFECTS[kind].imitations]
+    found += [
+        _doubt(one)
+        for one in imitations
+        if one.unless_harmonic is not None and one.unless_harmonic not in orders
+    ]
     # Nothing passive adds energy: there is a source, whose law may be another one.
     found += [
         Doubt(
@@ -69,10 +80,7 @@ def doubts(
     if len(effects) == 1:
         found += _of_exponent(effects[0], located, own_power)
     found += [
-        _doubt(one)
-        for kind in effects
-        for one in EFFECTS[kind].imitations
-        if one.unless_harmonic is None and one.near_power is None
+        _doubt(one) for one in imitations if one.unless_harmonic is None and one.near_power is None
     ]
     found += [
         Doubt(
@@ -83,9 +91,19 @@ def doubts(
         for kind in effects
         if kind in wide
     ]
+    return found + _of_several(effects)
+
+
+def _of_several(effects: tuple[str, ...]) -> list[Doubt]:
+    """What effects may stand for together."""
+    found = []
     if len(effects) > 2:
         found.append(Doubt("three effects together can fit most laws.", WIDER))
-    alike = [pair for pair in combinations(effects, 2) if _act_alike(*pair)]
+    alike = [
+        (one, other)
+        for one, other in combinations(effects, 2)
+        if acts_like(EFFECTS[one]) == acts_like(EFFECTS[other]) is not None
+    ]
     if alike:
         found.append(
             Doubt(
@@ -120,30 +138,6 @@ def wider_than_measured(
     return width > float(np.ptp(frequency)) / (2 * np.pi)
 
 
-def _of_harmonics(
-    effects: tuple[str, ...], orders: tuple[int, ...], both_ways: frozenset[str]
-) -> list[Doubt]:
-    """Laws with the same fundamental, where the harmonic that separates them is not known well."""
-    found = []
-    mine = [kind for kind in effects if is_drag(kind) and kind not in both_ways]
-    if mine:
-        closer = " with less noise" if 2 in orders else ""
-        found.append(
-            Doubt(
-                f"a damping that acts in one direction only has the same fundamental as {mine[0]}.",
-                f"record harmonic 2 at the largest level{closer}",
-                identical=True,
-            )
-        )
-    found += [
-        _doubt(one)
-        for kind in effects
-        for one in EFFECTS[kind].imitations
-        if one.unless_harmonic is not None and one.unless_harmonic not in orders
-    ]
-    return found
-
-
 def _doubt(one: Imitation) -> Doubt:
     return Doubt(one.reason, one.separated_by, identical=one.identical)
 
@@ -152,11 +146,6 @@ def _resonance(kind: str) -> type[AbstractInternalResonance] | None:
     """The internal resonance of a kind; None for other effects."""
     effect = EFFECTS[kind]
     return effect if issubclass(effect, AbstractInternalResonance) else None
-
-
-def _act_alike(one: str, other: str) -> bool:
-    """Whether two effects may be one law that the library lacks."""
-    return acts_like(EFFECTS[one]) == acts_like(EFFECTS[other]) is not None
 
 
 def is_drag(kind: str) -> bool:
@@ -193,8 +182,8 @@ def _of_exponent(effect: str, located: tuple[Located, ...], own_power: float | N
     mine = [p for p in located if p.part == part and p.exponent is not None]
     if not mine or mine[0].exponent is None or mine[0].exponent_std is None:
         return []
-    exponent, std = mine[0].exponent, float(np.hypot(mine[0].exponent_std, _CURVE))
-    if abs(exponent - expected) > _CONTRADICTED * std:
+    exponent, std = mine[0].exponent, float(np.hypot(mine[0].exponent_std, 0.05))
+    if abs(exponent - expected) > priors.CONTRADICTED * std:
         reason = (
             f"the {part} changes with the power {exponent:.2f} ± {std:.2f} of the amplitude, "
             f"not with the power {expected:.3g} of {effect}."
@@ -216,7 +205,7 @@ def acts_both_ways(misfit: WeightedMisfit, fit: EffectFit, kind: str) -> bool:
     if not is_drag(kind) or 2 not in chosen.orders or chosen.phase_unknown.any():
         return False
     share, std = even_share(misfit, fit, kind)
-    return abs(share) < _SEEN * std and abs(share) + _EXCLUDED * std < 1
+    return abs(share) < 3 * std and abs(share) + 2 * std < 1
 
 
 def even_share(misfit: WeightedMisfit, fit: EffectFit, kind: str) -> tuple[float, float]:
@@ -256,7 +245,7 @@ def _second_harmonic(
     effect = EFFECTS[kind](*(jnp.asarray(value) for value in parameters))
     if not isinstance(effect, AbstractMemoryless):
         return np.zeros_like(speed)
-    phase = 2 * np.pi * np.arange(_SAMPLES) / _SAMPLES
+    phase = 2 * np.pi * np.arange(256) / 256
     velocity = jnp.asarray(speed[:, None] * np.abs(np.cos(phase)))
     force = jax.vmap(jax.vmap(effect.force))(jnp.zeros_like(velocity), velocity)
     return 2 * np.mean(np.asarray(force) * np.cos(2 * phase), axis=1)

@@ -12,11 +12,6 @@ from snrmjax.diagnose.misfit.programs import COMPARED
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit, weighted_misfit
 from snrmjax.measure.states import SteadyStates, steady_states
 
-HARMONICS = COMPARED
-"""Those that are predicted for a further test."""
-
-_RESOLUTION = 1e-12  # of singular values: directions that no state determines stay open
-
 
 class DesignPoints(NamedTuple):
     """States of a further test: motions of a measured level, scaled."""
@@ -39,9 +34,8 @@ class PredictedTest(NamedTuple):
         """The same test with another noise of harmonics."""
         chosen = self.misfit.predictions.chosen
         own = chosen.states.own_std * (floor / self.floor)
-        states = chosen.states._replace(own_std=own)
-        misfit = self.misfit.with_states(chosen._replace(states=states))
-        return self._replace(misfit=misfit, floor=floor)
+        chosen = chosen._replace(states=chosen.states._replace(own_std=own))
+        return self._replace(misfit=self.misfit.with_states(chosen), floor=floor)
 
 
 def predicted_test(
@@ -81,35 +75,24 @@ def predicted_test(
     force, harmonics = _needed(misfit, fit, data)
     good = np.isfinite(np.abs(force)) & np.all(np.isfinite(harmonics), axis=1)
     turn = np.exp(-1j * np.angle(force))
-    seen = harmonics * turn[:, None] ** np.array(HARMONICS)
+    seen = harmonics * turn[:, None] ** np.array(COMPARED)
     own = np.exp(1j * aim) * size * turn
     found = _states(
         misfit, whose[good], at[good], own[good], np.abs(force)[good], seen[good], floor
     )
     predictions = predictions_of(misfit.model, found, misfit.predictions.force_gain_std)
     rows = tuple(whose[good] == number for number in range(len(points)))
-    ends = [_at_resonance(data=found, mine=mine, sensor=sensor) for mine in rows]
-    force_at, frequency_at = zip(*ends, strict=True)
-    return PredictedTest(
-        with_errors_passed_on(weighted_misfit(predictions), fit),
-        rows,
-        force_at,
-        frequency_at,
-        floor,
-    )
-
-
-def _at_resonance(
-    data: SteadyStates, mine: Bool[np.ndarray, " state"], sensor: int
-) -> tuple[float, float]:
-    """Force and frequency where the phase is zero; NaN without states."""
-    if not mine.any():
-        return np.nan, np.nan
-    phase = np.angle(np.asarray(data.velocity)[mine, sensor])
-    order = np.argsort(phase)
-    force, omega = (np.asarray(part)[mine][order] for part in (data.force, data.frequency))
-    at = [float(np.interp(0.0, phase[order], part)) for part in (force, omega)]
-    return at[0], at[1]
+    phases = np.angle(np.asarray(found.velocity)[:, sensor])
+    at_resonance = []
+    for column in (found.force, found.frequency):  # where the phase is zero; NaN without states
+        own = []
+        for mine in rows:
+            order = np.flatnonzero(mine)[np.argsort(phases[mine])]
+            known = order.size > 0
+            own.append(float(np.interp(0.0, phases[order], column[order])) if known else np.nan)
+        at_resonance.append(tuple(own))
+    passed_on = with_errors_passed_on(weighted_misfit(predictions), fit)
+    return PredictedTest(passed_on, rows, at_resonance[0], at_resonance[1], floor)
 
 
 def _states(
@@ -127,7 +110,7 @@ def _states(
     error = np.median(np.asarray(chosen.states.error), axis=0)
     alone = np.zeros((n, len(sensors)))
     alone[:, sensor] = 1.0
-    seen = np.zeros((n, len(HARMONICS))) if harmonics is None else harmonics
+    seen = np.zeros((n, len(COMPARED))) if harmonics is None else harmonics
     return steady_states(
         whose,
         omega,
@@ -141,7 +124,7 @@ def _states(
         order=np.ones(n),  # after the test
         harmonics=alone[:, :, None] * seen[:, None, :],
         harmonic_std=np.full((n, len(sensors)), floor),
-        harmonic_order=HARMONICS,
+        harmonic_order=COMPARED,
     )
 
 
@@ -150,26 +133,21 @@ def _needed(
 ) -> tuple[Complex[np.ndarray, " state"], Complex[np.ndarray, "state harmonic"]]:
     """The force that motions need under a fit, for one newton recorded, and their harmonics."""
     predictions = predictions_of(misfit.model, data)
-    group = predictions.group
-    values, own = group.values.copy(), misfit.baseline_parameters(fit.rows)
-    for name, value in (own | dict(zip(fit.labels, fit.values.tolist(), strict=True))).items():
-        values[group.place(name)] = value
-    columns = predictions.of(group, values[None]).columns[0]
+    own = misfit.baseline_parameters(fit.rows)
+    values = np.append(list(own.values()), fit.values)
+    columns = predictions.of(predictions.group.at((*own, *fit.labels), values)[None]).columns[0]
     parts = columns[:, 0::2] + 1j * columns[:, 1::2]
     first = len(predictions.chosen.sensors)  # the reference sensor's harmonics come first
-    higher = parts[:, first : first + len(HARMONICS)]
+    higher = parts[:, first : first + len(COMPARED)]
     velocity = np.asarray(predictions.chosen.states.velocity)[:, 0]
     return 1.0 + parts[:, 0], higher * np.abs(velocity)[:, None]
 
 
 def columns_of(predictions: Predictions, fit: EffectFit) -> Predicted | None:
     """Columns of all states under a fit's parameters; None where no program has all its effects."""
-    group = predictions.group
-    if not set(fit.labels) <= set(group.names):
+    if not set(fit.labels) <= set(predictions.group.names):
         return None
-    values = group.values.copy()
-    values[[group.place(label) for label in fit.labels]] = fit.values
-    return predictions.of(group, values[None], fit.labels)
+    return predictions.of(predictions.group.at(fit.labels, fit.values)[None], fit.labels)
 
 
 class Rows(NamedTuple):
@@ -213,18 +191,14 @@ def shared_by_both(
     )
 
 
-def refitted_chi_square(rows: Rows, shared: Float[np.ndarray, "row shared"]) -> float:
+def refitted_chi_square(rows: Rows, covariance: SharedCovariance) -> float:
     """χ² when a fit's parameters have moved to where all rows put them, to first order."""
-    return _least(rows, shared_covariance(shared))
-
-
-def _least(rows: Rows, covariance: SharedCovariance) -> float:
-    """The same from the covariance."""
     size = np.linalg.norm(rows.slopes, axis=0)
     arms = rows.slopes / np.where(size > 0, size, 1.0)
     arms, left = covariance.decorrelated(arms.T).T, covariance.decorrelated(rows.left)
     along, values, _ = np.linalg.svd(arms, full_matrices=False)
-    along = along[:, values > _RESOLUTION * max(values.max(initial=0.0), 1.0)]
+    # Directions that no state determines stay open.
+    along = along[:, values > 1e-12 * max(values.max(initial=0.0), 1.0)]
     return float(np.sum((left - along @ (along.T @ left)) ** 2))
 
 
@@ -242,10 +216,9 @@ def separation(
     """
     for _, _, rows in (truth, rival):
         kept = kept & np.isfinite(rows.left) & np.all(np.isfinite(rows.slopes), axis=1)
-    shared = shared_by_both(old, new, kept)
-    covariance = shared_covariance(shared)
+    covariance = shared_covariance(shared_by_both(old, new, kept))
     gains = []
     for before, least, after in (truth, rival):
         both = Rows(*(np.concatenate([a, b[kept]]) for a, b in zip(before, after, strict=True)))
-        gains.append(_least(both, covariance) - least)
+        gains.append(refitted_chi_square(both, covariance) - least)
     return gains[1] - gains[0]

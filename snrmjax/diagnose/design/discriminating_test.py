@@ -1,14 +1,14 @@
-"""Which further test is expected to separate competing models: optimal design."""
+"""Which further test is expected to separate competing models (optimal design), in words."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from snrmjax.diagnose import priors
 from snrmjax.diagnose.design.design_points import (
-    HARMONICS,
     DesignPoints,
     ModelRows,
     PredictedTest,
@@ -19,24 +19,17 @@ from snrmjax.diagnose.design.design_points import (
     refitted_chi_square,
     separation,
 )
-from snrmjax.diagnose.misfit.candidates import only_by_calibration
+from snrmjax.diagnose.misfit.candidates import decide_by, only_by_calibration
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
 from snrmjax.diagnose.misfit.predictions import Predicted
+from snrmjax.diagnose.misfit.programs import COMPARED
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
-from snrmjax.diagnose.search.model_search import AS_GOOD, FoundEffects
+from snrmjax.diagnose.search.model_search import FoundEffects
 
 STATES = 12
 """Of a level, or off resonance, in a further test."""
 
-_RIVALS = 4  # of a class, that are compared
-_WITHIN = np.radians(55.0)  # phases of a further level
-_OFF = np.radians(np.linspace(30.0, 60.0, STATES // 2))
-_HIGHER, _LOWER = (1.5, 2.0), 0.5  # times the velocities of the largest and the smallest level
 _CERTAIN = 1.64  # 1σ below the expected gain: noise leaves 95 % of tests with more
-_ORDINARY = 3e-3  # of the largest velocity: noise of harmonics measured without special care
-_RESOLVED = {"velocity": 0.01, "frequency": 2e-4}  # relative, by a careful test
-_SEEN = 0.1  # of the larger of two harmonics, above which the smaller one has a phase
-_CLOSER, _FINEST = 3.0, 1e-4  # factor between the noise floors tried, and the lowest one
 
 
 class ProposedLevel(NamedTuple):
@@ -104,15 +97,22 @@ def discriminating_test(found: FoundEffects, places: tuple[int, ...]) -> Discrim
     misfit = found.misfit
     speed = np.abs(np.asarray(misfit.predictions.chosen.states.velocity)[:, 0])
     floor = _floor(misfit)
-    ordinary = floor if floor is not None else _ORDINARY * float(speed.max())
+    # Without any, that of harmonics which are measured without special care.
+    ordinary = floor if floor is not None else 3e-3 * float(speed.max())
     groups = [list(_rivals(found, place)) for place in places]
     every = [rival for group in groups for rival in group]
     tried = [(found.fit, every)]
     tried += [(truth, [found.fit, *group]) for group in groups for truth in group]
-    hypotheses = [
-        _Hypothesis(misfit, truth, [fit for fit in rivals if _can_be_told(truth, fit)], ordinary)
-        for truth, rivals in tried
-    ]
+    hypotheses = []
+    for truth, rivals in tried:
+        differ = [set(truth.kinds) ^ set(fit.kinds) for fit in rivals]
+        # Some answers differ only by what a calibration separates.
+        told = [
+            fit
+            for fit, own in zip(rivals, differ, strict=True)
+            if own and not only_by_calibration(own)
+        ]
+        hypotheses.append(_Hypothesis(misfit, truth, told, ordinary))
     best: DiscriminatingTest | None = None
     for option in _options(ordinary, float(speed.max()), measured=floor is not None):
         worst: DiscriminatingTest | None = None
@@ -127,12 +127,6 @@ def discriminating_test(found: FoundEffects, places: tuple[int, ...]) -> Discrim
         if worst is not None and (best is None or _share(worst) > _share(best)):
             best = worst
     return best
-
-
-def _can_be_told(one: EffectFit, other: EffectFit) -> bool:
-    """Whether two answers differ by more than what only a calibration separates."""
-    differ = set(one.kinds) ^ set(other.kinds)
-    return bool(differ) and not only_by_calibration(differ)
 
 
 def _share(test: DiscriminatingTest) -> float:
@@ -155,21 +149,22 @@ def _design_points(misfit: WeightedMisfit) -> tuple[DesignPoints, ...]:
     peaks = [np.abs(velocity[level == k]).max() for k in range(level.max() + 1)]
     low, top = int(np.argmin(peaks)), int(np.argmax(peaks))
     again = np.sort(np.angle(velocity[level == top]))
-    off, spread = np.concatenate([-_OFF[::-1], _OFF]), np.linspace(-_WITHIN, _WITHIN, STATES)
-    higher = [DesignPoints(top, scale, spread) for scale in _HIGHER]
+    ends, near = np.radians(np.linspace(30.0, 60.0, STATES // 2)), np.radians(55.0)
+    off, spread = np.concatenate([-ends[::-1], ends]), np.linspace(-near, near, STATES)
     return (
         DesignPoints(top, 1.0, again[:: -(-len(again) // (2 * STATES))]),
         DesignPoints(low, 1.0, off),
         DesignPoints(top, 1.0, off),
-        DesignPoints(low, _LOWER, spread),
-        *higher,
+        DesignPoints(low, 0.5, spread),
+        DesignPoints(top, 1.5, spread),
+        DesignPoints(top, 2.0, spread),
     )
 
 
 def _options(ordinary: float, largest: float, *, measured: bool) -> Iterator[_Option]:
     """Measurements, the cheapest first."""
-    known = HARMONICS if measured else ()
-    each = [(h,) for h in HARMONICS] + [HARMONICS]
+    known = COMPARED if measured else ()
+    each = [(h,) for h in COMPARED] + [COMPARED]
     if not measured:
         yield from (_Option("harmonics", 0, orders, False, ordinary) for orders in each)
     yield from (_Option("off_resonance", place, known, True, None) for place in (1, 2))
@@ -177,48 +172,36 @@ def _options(ordinary: float, largest: float, *, measured: bool) -> Iterator[_Op
     yield from (_Option("higher_level", place, known, True, None) for place in (4, 5))
     floor = ordinary
     if not measured:
-        yield from (_Option("higher_level", p, HARMONICS, True, floor) for p in (4, 5))
-    while floor > _FINEST * largest:
-        floor = max(floor / _CLOSER, _FINEST * largest)
+        yield from (_Option("higher_level", p, COMPARED, True, floor) for p in (4, 5))
+    while floor > 1e-4 * largest:
+        floor = max(floor / 3, 1e-4 * largest)
         yield from (_Option("harmonics", 0, orders, False, floor) for orders in each)
-        yield from (_Option("higher_level", p, HARMONICS, True, floor) for p in (4, 5))
+        yield from (_Option("higher_level", p, COMPARED, True, floor) for p in (4, 5))
 
 
 def _rivals(found: FoundEffects, place: int) -> Iterator[EffectFit]:
     """The rivals of the answer in the class at a place, with their parameters from the table."""
     misfit = found.misfit
-    for name in found.classes[place][1 : 1 + _RIVALS]:
+    for name in found.classes[place][1:5]:
         kinds = {name if k == place else kind for k, kind in enumerate(found.fit.kinds)}
         # One effect with more parameters may stand for two.
-        fit = _from_table(found, kinds) or _from_table(found, {name})
-        columns = fit and columns_of(misfit.predictions, fit)
-        if fit is None or columns is None:
+        tables = (row.parameters for step in found.table[::-1] for row in step)
+        own = [({label.partition(".")[0] for label in one}, one) for one in tables]
+        last = [one for wanted in (kinds, {name}) for has, one in own if has == wanted][:1]
+        if not last:
+            continue
+        values, nothing = np.array(list(last[0].values())), np.zeros(0)
+        which = tuple(dict.fromkeys(label.partition(".")[0] for label in last[0]))
+        fit = EffectFit(
+            which, tuple(last[0]), values, np.inf, nothing, nothing[:, None], values, values
+        )
+        columns = columns_of(misfit.predictions, fit)
+        if columns is None:
             continue
         rows = in_noise_units(misfit, columns)
         if np.all(np.isfinite(rows.left)) and np.all(np.isfinite(rows.slopes)):
-            least = refitted_chi_square(rows, misfit.noise.shared)
+            least = refitted_chi_square(rows, misfit.noise.covariance)
             yield fit._replace(rows=rows.left, slopes=rows.slopes, chi_square=least)
-
-
-def _from_table(found: FoundEffects, kinds: set[str]) -> EffectFit | None:
-    """The last fit of some kinds that a table has, without its rows."""
-    for row in (row for step in found.table[::-1] for row in step):
-        if {label.partition(".")[0] for label in row.parameters} == kinds:
-            values = np.array(list(row.parameters.values()))
-            rows, slopes = np.zeros(0), np.zeros((0, len(values)))
-            labels = tuple(row.parameters)
-            return EffectFit(
-                tuple(kinds),
-                labels,
-                values,
-                row.chi_square,
-                rows,
-                slopes,
-                values,
-                values,
-                row.status,
-            )
-    return None
 
 
 class _Hypothesis:
@@ -247,7 +230,7 @@ class _Hypothesis:
     def _measured(self) -> list[tuple[Rows, float]]:
         """Rows of the measured states and χ² after a refit: of the truth, then of the rivals."""
         rows = [Rows(fit.rows, fit.slopes) for fit in (self.truth, *self.rivals)]
-        return [(one, refitted_chi_square(one, self.misfit.noise.shared)) for one in rows]
+        return [(one, refitted_chi_square(one, self.misfit.noise.covariance)) for one in rows]
 
     def expected(self, option: _Option) -> DiscriminatingTest | None:
         """The expected gain of an option over the rival that it separates least well."""
@@ -261,19 +244,24 @@ class _Hypothesis:
             return None
         own = ModelRows(*self._measured[0], in_noise_units(test.misfit, exact))
         found = []
-        for fit, before, columns in zip(self.rivals, self._measured[1:], others, strict=True):
-            if columns is None:
+        for fit, before, its in zip(self.rivals, self._measured[1:], others, strict=True):
+            if its is None:
                 continue
-            its = ModelRows(*before, in_noise_units(test.misfit, columns))
-            gain = separation(self.misfit, test.misfit, own, its, kept)
+            rival = ModelRows(*before, in_noise_units(test.misfit, its))
+            gain = separation(self.misfit, test.misfit, own, rival, kept)
             n = self.misfit.n_rows
-            needed = _needed(fit.criterion(n) - self.truth.criterion(n))
-            said = _difference(test, (self.truth, exact), (fit, columns), option)
+            # A gain G of χ² scatters by 2√G.
+            ahead = fit.criterion(n) - self.truth.criterion(n)
+            least = max(priors.AS_GOOD_BY_CRITERION - ahead, 0.0)
+            needed = float((_CERTAIN + np.sqrt(_CERTAIN**2 + least)) ** 2)
+            said = _difference(test, (self.truth, exact), (fit, its), option)
             found.append((gain, needed, *said))
         if not found:
             return None
         gain, needed, quantity, words = min(found, key=lambda one: one[0] / one[1])
-        one = self.points[option.place]
+        one, mine = self.points[option.place], test.members[option.place]
+        states = test.misfit.predictions.chosen.states
+        columns = (states.frequency, states.force, np.abs(states.velocity[:, 0]))
         size = np.degrees(np.abs(one.phase))
         place = ProposedLevel(
             level=int(self.misfit.level_numbers[one.level]),
@@ -291,14 +279,8 @@ class _Hypothesis:
             harmonic_std=option.floor,
             expected_gain=float(gain),
             needed_gain=needed,
-            planned=_planned(test, option),
+            planned=PlannedStates(*(np.asarray(column)[mine] for column in columns)),
         )
-
-
-def _planned(test: PredictedTest, option: _Option) -> PlannedStates:
-    states, mine = test.misfit.predictions.chosen.states, test.members[option.place]
-    columns = (states.frequency, states.force, np.abs(states.velocity[:, 0]))
-    return PlannedStates(*(np.asarray(column)[mine] for column in columns))
 
 
 def _what_to_measure(
@@ -328,22 +310,13 @@ def _what_to_measure(
     )
 
 
-def _needed(ahead: float) -> float:
-    """Expected gain over a rival that leaves it out of the class, if the truth is now `ahead`.
-
-    A gain G of χ² scatters by 2√G.
-    """
-    least = max(AS_GOOD - ahead, 0.0)
-    return float((_CERTAIN + np.sqrt(_CERTAIN**2 + least)) ** 2)
-
-
 def _rows(test: PredictedTest, option: _Option) -> Bool[np.ndarray, " row"]:
     noise = test.misfit.noise
     mine = test.members[option.place][noise.state]
     first = 2 * len(test.misfit.predictions.chosen.sensors)
     wanted = [noise.column < 2] if option.of_force else []
     for order in option.orders:
-        at = first + 2 * HARMONICS.index(order)
+        at = first + 2 * COMPARED.index(order)
         wanted.append((noise.column == at) | (noise.column == at + 1))
     return mine & np.logical_or.reduce(wanted)
 
@@ -369,7 +342,7 @@ def _difference(
         return "velocity", f"with {one} there is such a motion, with {other} there is none"
     at = mine[np.argmin(np.abs(np.angle(velocity[mine])))]
     if option.floor is not None:
-        places = [HARMONICS.index(h) for h in option.orders]
+        places = [COMPARED.index(h) for h in option.orders]
         own = np.asarray(states.harmonics)[at, 0, places] / np.abs(velocity[at])
         its = own + apart[at, [len(test.misfit.predictions.chosen.sensors) + k for k in places]]
         most = int(np.argmax(np.abs(own - its)))
@@ -377,7 +350,7 @@ def _difference(
         sizes = [f"{round(100 * abs(h[most]), 6):.2g} %" for h in (own, its)]
         both = np.abs([own[most], its[most]])
         turned = abs(np.degrees(np.angle(its[most] / own[most]))) if both.min() > 0 else 0.0
-        seen = both.min() > _SEEN * both.max() and turned > 1.0
+        seen = both.min() > 0.1 * both.max() and turned > 1.0
         turn = f", turned by {turned:.0f}°" if seen else ""
         words = f"{sizes[0]} of the fundamental with {one}, {sizes[1]}{turn} with {other}"
         return name, f"{name} is {words}"
@@ -388,7 +361,7 @@ def _difference(
     modes, j = test.misfit.model.modes, test.misfit.model.modes.mode_of_interest
     slower = float(apart[at, 0].real)
     shift = -float(apart[at, 0].imag * modes.damping_ratio[j])
-    if abs(slower) / _RESOLVED["velocity"] > abs(shift) / _RESOLVED["frequency"]:
+    if abs(slower) > 50 * abs(shift):  # a careful test resolves 1 % of one, 0.02 % of the other
         speed = float(np.abs(velocity[at]))
         values, unit, name = (speed, speed / max(1 + slower, 0.1)), "m/s", "velocity"
     else:
@@ -398,3 +371,61 @@ def _difference(
         name,
         f"{name} at resonance {values[0]:.4g} {unit} with {one}, {values[1]:.4g} with {other}",
     )
+
+
+def recommended_test(found: FoundEffects) -> DiscriminatingTest | None:
+    """The test that is expected to separate the effects that fit equally well.
+
+    A calibration where nothing else separates them; None where nothing is open.
+    """
+    open_places = [k for k, group in enumerate(found.classes) if len(group) > 1]
+    places = tuple(
+        k for k in open_places if set(found.classes[k]) - only_by_calibration(found.classes[k])
+    )
+    if not open_places:
+        return None
+    unclear = {kind for k in open_places for kind in found.classes[k]}
+    too = any(only_by_calibration(found.classes[k]) for k in open_places)
+    test = discriminating_test(found, places) if places else None
+    if test is not None:
+        return test._replace(calibration_too=too)
+    return DiscriminatingTest("calibration", decide_by(unclear, harmonics=True)) if too else None
+
+
+def recommendation(
+    found: FoundEffects,
+    test: DiscriminatingTest | None,
+    open_questions: Sequence[str],
+    *,
+    phases: bool,
+) -> str | None:
+    """What would decide, each measurement in one sentence and said once; None if nothing is open.
+
+    Arguments: `open_questions` are the measurements that would resolve doubts; `phases` says
+    whether any phase of the velocity is known.
+    """
+    groups = [set(group) for group in found.classes if len(group) > 1]
+    harmonics = bool(found.misfit.predictions.chosen.orders)
+    sentences = []
+    if groups and not phases:
+        sentences.append("Record the phase of the velocity relative to the force.")
+    if test is None or test.kind == "calibration":
+        sentences += [decide_by(set().union(*groups), harmonics=harmonics)] if groups else []
+    else:
+        static = [only_by_calibration(group) for group in groups]
+        sentences += [decide_by(group, harmonics=True) for group in static if group]
+        if not test.settles:
+            sentences.append(
+                "No single test that was compared is expected to decide; the most informative one:"
+            )
+        sentences.append(test.sentence)
+    sentences += [f"{text[0].upper()}{text[1:]}." for text in open_questions]
+    # Every measurement once: the most specific sentence of those that begin alike.
+    every = list(dict.fromkeys(sentences))
+    asked = [one.rstrip(".").lower() for one in every]
+    said = [
+        one
+        for k, one in enumerate(every)
+        if not any(asked[k] in other for j, other in enumerate(asked) if j != k)
+    ]
+    return " ".join(said) or None

@@ -1,43 +1,44 @@
 """Where no effect of the library explains the data, an answer by a law that is drawn from them."""
 
 import dataclasses
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
 
-from snrmjax.diagnose.checks.cross_validation import (
-    HeldOut,
+from snrmjax.diagnose import priors
+from snrmjax.diagnose.checks.residuals import (
     HeldOutLevels,
-    chi_square_of_level,
     held_out_by,
     held_out_places,
-    rows_of_level,
-)
-from snrmjax.diagnose.checks.patterns import (
-    UNLIKELY,
     left_curve,
     neighbour_noise,
     pattern,
+    rows_of_level,
     tolerated,
 )
-from snrmjax.diagnose.laws.law_prior import LawPosterior, posterior
-from snrmjax.diagnose.laws.law_search import LawFit, fit_laws, problem_of, secants_of
-from snrmjax.diagnose.laws.law_table import SURE, DrawnLaw, drawn_tables, law_effects, law_kind
+from snrmjax.diagnose.laws.law_prior import posterior
+from snrmjax.diagnose.laws.law_search import (
+    LAW_KINDS,
+    SURE,
+    DrawnLaw,
+    LawFit,
+    drawn_tables,
+    fit_laws,
+    law_effects,
+    law_problem,
+    secants_of,
+)
 from snrmjax.diagnose.misfit.effect_fit import EffectFit, baseline_fit
 from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
-from snrmjax.diagnose.search.model_search import DETECTED, FoundEffects
-from snrmjax.model.effect_base import AbstractEffect, AbstractMemoryless
+from snrmjax.diagnose.search.model_search import FoundEffects
+from snrmjax.model.effect_base import AbstractMemoryless
 from snrmjax.model.effect_metadata import Argument
 from snrmjax.model.effect_shape import shape_of
 from snrmjax.model.effects import EFFECTS
 from snrmjax.model.parameters import with_parameters
 from snrmjax.model.structures import Structure
-
-_CLOSEST = 2  # laws of the library that a note compares with
 
 
 class LawAnswer(NamedTuple):
@@ -65,58 +66,59 @@ def law_answer(found: FoundEffects, model: Structure) -> LawAnswer | None:
     others that was left out of the fit is predicted; and where the effects do not fit, its evidence
     must be better than theirs.
     """
-    misfit = found.misfit
     try:
-        fit = fit_laws(misfit)
+        fit = fit_laws(found.misfit)
     except np.linalg.LinAlgError:  # errors as a law passes them on leave nothing that was measured
         return None
-    if fit is None or not fit.settled or fit.posterior.cost > -DETECTED:
+    if fit is None or not fit.settled or fit.posterior.cost > -priors.DETECTED:
         return None
-    parts = fit.posterior.parts
+    misfit, numbers = fit.misfit, fit.misfit.level_numbers
     # Each with errors passed on as it passes them. Effects that fit were refuted otherwise.
-    rejected = found.p_value < UNLIKELY
-    if rejected and fit.criterion > found.fit.criterion(misfit.n_rows) - DETECTED:
+    rejected = found.p_value < priors.REJECTED
+    if rejected and fit.criterion > found.fit.criterion(misfit.n_rows) - priors.DETECTED:
         return None
     as_effect = _as_effect_fit(fit)
-    neighbours = neighbour_noise(fit.misfit, as_effect)
-    freedom = round(fit.misfit.n_rows - fit.posterior.freedom)
+    neighbours = neighbour_noise(misfit, as_effect)
+    freedom = round(misfit.n_rows - fit.posterior.freedom)
     p_value = chi_square_p_value(as_effect.chi_square, freedom)
-    structure = pattern(fit.misfit, as_effect) if p_value < UNLIKELY else None
-    allowed = tolerated(neighbours.variance) if structure is None else 1.0
-    if chi_square_p_value(as_effect.chi_square / allowed, freedom) < UNLIKELY:
+    structure = pattern(misfit, as_effect) if p_value < priors.REJECTED else None
+    allowed = tolerated(neighbours) if structure is None else 1.0
+    if chi_square_p_value(as_effect.chi_square / allowed, freedom) < priors.REJECTED:
         return None
-    if left_curve(fit.misfit, as_effect) is not None:
+    if left_curve(misfit, as_effect) is not None:
         return None
-    without = {place: _without(fit, place) for place in held_out_places(fit.misfit)}
-    levels = None
-    if without:
-        pairs = [_held_out(fit, place, one, allowed) for place, one in without.items()]
-        levels = HeldOutLevels(*pairs)
+    completed = _completed(model, misfit.baseline_parameters(as_effect.rows), fit, fit.secants)
+    pairs, completed_without = [], {}
+    for place in held_out_places(misfit):
+        # The same parts, sizes and reaches chosen without the level too.
+        kept = ~rows_of_level(misfit, place)
+        problem = law_problem(misfit, fit.columns, fit.secants, fit.knots, fit.units, kept)
+        without = posterior(problem, fit.posterior.parts)
+        rows = as_effect.rows + as_effect.slopes @ (without.mean - fit.posterior.mean)
+        values, vectors = np.linalg.eigh(without.covariance)
+        root = as_effect.slopes @ (vectors * np.sqrt(np.maximum(values, 0.0)))
+        before = baseline_fit(misfit).rows, np.zeros((misfit.n_rows, 0))
+        pairs.append(held_out_by(misfit, place, before, (rows, root), allowed))
+        secants = secants_of(without.parts, without.mean, fit.units)
+        baseline = misfit.baseline_parameters(rows, kept)
+        completed_without[int(numbers[place])] = _completed(model, baseline, fit, secants)
+    levels = HeldOutLevels(*pairs) if pairs else None
+    if levels is not None:
         # The top one is predicted by extrapolation, of which a law of any shape promises nothing.
         inner = levels.inner
-        worse = inner.after > inner.before and inner.p_value < UNLIKELY
-        if worse or inner.uncertain_p_value < UNLIKELY / 2:
+        worse = inner.after > inner.before and inner.p_value < priors.REJECTED
+        if worse or inner.uncertain_p_value < priors.REJECTED / 2:
             return None
     laws = tuple(drawn_tables(fit))
-    effects = law_effects(fit, fit.secants)
-    completed = _completed(model, fit.misfit.baseline_parameters(as_effect.rows), effects)
-    numbers = fit.misfit.level_numbers
-    completed_without = {}
-    for place, one in without.items():
-        kept = ~rows_of_level(fit.misfit, place)
-        rows = _rows(fit, one)
-        own = law_effects(fit, secants_of(parts, one.mean, fit.units))
-        baseline = fit.misfit.baseline_parameters(rows, kept)
-        completed_without[int(numbers[place])] = _completed(model, baseline, own)
     return LawAnswer(
         laws=laws,
-        kinds=tuple(effect.kind for effect in effects),
-        share=fit.share,
-        rivals=tuple(law_kind(part) for part in fit.rivals),
+        kinds=tuple(effect.kind for effect in completed.effects[len(model.effects) :]),
+        share=(1 - priors.NO_CURVE) * fit.share,
+        rivals=tuple(LAW_KINDS[part] for part in fit.rivals),
         fit=as_effect,
-        misfit=fit.misfit,
+        misfit=misfit,
         p_value=p_value,
-        noise=neighbours.variance,
+        noise=neighbours,
         levels=levels,
         completed=completed,
         completed_without=completed_without,
@@ -125,54 +127,24 @@ def law_answer(found: FoundEffects, model: Structure) -> LawAnswer | None:
     )
 
 
-def _arms(fit: LawFit) -> Float[np.ndarray, "row secant"]:
-    """Slopes of the rows by the secants of the law's parts, in units plainly seen."""
-    by, noise = fit.columns.by_secant, fit.misfit.noise
-    n = by.shape[-1]
-    units = secants_of(fit.posterior.parts, np.eye(n * len(fit.posterior.parts)), fit.units)
-    columns = np.einsum("sctk,etk->esc", by, units)
-    return noise.noise_units(columns).T
-
-
-def _rows(fit: LawFit, other: LawPosterior) -> Float[np.ndarray, " row"]:
-    """Misfits with other secants, to first order, in units of noise."""
-    return fit.rows + _arms(fit) @ (other.mean - fit.posterior.mean)
-
-
 def _as_effect_fit(fit: LawFit) -> EffectFit:
-    nothing = np.zeros(len(fit.posterior.mean))
-    kinds = tuple(law_kind(part) for part in fit.posterior.parts)
+    """The law as an effect whose parameters are the secants of its parts, in units plainly seen."""
+    parts, mean = fit.posterior.parts, fit.posterior.mean
+    units = secants_of(parts, np.eye(len(mean)), fit.units)
+    columns = np.einsum("sctk,etk->esc", fit.columns.by_secant, units)
+    slopes = fit.misfit.noise.noise_units(columns).T
+    kinds = tuple(LAW_KINDS[part] for part in parts)
     labels = tuple(f"{kind}_{k}" for k, kind in enumerate(kinds))
-    square = fit.misfit.chi_square(fit.rows)
-    anywhere = nothing - np.inf, nothing + np.inf
-    return EffectFit(kinds, labels, fit.posterior.mean, square, fit.rows, _arms(fit), *anywhere)
-
-
-def _without(fit: LawFit, place: int) -> LawPosterior:
-    """The same parts of a law by all levels but one, sizes and reaches chosen without it too."""
-    problem = problem_of(fit, ~rows_of_level(fit.misfit, place))
-    return posterior(problem, fit.posterior.parts)
-
-
-def _held_out(fit: LawFit, place: int, without: LawPosterior, noise: float) -> HeldOut:
-    """A level left out of the fit, predicted by the others."""
-    misfit, out = fit.misfit, rows_of_level(fit.misfit, place)
-    values, vectors = np.linalg.eigh(without.covariance)
-    root = _arms(fit) @ (vectors * np.sqrt(np.maximum(values, 0.0)))
-    none = np.zeros((misfit.n_rows, 0))
-    before, _ = chi_square_of_level(misfit, baseline_fit(misfit).rows, none, out)
-    after = chi_square_of_level(misfit, _rows(fit, without), root, out)
-    return held_out_by(misfit, place, before, after, noise)
+    square, anywhere = fit.misfit.chi_square(fit.rows), np.full(len(mean), np.inf)
+    return EffectFit(kinds, labels, mean, square, fit.rows, slopes, -anywhere, anywhere)
 
 
 def _completed(
-    model: Structure, baseline: dict[str, float], effects: Sequence[AbstractEffect]
+    model: Structure, baseline: dict[str, float], fit: LawFit, secants: np.ndarray
 ) -> Structure:
     """The model with its own parameters at their most likely values, and with a law."""
-    moved = model
-    if baseline:
-        moved = with_parameters(model, tuple(baseline), jnp.array(list(baseline.values())))
-    return dataclasses.replace(moved, effects=(*model.effects, *effects))
+    moved = with_parameters(model, tuple(baseline), jnp.array(list(baseline.values())))
+    return dataclasses.replace(moved, effects=(*model.effects, *law_effects(fit, secants)))
 
 
 def _notes(
@@ -198,7 +170,8 @@ def _notes(
     if _odd_alone(fit):
         notes.append("without harmonics the odd part of the force alone is seen.")
     if fit.rivals:
-        notes.append(f"{' or '.join(map(law_kind, fit.rivals))} would do about as well.")
+        rivals = [LAW_KINDS[part] for part in fit.rivals]
+        notes.append(f"{' or '.join(rivals)} would do about as well.")
     return notes + _closest(fit, first, found)
 
 
@@ -240,18 +213,10 @@ def _closest(fit: LawFit, law: DrawnLaw, found: FoundEffects) -> list[str]:
         pair = (zero, at) if law.argument is Argument.VELOCITY else (at, zero)
         force = np.asarray(own.cycle_force(*pair)) / size
         beyond = np.abs(force - law.force) > SURE * law.force_std + 1e-12 * np.abs(law.force).max()
-        notes.append(_where_beyond(row.kind, law, beyond))
-        if len(notes) == _CLOSEST:
-            break
-    return notes
-
-
-def _where_beyond(kind: str, law: DrawnLaw, beyond: Bool[np.ndarray, " knot"]) -> str:
-    unit = "m/s" if law.argument is Argument.VELOCITY else "m"
-    if not beyond.any():
-        return f"{kind}, fitted alone, stays within the 95 % band of the law."
-    at = law.at[beyond]
-    return (
-        f"{kind}, fitted alone, leaves the 95 % band of the law between {at.min():.3g} and "
-        f"{at.max():.3g} {unit}."
-    )
+        unit = "m/s" if law.argument is Argument.VELOCITY else "m"
+        said = "stays within the 95 % band of the law."
+        if beyond.any():
+            ends = f"{law.at[beyond].min():.3g} and {law.at[beyond].max():.3g} {unit}"
+            said = f"leaves the 95 % band of the law between {ends}."
+        notes.append(f"{row.kind}, fitted alone, {said}")
+    return notes[:2]

@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from snrmjax.diagnose.misfit.predictions import Predictions
 from snrmjax.diagnose.misfit.programs import ComparedMotion
@@ -29,12 +29,10 @@ from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance
 from snrmjax.simulate.balance.harmonics import harmonic_basis
 from snrmjax.simulate.balance.prescribed_motion import PrescribedMotion, start_of
 
-_BLOCK = 32  # states of a program: slopes by many knots take room
 _SAMPLES = 256  # of a cycle
-_CLOSE = 1e-8  # last step of a motion's solution
 
-TABLES = 6
-"""Of secants: springs and dampers in either direction, damping by displacement, slip."""
+TABLES = 5
+"""Of secants: springs in either direction, dampers, damping by displacement, slip."""
 
 
 class LawKnots(NamedTuple):
@@ -62,10 +60,9 @@ def law_columns(
     predictions: Predictions,
     knots: LawKnots,
     secants: Float[np.ndarray, "table knot"],
-    active: Bool[np.ndarray, " table"],
     start: LawColumns | None = None,
 ) -> LawColumns:
-    """Columns and slopes for laws with these secants; of tables that are not active no slopes.
+    """Columns and slopes for laws with these secants.
 
     Arguments: `start` is an earlier answer, from whose motions these are found.
     """
@@ -75,24 +72,24 @@ def law_columns(
     stated, j = p.stated, p.model.modes.mode_of_interest + 1
     linear = (f"mode_{j}.natural_frequency", f"mode_{j}.damping_ratio")
     names = tuple(dict.fromkeys((*stated, *linear)))
-    values = jnp.asarray([p.group.values[p.group.place(name)] for name in names])
-    own = _Settings(names, p.compared)
+    values = jnp.asarray(p.group.values[p.group.places(names)])
     slopes = []
     for some in (knots.displacement, knots.velocity):
         spline = CubicSpline(np.log(some), np.eye(len(some)))
         slope = np.array(spline(np.log(some), 1))
         slope[0] = 0.0
         slopes.append(slope)
-    drawn = _Drawn(*(jnp.asarray(a) for a in (secants, active, *knots, *slopes)))
+    drawn = _Drawn(*(jnp.asarray(a) for a in (secants, *knots, *slopes)))
 
     def answered(*rows: Any) -> tuple:
-        return _law_columns(p.model, own, drawn, values, CalibrationStates(*rows[:-2]), *rows[-2:])
+        own = (names, p.compared, drawn, values, CalibrationStates(*rows[:-2]))
+        return _law_columns(p.model, *own, *rows[-2:])
 
     near = [np.asarray(part)[:n] for part in p.motions[1:]]
     if start is not None:
         near = [start.point, start.inverse]
     states = [np.asarray(part) for part in p.states]
-    found = by_blocks(answered, _BLOCK, *states, *near)
+    found = by_blocks(answered, 32, *states, *near)
     columns, by_secant, by_value, by_error = (part[:, p.own_columns] for part in found[:4])
     columns = columns if p.offset is None else columns + p.offset
     std = np.array([*(std for _, std in stated.values()), 1.0, 1.0])
@@ -105,18 +102,10 @@ def law_columns(
     return LawColumns(columns, by_secant.reshape(shape), passed_on, *found[4:])
 
 
-class _Settings(NamedTuple):
-    """What is compiled into the program."""
-
-    names: tuple[str, ...]
-    compared: ComparedMotion
-
-
 class _Drawn(eqx.Module):
     """The laws: secants, knots, and the splines' slopes at the knots by their values there."""
 
     secants: Float[Array, "table knot"]
-    active: Bool[Array, " table"]
     displacement: Float[Array, " knot"]
     velocity: Float[Array, " knot"]
     slip: Float[Array, " knot"]
@@ -133,20 +122,16 @@ class _Drawn(eqx.Module):
         slip = -slipped_position(q, self.slip)
         q, v = q[:, None], v[:, None]
         one_sided = (of_q * jnp.maximum(q, 0), of_q * jnp.minimum(q, 0))
-        dampers = (of_v * jnp.maximum(v, 0), of_v * jnp.minimum(v, 0))
-        every = jnp.stack([*one_sided, *dampers, of_q * v, slip])
-        return jnp.where(self.active[:, None, None], every, 0.0)
+        return jnp.stack([*one_sided, of_v * v, of_q * v, slip])
 
     def force(self, q: Float[Array, " time"], v: Float[Array, " time"]) -> Float[Array, " time"]:
         """The force of all tables at time samples: `by_secant` times the secants, for less work."""
-        w = jnp.where(self.active[:, None], self.secants, 0.0)
-        tables = jnp.stack([w[0], w[1], w[4]], axis=1)
+        w = self.secants
+        tables, dampers = jnp.stack([w[0], w[1], w[3]], axis=1), w[2][:, None]
         of_q = _spline(jnp.abs(q), self.displacement, tables, self.slopes_of_displacement @ tables)
-        tables = w[2:4].T
-        of_v = _spline(jnp.abs(v), self.velocity, tables, self.slopes_of_velocity @ tables)
+        of_v = _spline(jnp.abs(v), self.velocity, dampers, self.slopes_of_velocity @ dampers)
         spring = q * jnp.where(q < 0, of_q[:, 1], of_q[:, 0]) + of_q[:, 2] * v
-        damper = v * jnp.where(v < 0, of_v[:, 1], of_v[:, 0])
-        return spring + damper - slipped_position(q, self.slip) @ w[5]
+        return spring + v * of_v[:, 0] - slipped_position(q, self.slip) @ w[4]
 
 
 def _spline(
@@ -202,40 +187,34 @@ class _DrawnBalance(HarmonicBalance):
         return jnp.moveaxis(every, -1, 1).reshape(-1, *force.shape[1:])
 
 
-class _Changed(NamedTuple):
-    """What the misfit has slopes by, beside the secants."""
-
-    values: Float[Array, " parameter"]
-    error: Float[Array, " input"]
-
-
 @compiled
 def _law_columns(
     model: Structure,
-    settings: _Settings,
+    names: tuple[str, ...],
+    compared: ComparedMotion,
     drawn: _Drawn,
     values: Float[Array, " parameter"],
     states: CalibrationStates,
     near: Float[Array, "state entry"],
     inverse: Float[Array, "state entry entry"],
 ) -> tuple:
-    sensors, orders, order = settings.compared
+    sensors, orders, order = compared
 
     def one(measured: CalibrationStates, near: Array, inverse: Array) -> tuple:
-        def motion(changed: _Changed) -> tuple[StateWithErrors, PrescribedMotion]:
-            own = with_parameters(model, settings.names, changed.values)
-            erring = StateWithErrors(measured, 1.0, changed.error)
+        def motion(changed: tuple[Array, Array]) -> tuple[StateWithErrors, PrescribedMotion]:
+            own = with_parameters(model, names, changed[0])
+            erring = StateWithErrors(measured, 1.0, changed[1])
             found = erring.motion(own, sensors[0], order)
             parts = {f.name: getattr(found.balance, f.name) for f in fields(found.balance)}
             return erring, replace(found, balance=_DrawnBalance(**parts, drawn=drawn))
 
-        def both(point: Array, changed: _Changed) -> tuple[Array, Array]:
+        def both(point: Array, changed: tuple[Array, Array]) -> tuple[Array, Array]:
             erring, own = motion(changed)
             return own.equations(point), residual_columns(erring, own, point, sensors, orders)
 
-        here = _Changed(values, jnp.zeros_like(measured.error))
+        here = values, jnp.zeros_like(measured.error)
         own, none = motion(here)[1], jnp.zeros(())
-        point = own.solved_by_secants(inverse, start_of(near), none + _CLOSE, none).point
+        point = own.solved_by_secants(inverse, start_of(near), none + 1e-8, none).point
         jacobian, of_point = jax.jacfwd(both)(point, here)
         exact = jnp.linalg.inv(jacobian)
         of_point = of_point @ exact

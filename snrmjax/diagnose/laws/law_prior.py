@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.linalg import cho_solve, solve_triangular
+from scipy.linalg import block_diag, cho_solve, solve_triangular
 from scipy.optimize import nnls
 from scipy.special import logsumexp
 
@@ -24,10 +24,6 @@ REACHES = (0.35, 0.7, 1.4, 2.8)
 
 SIZES = 2.0 ** np.arange(-7.0, 9.0)
 """Of a process, in units of a change that is plainly seen."""
-
-_JITTER = 1e-6  # of a variance
-_SAMPLES, _BOUNCES = 300, 200  # of a Gaussian within bounds, and reflections of each at most
-_ROUNDS = 3  # of sizes and reaches, part by part
 
 
 class LawPart(NamedTuple):
@@ -41,9 +37,9 @@ class LawPart(NamedTuple):
 PARTS = {
     "odd spring": LawPart((0, 1), (1.0, 1.0)),
     "even spring": LawPart((0, 1), (1.0, -1.0)),
-    "odd damper": LawPart((2, 3), (1.0, 1.0)),
-    "film": LawPart((4,), (1.0,)),
-    "slip": LawPart((5,), (1.0,), not_negative=True),
+    "odd damper": LawPart((2,), (1.0,)),
+    "film": LawPart((3,), (1.0,)),
+    "slip": LawPart((4,), (1.0,), not_negative=True),
 }
 """Parts of laws, by what they are called here; tables are those of `LawColumns`.
 
@@ -95,15 +91,15 @@ def best_processes(problem: LawProblem, parts: Sequence[str]) -> tuple[list[Proc
     The cost has the mean of the evidence over sizes and reaches of each part, the others at their
     best: what is not determined is not free of charge.
     """
-    found = [_alone(problem, part)[0] for part in parts]
+    alone = [_table(problem, (part,), (Process(1.0, 1.0),), 0) for part in parts]
+    found = [_least(table) for table in alone]
     tables: list[np.ndarray] = []
-    for _ in range(_ROUNDS if len(parts) > 1 else 1):
+    for _ in range(3 if len(parts) > 1 else 1):
         before, tables = list(found), []
         for k in range(len(parts)):
             table = _table(problem, parts, found, k)
             tables.append(table)
-            reach, size = np.unravel_index(np.argmin(table), table.shape)
-            found[k] = Process(float(SIZES[size]), REACHES[reach])
+            found[k] = _least(table)
         if found == before:
             break
     least = min(float(np.min(table)) for table in tables)
@@ -130,9 +126,9 @@ def posterior(problem: LawProblem, parts: Sequence[str]) -> LawPosterior:
         weights /= weights.sum()
         several = []
         for reach, size in zip(*np.nonzero(weights > 1e-2), strict=True):
-            own = list(found)
-            own[k] = Process(float(SIZES[size]), REACHES[reach])
-            several.append((weights[reach, size], _gaussian(problem, parts, own)))
+            others = list(found)
+            others[k] = Process(float(SIZES[size]), REACHES[reach])
+            several.append((weights[reach, size], _gaussian(problem, parts, others)))
         total = sum(weight for weight, _ in several)
         centre = sum(weight * one.mean for weight, one in several) / total
         spread = sum(
@@ -141,7 +137,8 @@ def posterior(problem: LawProblem, parts: Sequence[str]) -> LawPosterior:
         )
         mean += centre - best.mean
         covariance += spread / total - best.covariance
-    bounded = _bounded(parts, problem)
+    own = [np.full(len(problem.place[part]), PARTS[part].not_negative) for part in parts]
+    bounded = np.concatenate(own)
     if bounded.any():
         mean, covariance = _not_negative(mean, covariance, bounded)
     return LawPosterior(tuple(parts), tuple(found), cost, best.freedom, mean, covariance)
@@ -152,11 +149,7 @@ def law_prior(
 ) -> Float[np.ndarray, "secant direction"]:
     """A root of the prior covariance of some parts together."""
     roots = [_root(problem, *pair) for pair in zip(parts, processes, strict=True)]
-    n = [len(root) for root in roots]
-    whole = np.zeros((sum(n), sum(n)))
-    for begin, root in zip(np.cumsum([0, *n[:-1]]), roots, strict=True):
-        whole[begin : begin + len(root), begin : begin + len(root)] = root
-    return whole
+    return np.asarray(block_diag(*roots))
 
 
 class _Gaussian(NamedTuple):
@@ -179,23 +172,16 @@ def _gaussian(problem: LawProblem, parts: Sequence[str], processes: Sequence[Pro
     return _Gaussian(cost, freedom, root @ best, root @ inverse @ root.T)
 
 
-class _Beside(NamedTuple):
-    """A part's problem, with other parts as a further noise; what these cost."""
-
-    gram: np.ndarray
-    pull: np.ndarray
-    cost: float
-
-
 def _beside(
     problem: LawProblem, parts: Sequence[str], processes: Sequence[Process], k: int
-) -> _Beside:
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """A part's problem, with other parts as a further noise; what these cost."""
     others = [part for number, part in enumerate(parts) if number != k]
     rest = [one for number, one in enumerate(processes) if number != k]
     own, theirs = problem.of([parts[k]]), problem.of(others)
     gram, pull = problem.gram[np.ix_(own, own)], problem.pull[own]
     if not others:
-        return _Beside(gram, pull, 0.0)
+        return gram, pull, 0.0
     root = law_prior(problem, others, rest)
     arms = root.T @ problem.gram[np.ix_(theirs, theirs)] @ root
     lower = np.linalg.cholesky(np.eye(len(root)) + arms)
@@ -203,7 +189,7 @@ def _beside(
     both = solve_triangular(lower, root.T @ both, lower=True)
     across, along = both[:, :-1], both[:, -1]
     cost = 2 * float(np.sum(np.log(np.diag(lower)))) - float(along @ along)
-    return _Beside(gram - across.T @ across, pull - across.T @ along, cost)
+    return gram - across.T @ across, pull - across.T @ along, cost
 
 
 def _table(
@@ -234,10 +220,9 @@ def _cost_of_bounds(
     return float(nnls(lower.T, solve_triangular(lower, pull, lower=True))[1] ** 2)
 
 
-def _alone(problem: LawProblem, part: str) -> tuple[Process, float]:
-    table = _table(problem, (part,), (Process(1.0, 1.0),), 0)
+def _least(table: np.ndarray) -> Process:
     reach, size = np.unravel_index(np.argmin(table), table.shape)
-    return Process(float(SIZES[size]), REACHES[reach]), _mean(table)
+    return Process(float(SIZES[size]), REACHES[reach])
 
 
 def _mean(table: np.ndarray) -> float:
@@ -250,12 +235,7 @@ def _root(problem: LawProblem, part: str, process: Process) -> Float[np.ndarray,
     place = problem.place[part]
     apart = np.sqrt(5.0) * np.abs(place[:, None] - place) / process.reach
     alike = (1 + apart + apart**2 / 3) * np.exp(-apart)
-    return process.size * np.linalg.cholesky(alike + _JITTER * np.eye(len(place)))
-
-
-def _bounded(parts: Sequence[str], problem: LawProblem) -> np.ndarray:
-    own = [np.full(len(problem.place[part]), PARTS[part].not_negative) for part in parts]
-    return np.concatenate(own)
+    return process.size * np.linalg.cholesky(alike + 1e-6 * np.eye(len(place)))
 
 
 def _not_negative(
@@ -269,16 +249,16 @@ def _not_negative(
     """
     scale = np.sqrt(np.diag(covariance))
     alike = covariance / np.outer(scale, scale)
-    root = np.linalg.cholesky(alike + _JITTER * np.eye(len(mean)))
+    root = np.linalg.cholesky(alike + 1e-6 * np.eye(len(mean)))
     walls, off = root[bounded], (mean / scale)[bounded]  # walls @ z + off ≥ 0
     size = np.linalg.norm(walls, axis=1)
     rng = np.random.default_rng(len(mean))
     inside = np.where(bounded, np.maximum(mean / scale, 0.1), mean / scale)
     z = np.linalg.solve(root, inside - mean / scale)
     drawn = []
-    for _ in range(_SAMPLES):
+    for _ in range(300):
         speed, left = rng.normal(size=len(z)), np.pi / 2
-        for _ in range(_BOUNCES):
+        for _ in range(200):
             a, b = walls @ speed, walls @ z
             reach = np.hypot(a, b)
             meets = reach > np.abs(off)
@@ -299,6 +279,6 @@ def _not_negative(
             across = walls[wall] / size[wall]
             speed = speed - 2 * (speed @ across) * across
         drawn.append(z)
-    every = (np.array(drawn[_SAMPLES // 10 :]) @ root.T + mean / scale) * scale
+    every = (np.array(drawn[30:]) @ root.T + mean / scale) * scale
     every[:, bounded] = np.maximum(every[:, bounded], 0.0)
     return every.mean(axis=0), np.cov(every.T)

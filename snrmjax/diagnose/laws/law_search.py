@@ -1,11 +1,13 @@
-"""The parts of a law that data ask for, and their secants, by a few rounds of Gauss and Newton."""
+"""The law that data ask for, by a few rounds of Gauss and Newton, and its tables at a sensor."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
+from snrmjax.diagnose import priors
 from snrmjax.diagnose.laws.law_columns import TABLES, LawColumns, LawKnots, law_columns
 from snrmjax.diagnose.laws.law_prior import (
     PARTS,
@@ -14,18 +16,19 @@ from snrmjax.diagnose.laws.law_prior import (
     best_processes,
     posterior,
 )
-from snrmjax.diagnose.misfit.predictions import Predictions, scales_of
+from snrmjax.diagnose.misfit.predictions import scales_of
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
-from snrmjax.diagnose.search.model_search import AS_GOOD, DETECTED
+from snrmjax.model.effect_base import AbstractEffect
+from snrmjax.model.effect_metadata import Argument
+from snrmjax.model.library.free_laws import (
+    DampingLaw,
+    DisplacementDampingLaw,
+    SlipLaw,
+    StiffnessLaw,
+    UnevenStiffnessLaw,
+)
 
 _KNOTS = 24
-_FIRST = 0.25  # knot, over the smallest amplitude that was measured; the last is at the largest
-_FIRST_SLIP = 0.1  # slip displacement, over the smallest amplitude
-_MOST = 3  # parts of a law
-_STARTS = 2  # parts from which further ones are sought
-_ROUNDS, _HALVINGS = 6, 5
-_SEARCHED = 3  # rounds in which parts are chosen
-_SETTLED = 0.05  # rms change of the rows, in units of noise, that ends the rounds
 
 
 class LawFit(NamedTuple):
@@ -75,32 +78,37 @@ def fit_laws(misfit: WeightedMisfit) -> LawFit | None:
     of the instruments, and Masing's rule ties the damping of slip to its stiffness.
     """
     predictions, scales = misfit.predictions, scales_of(misfit.predictions)
-    knots = knots_of(predictions)
+    # Over the measured range of motion of the mode of interest.
+    states, modes = predictions.chosen.states, predictions.model.modes
+    shape = float(modes.mode_shape[predictions.chosen.sensors[0], modes.mode_of_interest])
+    v = np.abs(np.asarray(states.velocity)[:, 0] / shape)
+    q = v / np.asarray(states.frequency)
+    ranges = ((q, 0.25), (v, 0.25), (q, 0.1))  # the first knots over the smallest amplitude
+    knots = LawKnots(*(np.geomspace(k * s.min(), s.max(), _KNOTS) for s, k in ranges))
     units = {}
     for name, part in PARTS.items():
-        is_stiffness = part.tables[0] in (0, 5)
+        is_stiffness = part.tables[0] in (0, 4)
         size = scales.change / (1.0 if is_stiffness else scales.frequency)
         units[name] = np.full(_KNOTS, size)
     # Where the linear frequency was measured, little slips.
     units["slip"] = units["slip"] * knots.slip / knots.slip[-1]
-    everything = np.ones(TABLES, dtype=bool)
     secants = np.zeros((TABLES, _KNOTS))
-    columns = law_columns(predictions, knots, secants, everything)
+    columns = law_columns(predictions, knots, secants)
     if not np.isfinite(columns.columns).all():
         return None
-    settled = False
+    settled, nothing = False, 0.05  # rms change of the rows, in units of noise
     parts: tuple[str, ...] = ()
     rivals: tuple[str, ...] = ()
-    for number in range(_ROUNDS):
+    for number in range(6):
         problem = law_problem(misfit, columns, secants, knots, units)
         # First one part alone: errors are not passed on yet as the law does.
-        if number < _SEARCHED:
-            parts, rivals = _parts(problem, 1 if number == 0 else _MOST)
+        if number < 3:
+            parts, rivals = _parts(problem, 1 if number == 0 else 3)
         found = posterior(problem, parts)
         aim = secants_of(parts, found.mean, units)
         change = (aim - secants).reshape(-1)
-        for _ in range(_HALVINGS):
-            ahead = law_columns(predictions, knots, aim, everything, columns)
+        for _ in range(5):
+            ahead = law_columns(predictions, knots, aim, columns)
             if np.isfinite(ahead.columns).all():
                 break
             aim = 0.5 * (aim + secants)
@@ -109,12 +117,12 @@ def fit_laws(misfit: WeightedMisfit) -> LawFit | None:
         # A step that changes no row any more, in the weighting of the step before.
         moved = (columns.by_secant.reshape(*columns.columns.shape, -1) @ change)[None]
         moved = misfit.noise.decorrelated(misfit.noise.noise_units(moved)[0])
-        settled = bool(np.sqrt(np.mean(moved**2)) < _SETTLED)
+        settled = bool(np.sqrt(np.mean(moved**2)) < nothing)
         secants, columns = aim, ahead
         misfit = misfit.reweighted(columns.passed_on)
         if settled and number > 0:
             break
-        if number + 1 >= _SEARCHED and not _is_one(parts):
+        if number >= 2 and not _is_one(parts):
             return None
     if not _is_one(parts):
         return None
@@ -131,19 +139,6 @@ def _is_one(parts: Sequence[str]) -> bool:
 def _class_of(part: str) -> str:
     """Of a part, what it is a function of: "odd spring" and "even spring" are of one law."""
     return part.split()[-1]
-
-
-def knots_of(predictions: Predictions) -> LawKnots:
-    """Knots over the measured range of motion of the mode of interest."""
-    states, modes = predictions.chosen.states, predictions.model.modes
-    shape = float(modes.mode_shape[predictions.chosen.sensors[0], modes.mode_of_interest])
-    v = np.abs(np.asarray(states.velocity)[:, 0] / shape)
-    q = v / np.asarray(states.frequency)
-
-    def between(size: np.ndarray, first: float) -> np.ndarray:
-        return np.geomspace(first * float(size.min()), float(size.max()), _KNOTS)
-
-    return LawKnots(between(q, _FIRST), between(v, _FIRST), between(q, _FIRST_SLIP))
 
 
 def law_problem(
@@ -167,21 +162,11 @@ def law_problem(
             for table, sign in zip(part.tables, part.signs, strict=True)
         ]
         whole.append(units[name] * sum(signed))
-        place[name] = np.log(knots_of_table(knots, part.tables[0]))
+        place[name] = np.log(knots[(0, 0, 1, 0, 2)[part.tables[0]]])
     both = noise.decorrelated(np.column_stack([*whole, rows]).T, kept).T
     columns_of, left = both[:, :-1], both[:, -1]
     gram, pull = columns_of.T @ columns_of, -columns_of.T @ left
     return LawProblem(gram, pull, float(left @ left), place)
-
-
-def problem_of(fit: LawFit, kept: Bool[np.ndarray, " row"]) -> LawProblem:
-    """The problem of a fitted law by some of the rows."""
-    return law_problem(fit.misfit, fit.columns, fit.secants, fit.knots, fit.units, kept)
-
-
-def knots_of_table(knots: LawKnots, table: int) -> Float[np.ndarray, " knot"]:
-    """Where a table of secants has its knots."""
-    return knots[(0, 0, 1, 1, 0, 2)[table]]
 
 
 def secants_of(
@@ -204,8 +189,8 @@ def _parts(problem: LawProblem, most: int) -> tuple[tuple[str, ...], tuple[str, 
     order = sorted(PARTS, key=lambda part: alone[part])
     best: tuple[str, ...] = (order[0],)
     cost = alone[order[0]]
-    rivals = tuple(part for part in order[1:] if alone[part] < cost + AS_GOOD)
-    for first in order[:_STARTS]:
+    rivals = tuple(part for part in order[1:] if alone[part] < cost + priors.AS_GOOD_BY_CRITERION)
+    for first in order[:2]:
         own: tuple[str, ...] = (first,)
         own_cost = alone[first]
         while len(own) < most:
@@ -213,9 +198,156 @@ def _parts(problem: LawProblem, most: int) -> tuple[tuple[str, ...], tuple[str, 
                 part: best_processes(problem, (*own, part))[1] for part in PARTS if part not in own
             }
             added = min(costs, key=lambda part: costs[part])
-            if costs[added] > own_cost - DETECTED:
+            if costs[added] > own_cost - priors.DETECTED:
                 break
             own, own_cost = (*own, added), costs[added]
-        if own_cost < cost - (DETECTED if len(own) > len(best) else 0.0):
+        if own_cost < cost - (priors.DETECTED if len(own) > len(best) else 0.0):
             best, cost = own, own_cost
     return best, rivals if len(best) == 1 else ()
+
+
+SURE = 1.96
+"""1σ of a 95 % band."""
+
+LAW_KINDS = {
+    "odd spring": StiffnessLaw.kind,
+    "even spring": UnevenStiffnessLaw.kind,
+    "odd damper": DampingLaw.kind,
+    "film": DisplacementDampingLaw.kind,
+    "slip": SlipLaw.kind,
+}
+
+
+class DrawnLaw(NamedTuple):
+    """A law that was drawn from data, as an equivalent force at the reference sensor.
+
+    `at` is the displacement (m) or the velocity (m/s) of that sensor, `force` (N) what a spring, a
+    damper or a joint between the sensor's point and the ground would have to exert there beside
+    the linear model, with its 1σ: of a mode of the shape φ at the sensor, x = φq, and φ times the
+    force is the modal force. Of friction it is the first loading from rest, beside the stuck
+    stiffness; of a damping that depends on the displacement the force at the velocity `passing`.
+    """
+
+    name: str  # its class in words
+    argument: Argument  # displacement or velocity
+    at: Float[np.ndarray, " knot"]
+    force: Float[np.ndarray, " knot"]
+    force_std: Float[np.ndarray, " knot"]
+    largest: float  # of `at`, that was measured: what is beyond is extrapolated
+    passing: float | None = None  # m/s
+
+
+def law_effects(fit: LawFit, secants: Float[np.ndarray, "table knot"]) -> list[AbstractEffect]:
+    """Effects of the model, one for the springs, one for the dampers and so on, by importance."""
+    found: list[AbstractEffect] = []
+    x, v, s = (jnp.asarray(knots) for knots in fit.knots)
+    w = jnp.asarray(secants)
+    for group in _grouped(fit.posterior.parts):
+        two_sided = "even spring" in group
+        if group[0].endswith("spring"):
+            own = UnevenStiffnessLaw(x, w[0] * x, w[1] * x) if two_sided else None
+            found.append(own or StiffnessLaw(x, w[0] * x))
+        elif group[0].endswith("damper"):
+            found.append(DampingLaw(v, w[2] * v))
+        elif group[0] == "film":
+            found.append(DisplacementDampingLaw(x, w[3]))
+        else:
+            found.append(SlipLaw(s, jnp.maximum(w[4], 0.0)))
+    return found
+
+
+def drawn_tables(fit: LawFit) -> list[DrawnLaw]:
+    """The tables of a fitted law, the most important first."""
+    predictions = fit.misfit.predictions
+    modes = predictions.model.modes
+    states = predictions.chosen.states
+    shape = float(modes.mode_shape[predictions.chosen.sensors[0], modes.mode_of_interest])
+    speed = np.abs(np.asarray(states.velocity)[:, 0])
+    size = abs(shape)
+    tables = []
+    for group in _grouped(fit.posterior.parts):
+        passing = float(speed.max()) if group == ("film",) else None
+        at, force, std, side = _modal_table(fit, group, (passing or 0.0) / size)
+        if side and shape < 0:
+            at, force, std = -at[::-1], -force[::-1], std[::-1]
+        is_velocity = group[0].endswith("damper")
+        measured = speed if is_velocity else speed / np.asarray(states.frequency)
+        tables.append(
+            DrawnLaw(
+                _words(group, at * size, force, std),
+                Argument.VELOCITY if is_velocity else Argument.DISPLACEMENT,
+                at * size,
+                force / size,
+                std / size,
+                float(measured.max()),
+                passing,
+            )
+        )
+    return tables
+
+
+def _grouped(parts: Sequence[str]) -> list[tuple[str, ...]]:
+    """Parts of one kind of law together, in the order in which they were found."""
+    groups: dict[int, list[str]] = {}
+    for part in parts:
+        groups.setdefault(PARTS[part].tables[0], []).append(part)
+    return [tuple(sorted(group, reverse=True)) for group in groups.values()]
+
+
+def _modal_table(
+    fit: LawFit, group: tuple[str, ...], passing: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, bool]:
+    """Knots, modal force and its 1σ of some parts, from rest or, two-sided, through it."""
+    post, knots = fit.posterior, fit.knots
+    n = len(knots.slip)
+    eye = np.eye(len(post.parts) * n)
+    tables = secants_of(post.parts, eye, fit.units)  # secant, table, knot
+    two_sided = "even spring" in group
+    if group == ("slip",):
+        at = knots.displacement
+        force = -np.einsum("ek,kx->ex", tables[:, 4], np.maximum(at - knots.slip[:, None], 0.0))
+    elif group == ("film",):
+        at, force = knots.displacement, passing * tables[:, 3]
+    else:
+        first = PARTS[group[0]].tables[0]
+        at = knots.velocity if group[0].endswith("damper") else knots.displacement
+        force = tables[:, first] * at
+        if two_sided:
+            force = np.concatenate([-(tables[:, first + 1] * at)[:, ::-1], force], axis=1)
+            at = np.concatenate([-at[::-1], at])
+    mean = post.mean @ force
+    std = np.sqrt(np.maximum(np.einsum("ex,ef,fx->x", force, post.covariance, force), 0.0))
+    rest = len(at) // 2 if two_sided else 0
+    at, mean, std = (np.insert(one, rest, 0.0) for one in (at, mean, std))
+    return at, mean, std, two_sided
+
+
+def _words(group: tuple[str, ...], at: np.ndarray, force: np.ndarray, std: np.ndarray) -> str:
+    """The class of a law: what it is, and from where it grows which way."""
+    names = {
+        "spring": ("stiffness", "hardening", "softening"),
+        "damper": ("damping", "more damping", "less damping"),
+        "film": ("damping that depends on the displacement", "more damping", "less damping"),
+        "slip": ("friction with a memory", "gaining stiffness", "losing stiffness"),
+    }
+    word = group[0].split()[-1]
+    name, more, less = names[word]
+    symmetry = [part.split()[0] for part in group if " " in part]
+    unit = "m/s" if word == "damper" else "m"
+    text = f"{' and '.join(symmetry)} {name}".strip()
+    sides = [("", at > 0, force)]
+    if at[0] < 0:
+        sides = [(" for positive values", at > 0, force), (" for negative values", at < 0, -force)]
+    for side, there, signed in sides:
+        order = np.argsort(np.abs(at[there]))
+        x, f = np.abs(at[there])[order], signed[there][order]
+        seen = np.abs(f) > SURE * std[there][order]
+        last = 0.0
+        for k in np.flatnonzero(seen):  # where a force that is sure begins, or changes its sign
+            if np.sign(f[k]) != last:
+                last = np.sign(f[k])
+                prefixes = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"))
+                size, prefix = next((pair for pair in prefixes if x[k] >= pair[0]), prefixes[-1])
+                from_there = f"from {x[k] / size:.2g} {prefix}{unit}{side}"
+                text += f", {more if last > 0 else less} {from_there}"
+    return text

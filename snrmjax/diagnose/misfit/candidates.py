@@ -6,11 +6,13 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from snrmjax.identify.calibrate.calibration_states import ComparedColumns
 from snrmjax.model.effect_metadata import Confusion, MotionScales
 from snrmjax.model.effect_shape import shape_of, starts_of
 from snrmjax.model.effects import EFFECTS, effect_parameters
 from snrmjax.model.library.confusions import CONFUSIONS
 from snrmjax.model.modes import LinearModes
+from snrmjax.model.structures import Structure
 
 
 class EffectCandidate(NamedTuple):
@@ -125,7 +127,15 @@ def coordinates(labels: Sequence[str], reference: float) -> Coordinates:
     return Coordinates(tuple(pairs), reference)
 
 
-def motion_scales(
+def motion_scales(model: Structure, chosen: ComparedColumns) -> MotionScales:
+    """Typical sizes of the motions of states that are compared with a model."""
+    states, modes = chosen.states, model.modes
+    columns = (np.abs(states.velocity[:, 0]), states.frequency, states.force)
+    speed, omega, force = (np.asarray(part) for part in columns)
+    return scales_of_motions(modes, chosen.sensors[0], speed, omega, force)
+
+
+def scales_of_motions(
     modes: LinearModes,
     sensor: int,
     speed: Float[np.ndarray, " state"],

@@ -5,7 +5,7 @@ candidate: a candidate is a vector of parameters.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from snrmjax.diagnose.misfit import programs
-from snrmjax.diagnose.misfit.amplitudes import Sizes, sizes_of
 from snrmjax.diagnose.misfit.candidates import candidate, motion_scales, parameter_labels
+from snrmjax.diagnose.misfit.noise_model import Sizes, sizes_of
 from snrmjax.identify.calibrate.calibration_states import (
     CalibrationStates,
     ComparedColumns,
@@ -33,11 +33,7 @@ from snrmjax.numerics.blocks import by_blocks, over_cores, padded
 
 _BLOCK = 64  # rows of a program: a state under one vector of parameters each
 _ROOM = 256  # states that programs have room for: few tests have more, which compile anew
-_GROWN = 16  # of those that are grown, one after the other
 _DIRECTIONS = 8  # derivatives that a call gives, at most
-_LEAST = 1e-6  # of its unit, that a shape counts for at least
-_ERROR = 0.1  # of which a slope takes a thousandth: of a logarithm, or rad
-_TRIALS = _BLOCK  # that may meet in a block, at most
 
 
 class Group(NamedTuple):
@@ -51,9 +47,17 @@ class Group(NamedTuple):
     is_shape: Bool[np.ndarray, " parameter"]  # another one of it
     force: Int[np.ndarray, " parameter"]  # of the added forces, whose it is; −1: of none
 
-    def place(self, name: str) -> int:
-        """The place of a parameter in `names`."""
-        return self.names.index(name)
+    def places(self, names: Iterable[str]) -> Int[np.ndarray, " name"]:
+        """The places of some parameters."""
+        return np.array([self.names.index(name) for name in names], dtype=int)
+
+    def at(
+        self, names: Sequence[str], values: Float[np.ndarray, "*trial name"]
+    ) -> Float[np.ndarray, "*trial parameter"]:
+        """All parameters, of which some have other values."""
+        every = np.tile(self.values, (*values.shape[:-1], 1))
+        every[..., self.places(names)] = values
+        return every
 
 
 class _Steps(NamedTuple):
@@ -94,25 +98,17 @@ class Predictions:
     stated: dict[str, tuple[float, float]]  # the baseline's uncertain parameters: value and 1σ
     group: Group
     motions: programs.Stored
+    added: Float[np.ndarray, "state input"]  # to logarithms of velocities and phases as recorded
     reference: Any = None  # `misfit.reference.Reference`, once it is known
     level_sizes: tuple[float, ...] = (0.0,) * 4  # 1σ of `LEVEL_ERRORS` that the noise takes
     unstated_levels: tuple[bool, ...] = (False,) * 4  # which of them nobody stated
-    added: Float[np.ndarray, "state input"] | None = (
-        None  # to log velocities and phases as recorded
-    )
     # What is added to the columns for that: errors that the records were corrected for still count.
     offset: Float[np.ndarray, "state column"] | None = None
     error_scale: float = 1.0  # of errors over those that were stated or assumed
     free_level_forces: tuple[int, ...] = ()  # places of levels whose force has a gain of its own
 
-    def with_level_forces_free(self, places: tuple[int, ...]) -> "Predictions":
-        """The same with forces of levels, by their places, that have gains of their own."""
-        return dataclasses.replace(self, free_level_forces=places)
-
     def carried_back(self, by_error: Float[np.ndarray, "state column input"]) -> "Predictions":
         """The same as the records have it, by what errors do to the columns."""
-        if self.added is None:
-            return self
         offset = -np.einsum("sci,si->sc", by_error, self.added)
         return dataclasses.replace(self, offset=offset)
 
@@ -122,13 +118,14 @@ class Predictions:
         added: Float[np.ndarray, "state input"],
         harmonics: int | None = None,
     ) -> "Predictions":
-        """The same of other records of the same states, to which something was added.
+        """The same of records to which something was added; it counts once they are weighted.
 
-        `harmonics` are those of the motions: as before if None.
+        Arguments: `data` as they were measured; `harmonics` of the motions, as before if None.
         """
         order = self.compared.harmonic_order if harmonics is None else harmonics
-        own = _records(self.given, data, order, self.error_scale)
-        return dataclasses.replace(self, **own._asdict(), added=added)
+        corrected = with_corrected_records(data, self.chosen.rows, self.chosen.sensors, added)
+        own = _records(self.given, corrected, order, self.error_scale)
+        return dataclasses.replace(self, **own, added=added)
 
     def with_errors_scaled(self, factor: float) -> "Predictions":
         """The same with all errors of force, velocities and phases so many times larger."""
@@ -164,21 +161,18 @@ class Predictions:
         return whiten, np.asarray(chosen.states.known) & used[:, None]
 
     def of(
-        self,
-        group: Group,
-        values: Float[np.ndarray, "trial parameter"],
-        along: Sequence[str] = (),
+        self, values: Float[np.ndarray, "trial parameter"], along: Sequence[str] = ()
     ) -> Predicted:
         """The misfit of the states for every trial's parameters, and slopes along some of these."""
-        places = np.array([group.place(name) for name in along], dtype=int)
+        group, places = self.group, self.group.places(along)
         # Slopes are differences, over a small share of a change that is clearly detectable. The
         # unit of a shape may be a guess: its own size counts, unless that is zero.
         size = np.abs(values)
         length = np.maximum(group.unit, np.where(group.is_strength, size, 0.0))
-        own = np.clip(size, _LEAST * group.unit, group.unit)
+        own = np.clip(size, 1e-6 * group.unit, group.unit)
         length = np.where(group.is_shape & (size > 0), own, length)[:, places]
         steps = _Steps(places, length, np.zeros((self.states.error.shape[1], len(places))))
-        columns, slopes = self._in_turn(group, values, steps)
+        columns, slopes = self._in_turn(values, steps)
         slopes = slopes / length[:, None, None]
         force_slopes = slopes[:, :, 0] + 1j * slopes[:, :, 1]
         if self.offset is not None:
@@ -187,7 +181,7 @@ class Predictions:
         return Predicted(*compared, self.sizes.phasors(columns), force_slopes)
 
     def by_error(
-        self, group: Group, values: Float[np.ndarray, " parameter"]
+        self, values: Float[np.ndarray, " parameter"]
     ) -> tuple[Float[np.ndarray, "state column input"], Complex[np.ndarray, "state part"]]:
         """Derivatives by the states' errors, as a model with these parameters passes them on.
 
@@ -195,11 +189,10 @@ class Predictions:
         levels of free gain would else explain (D'Agostini, doi:10.1016/0168-9002(94)90719-6).
         Returns the model's phasors too.
         """
-        inputs = self.states.error.shape[1]
-        none = (np.full(inputs, -1), np.zeros((1, inputs)))
-        steps = _Steps(*none, _ERROR * np.eye(inputs))
-        columns, slopes = self._in_turn(group, values[None], steps)
-        slopes = slopes / _ERROR - self._by_error_of_missed(columns)
+        inputs, unit = self.states.error.shape[1], 0.1  # of a logarithm, or rad
+        steps = _Steps(np.full(inputs, -1), np.zeros((1, inputs)), unit * np.eye(inputs))
+        columns, slopes = self._in_turn(values[None], steps)
+        slopes = slopes / unit - self._by_error_of_missed(columns)
         found = self.sizes.compared(columns, slopes, of_errors=True)[1]
         return found[0], self.sizes.phasors(columns)[0]
 
@@ -221,24 +214,22 @@ class Predictions:
         return found
 
     def _in_turn(
-        self, group: Group, values: Float[np.ndarray, "trial parameter"], steps: "_Steps"
+        self, values: Float[np.ndarray, "trial parameter"], steps: "_Steps"
     ) -> tuple[np.ndarray, np.ndarray]:
         """Columns, and slopes along some directions after the other."""
         wanted, parts = len(steps.place), []
         for begin in range(0, max(wanted, 1), _DIRECTIONS):
-            some = slice(begin, begin + _DIRECTIONS)
-            own = _Steps(*(_filled(a[..., some]) for a in steps))
-            parts.append(self._answers(group, values, own, min(wanted - begin, _DIRECTIONS)))
+            some = [a[..., begin : begin + _DIRECTIONS] for a in steps]
+            room = [(0, _DIRECTIONS - some[0].size)]
+            own = _Steps(*(np.pad(a, [(0, 0)] * (a.ndim - 1) + room) for a in some))
+            parts.append(self._answers(values, own, min(wanted - begin, _DIRECTIONS)))
         return parts[0][0], np.concatenate([slope for _, slope in parts], axis=3)[..., :wanted]
 
     def _answers(
-        self,
-        group: Group,
-        values: Float[np.ndarray, "trial parameter"],
-        steps: "_Steps",
-        wanted: int,
+        self, values: Float[np.ndarray, "trial parameter"], steps: "_Steps", wanted: int
     ) -> tuple[np.ndarray, np.ndarray]:
         """Columns and slopes: friction by quick formulas, over the whole cycle where they fail."""
+        group = self.group
         used = np.any(values != group.values, axis=0)
         used[steps.place[:wanted][steps.place[:wanted] >= 0]] = True
         active = np.zeros(group.force.max() + 1, dtype=bool)
@@ -250,18 +241,12 @@ class Predictions:
             def block(some: np.ndarray) -> list[np.ndarray]:
                 at = padded(some, _BLOCK)
                 first = int(trial[some[0]])
-                near = slice(first, first + _TRIALS)
-                ours = [padded(a[near], _TRIALS) for a in (values, steps.length)]
-                parts: list[Any] = [*ours, steps.place, steps.by_error]
-                asked: list[Any] = [active, np.array(wanted), state[at], trial[at] - first]
-                found = programs.missed(
-                    group.model,
-                    programs.Settings(group.names, self.compared, len(self.model.effects), quick),
-                    programs.Wanted(*asked[:2]),
-                    self.motions,
-                    programs.Trials(*parts),
-                    programs.StateTrials(*asked[2:]),
-                )
+                near = slice(first, first + _BLOCK)  # no more trials meet in a block
+                ours = [padded(a[near], _BLOCK) for a in (values, steps.length)]
+                asked: list[Any] = [*ours, steps.place, steps.by_error, active, np.array(wanted)]
+                asked += [state[at], trial[at] - first]
+                own = programs.Settings(group.names, self.compared, len(self.model.effects), quick)
+                found = programs.missed(group.model, own, self.motions, programs.Asked(*asked))
                 return [np.asarray(a)[: len(some), self.own_columns] for a in found]
 
             blocks = np.split(rows, range(_BLOCK, len(rows), _BLOCK))
@@ -296,32 +281,22 @@ def predictions_of(
     return Predictions(
         model=model,
         given=model,
-        **records._asdict(),
-        level_numbers=np.asarray(data.level)[records.chosen.rows],
+        **records,
+        added=np.zeros_like(records["chosen"].states.error),
+        level_numbers=np.asarray(data.level)[records["chosen"].rows],
         force_gain_std=force_gain_std,
         stated={
             name: (numbers[name], std)
             for name, std in (stated_stds(model) | _of_modal_mass(model, force_gain_std)).items()
         },
-        group=_all_effects(model, _scales(model, records.chosen)),
+        group=_all_effects(model, motion_scales(model, records["chosen"])),
     )
-
-
-class _Records(NamedTuple):
-    """What of `Predictions` depends on the records: see there."""
-
-    chosen: ComparedColumns
-    sizes: Sizes
-    states: CalibrationStates
-    compared: programs.ComparedMotion
-    own_columns: Int[np.ndarray, " column"]
-    motions: programs.Stored
 
 
 def _records(
     model: Structure, data: SteadyStates, harmonics: int, error_scale: float = 1.0
-) -> _Records:
-    """Records with the baseline's motions at them."""
+) -> dict[str, Any]:
+    """What of `Predictions` depends on the records, with the baseline's motions at them."""
     chosen = calibration_states(model, data, programs.HARMONICS)
     # Operations of JAX compile for every number of states.
     on_host: Any = jax.tree.map(np.asarray, chosen.states)
@@ -337,17 +312,17 @@ def _records(
     def motions(*rows: Array) -> tuple[Array, Array]:
         return programs.grown(model, CalibrationStates(*rows), compared)
 
-    found = by_blocks(motions, _GROWN, *columns)
+    found = by_blocks(motions, 16, *columns)  # grown one after the other
     arrays = jax.device_put([padded(rows, _ROOM) for rows in (*columns, *found)])
     every: list[Any] = columns
-    return _Records(
-        chosen=chosen,
-        sizes=sizes_of(chosen),
-        states=CalibrationStates(*every),
-        compared=compared,
-        own_columns=own_columns,
-        motions=programs.Stored(CalibrationStates(*arrays[:-2]), *arrays[-2:]),
-    )
+    return {
+        "chosen": chosen,
+        "sizes": sizes_of(chosen),
+        "states": CalibrationStates(*every),
+        "compared": compared,
+        "own_columns": own_columns,
+        "motions": programs.Stored(CalibrationStates(*arrays[:-2]), *arrays[-2:]),
+    }
 
 
 def _of_modal_mass(model: Structure, force_gain_std: float) -> dict[str, float]:
@@ -421,20 +396,30 @@ def _widened(chosen: ComparedColumns) -> tuple[list[np.ndarray], tuple[int, ...]
     return parts, orders, columns
 
 
-def _filled(directions: np.ndarray) -> np.ndarray:
-    room = np.zeros((*directions.shape[:-1], _DIRECTIONS), dtype=directions.dtype)
-    room[..., : directions.shape[-1]] = directions
-    return room
-
-
 def scales_of(predictions: Predictions) -> MotionScales:
     """Typical sizes of the measured motions."""
-    return _scales(predictions.model, predictions.chosen)
+    return motion_scales(predictions.model, predictions.chosen)
 
 
-def _scales(model: Structure, chosen: ComparedColumns) -> MotionScales:
-    states = chosen.states
-    columns = (
-        np.asarray(part) for part in (np.abs(states.velocity[:, 0]), states.frequency, states.force)
+def with_corrected_records(
+    data: SteadyStates,
+    rows: Int[np.ndarray, " state"],
+    sensors: tuple[int, ...],
+    added: Float[np.ndarray, "state input"],
+) -> SteadyStates:
+    """The data with errors of velocities and phases taken away, of the states in `rows`."""
+    told: Any = jax.tree.map(np.asarray, data)
+    n = len(sensors)
+    size, turn = np.ones((data.n_states, n)), np.zeros((data.n_states, n))
+    size[rows], turn[rows] = np.exp(added[:, 1 : n + 1]), added[:, n + 1 :]
+    back = np.argsort(sensors)
+    size, turn = size[:, back], turn[:, back]
+    orders = np.array(data.harmonic_order, dtype=int)
+    found: SteadyStates = dataclasses.replace(
+        told,
+        velocity=told.velocity * (size * np.exp(1j * turn)),
+        velocity_std=told.velocity_std * size,
+        harmonics=told.harmonics * size[:, :, None] * np.exp(1j * turn[:, :, None] * orders),
+        harmonic_std=told.harmonic_std * size,
     )
-    return motion_scales(model.modes, chosen.sensors[0], *columns)
+    return found

@@ -43,9 +43,6 @@ COMPARED = (2, 3)
 """Harmonics that the programs hold, measured or not."""
 
 _STEP = 2.5e-4  # of a direction, between the two ends of a slope
-_SHARE = 1e-2  # of a slope's first step, below which the last one is
-_NOTHING = 1e-9  # relative difference of columns that solutions may have by chance
-_CLOSE, _CLOSER = 1e-5, 1e-8  # step of a motion's solution that is the last one, and for slopes
 
 
 class ComparedMotion(NamedTuple):
@@ -81,13 +78,17 @@ class Stored(NamedTuple):
     inverse: Float[Array, "state entry entry"]
 
 
-class Trials(NamedTuple):
-    """Parameters of some trials, and the steps of slopes: of one parameter, or of errors."""
+class Asked(NamedTuple):
+    """Rows of states under trials' parameters, and the directions of their slopes."""
 
     values: Float[Array, "trial parameter"]
-    length: Float[Array, "trial direction"]
-    place: Int[Array, " direction"]
+    length: Float[Array, "trial direction"]  # of a slope's step: of one parameter, or of errors
+    place: Int[Array, " direction"]  # of the parameter
     by_error: Float[Array, "input direction"]
+    active: Bool[Array, " force"]  # which of the added `forces_of` have strength
+    n_directions: Int[Array, ""]  # of the directions, that have slopes
+    state: Int[Array, " row"]
+    trial: Int[Array, " row"]
 
 
 class Settings(NamedTuple):
@@ -99,28 +100,12 @@ class Settings(NamedTuple):
     quick: bool  # whether friction is taken by formulas for cycles that turn only twice
 
 
-class Wanted(NamedTuple):
-    """What a call asks for."""
-
-    active: Bool[Array, " force"]  # which of the added `forces_of` have strength
-    directions: Int[Array, ""]  # how many of the directions have slopes
-
-
-class StateTrials(NamedTuple):
-    """The state and the trial of every row, by their numbers."""
-
-    state: Int[Array, " row"]
-    trial: Int[Array, " row"]
-
-
 @compiled
 def missed(
     model: Structure,
     settings: Settings,
-    wanted: Wanted,
     stored: Stored,
-    trials: Trials,
-    rows: StateTrials,
+    asked: Asked,
 ) -> tuple[Float[Array, "row column"], Float[Array, "row column direction"]]:
     """The misfit of every row, and its slopes along the wanted directions, else zero.
 
@@ -129,30 +114,30 @@ def missed(
     the first, and the equations are compiled only once.
     """
     names, compared, own, quick = settings
-    n_directions, n_wanted = len(trials.place), wanted.directions
-    close = jnp.where(n_wanted > 0, _CLOSER, _CLOSE)
+    n_directions, n_wanted = len(asked.place), asked.n_directions
+    close = jnp.where(n_wanted > 0, 1e-8, 1e-5)  # the last step of a motion's solution
 
     def one(state: Array, trial: Array) -> tuple[Array, Array]:
         measured, near, inverse = jax.tree.map(lambda a: a[state], stored)
-        values, length = trials.values[trial], trials.length[trial]
+        values, length = asked.values[trial], asked.length[trial]
 
         def found(
             number: Array, start: Secants, columns: Float[Array, "column direction"]
         ) -> tuple[Secants, Float[Array, "column direction"]]:
             along = jnp.where(jnp.arange(n_directions) == number - 1, _STEP, 0.0)
-            mine = trials.place[number - 1] == jnp.arange(len(names))
+            mine = asked.place[number - 1] == jnp.arange(len(names))
             changed = with_parameters(model, names, values + (length @ along) * mine)
             added = changed.effects[own:]
             order = compared.harmonic_order
             forces = [_quick(added[k], order, quick=quick) for k in forces_of(added)]
             rest = [e for k, e in enumerate(added) if k not in forces_of(added)]
             changed = dataclasses.replace(changed, effects=(*changed.effects[:own], *rest))
-            erring = StateWithErrors(measured, 1.0, trials.by_error @ along)
+            erring = StateWithErrors(measured, 1.0, asked.by_error @ along)
             motion = erring.motion(changed, compared.sensors[0], compared.harmonic_order)
             parts = {f.name: getattr(motion.balance, f.name) for f in fields(motion.balance)}
-            balance = _ForcedBalance(**parts, forces=tuple(forces), active=wanted.active)
+            balance = _ForcedBalance(**parts, forces=tuple(forces), active=asked.active)
             motion = dataclasses.replace(motion, balance=balance)
-            share = jnp.where(number > 0, _SHARE, 0.0)
+            share = jnp.where(number > 0, 1e-2, 0.0)  # of a slope's first step: the last one
             end = motion.solved_by_secants(inverse, start, close, share)
             # Where the second motion is not found, the first step towards it is its slope.
             lost = (number > 0) & ~jnp.all(jnp.isfinite(end.point))
@@ -167,10 +152,11 @@ def missed(
             0, n_wanted + 1, lambda k, now: found(k, *now), (start_of(near), none)
         )[1]
         change = columns[:, 1:] - columns[:, :1]
-        seen = (jnp.arange(n_directions) < n_wanted) & ~(jnp.abs(change) < _NOTHING)
+        chance = 1e-9  # of a column, by which solutions may differ
+        seen = (jnp.arange(n_directions) < n_wanted) & ~(jnp.abs(change) < chance)
         return columns[:, 0], jnp.where(seen, change / _STEP, 0.0)
 
-    return jax.vmap(one)(*rows)
+    return jax.vmap(one)(asked.state, asked.trial)
 
 
 def forces_of(effects: Sequence[AbstractEffect]) -> list[int]:

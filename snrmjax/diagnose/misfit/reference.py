@@ -2,22 +2,28 @@
 
 The posterior of a test (`identify.test_model`) follows any smooth law. Its slopes weigh the misfit
 of every candidate alike, so that none is favoured by what it would pass on itself, and a model that
-lacks most of the stiffness does not take the weights from the data.
+lacks most of the stiffness does not take the weights from the data. Of a force that is known as a
+drive voltage it gives a first value of the gain.
 """
 
 import dataclasses
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Complex
 
-from snrmjax.diagnose.misfit.predictions import Predictions
+from snrmjax.diagnose.misfit.predictions import Predictions, predictions_of
+from snrmjax.diagnose.misfit.weighted_misfit import weighted_misfit
+from snrmjax.identify.checks.instruments import force_gain_undetermined
 from snrmjax.identify.test_model.posterior import TestPosterior, fit_test
 from snrmjax.identify.test_model.priors import INSTRUMENT_PHASE, LEVELS
 from snrmjax.identify.test_model.states import TestStates, state_errors
+from snrmjax.measure.states import SteadyStates
 from snrmjax.model.modes import residual_velocity
+from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import padded
 
 _FEWEST = 6  # states with a phase
@@ -146,12 +152,52 @@ def _with_levels(predictions: Predictions, sizes: Sequence[float]) -> Prediction
     )
 
 
-def passed_on_by(
-    reference: Reference, by_error: Float[np.ndarray, "state column input"], n_sensors: int
-) -> Float[np.ndarray, "state column input"]:
-    """Derivatives of the columns by the states' errors, those of the force by the reference."""
-    changed = by_error.copy()
-    for place, slope in ((1, reference.by_velocity), (1 + n_sensors, reference.by_phase)):
-        changed[reference.rows, 0, place] = slope.real
-        changed[reference.rows, 1, place] = slope.imag
-    return changed
+FREE_GAIN_STD = 1.0
+"""Relative 1σ of a force gain that is unknown."""
+
+
+def driven_by_voltage(data: SteadyStates) -> bool:
+    """Whether the force is known as a drive voltage only."""
+    force, drive = np.asarray(data.force), np.asarray(data.drive)
+    return bool(not np.any(np.isfinite(force)) and np.any(np.isfinite(drive)))
+
+
+def with_first_gain(
+    model: Structure, data: SteadyStates
+) -> tuple[SteadyStates, float, tuple[str, ...]]:
+    """The states with a force by a first value (N/V) of the unknown gain, and notes on it.
+
+    The gain must stay free. It is the median, over the states, of the force that the model needs
+    for the measured motion over the drive voltage; and, where phases are known, what smooth curves
+    of amplitude make of that: with a gain of the force all of the dynamic stiffness grows, but not
+    the part of the known modal mass.
+
+    Raises `ValueError` where the model has no such motions.
+    """
+
+    def driven(gain: float) -> SteadyStates:
+        return eqx.tree_at(lambda d: d.force, data, gain * data.drive)
+
+    predictions = predictions_of(model, driven(1.0), FREE_GAIN_STD)
+    needed, unknown = weighted_misfit(predictions).baseline.force, predictions.chosen.phase_unknown
+    phase = np.angle(np.asarray(predictions.chosen.states.velocity)[:, 0])
+    # With known phases the part against damping, which no error of the stiffness changes.
+    part = np.real(needed * np.exp(-1j * phase)) / np.maximum(np.cos(phase), 0.5)
+    gains = np.abs(needed if unknown.any() else part)
+    if not np.any(np.isfinite(gains)):
+        raise ValueError("the model has no motion of the measured amplitude for any state.")
+    gain, by = float(np.median(gains[np.isfinite(gains)])), "the model as given"
+    doubt = ""
+    # Twice: the first curves' prior lies about what the model as given needs.
+    for _ in range(0 if unknown.any() else 2):
+        reference = reference_of(predictions_of(model, driven(gain), FREE_GAIN_STD))
+        if reference is None:
+            break
+        mass, std = reference.posterior.modal_mass
+        gain, by = gain / mass, "smooth curves of amplitude"
+        doubt = force_gain_undetermined(std / mass, float(np.max(np.abs(phase))))
+    note = (
+        f"the force is known as a drive voltage only: about {gain:.4g} N/V by {by}. The gain "
+        "is fitted too: a 1 % error of the gain looks like 1 % of damping."
+    )
+    return driven(gain), gain, (note, doubt) if doubt else (note,)

@@ -8,16 +8,13 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
 from snrmjax.diagnose.misfit.candidates import EffectCandidate, parameter_labels
-from snrmjax.diagnose.misfit.noise_model import NoiseModel, noise_model
-from snrmjax.diagnose.misfit.predictions import Group, Predicted, Predictions
-from snrmjax.diagnose.misfit.reference import passed_on_by
-from snrmjax.identify.calibrate.calibration_states import ComparedColumns
+from snrmjax.diagnose.misfit.noise_model import NoiseModel, shared_covariance
+from snrmjax.diagnose.misfit.predictions import Predicted, Predictions
+from snrmjax.identify.calibrate.calibration_states import ComparedColumns, whitened_columns
 from snrmjax.model.structures import Structure
 
 FREE_LEVEL_FORCE_STD = 0.3
 """Relative 1σ of the force of a level that is left free: far more than a calibration is off."""
-
-_WEAK = 0.1  # of its strength, at which a start without a motion is evaluated
 
 
 class BaselinePrediction(NamedTuple):
@@ -73,11 +70,6 @@ class WeightedMisfit:
         """Numbers of the levels in the data."""
         return np.unique(self.predictions.level_numbers)
 
-    @property
-    def first_level_force(self) -> int:
-        """Place of the first force of a level that is free among the shared errors."""
-        return len(self.predictions.stated) + (self.predictions.force_gain_std > 0)
-
     def chi_square(self, rows: Float[np.ndarray, " row"]) -> float:
         """χ² of misfits in units of noise."""
         return float(np.sum(self.noise.decorrelated(rows) ** 2))
@@ -85,9 +77,23 @@ class WeightedMisfit:
     def start_changes(self, candidate: EffectCandidate) -> Float[np.ndarray, "trial state column"]:
         """Columns of every starting point of a candidate less those of the baseline."""
         key = (candidate.kind, candidate.starts)
-        if key not in self.starts:
-            self.starts[key] = _start_changes(self, candidate)
-        return self.starts[key]
+        if key in self.starts:
+            return self.starts[key]
+
+        def changed(starts: np.ndarray) -> np.ndarray:
+            labels, predictions = parameter_labels(candidate.kind), self.predictions
+            found = predictions.of(predictions.group.at(labels, starts))
+            return found.columns - self.baseline.columns
+
+        starts = np.array(candidate.starts)
+        changes = changed(starts)
+        lost = ~np.isfinite(self.noise.noise_units(changes)).all(axis=1)
+        if lost.any():  # too strong to have a motion: what a weaker one does, scaled up
+            weak = 0.1
+            starts[:, 0] *= weak
+            changes[lost] = changed(starts[lost]) / weak**candidate.strength_order
+        self.starts[key] = changes
+        return changes
 
     def first_change(self, candidate: EffectCandidate) -> Float[np.ndarray, " row"]:
         """What the first starting point of a candidate changes, in units of noise."""
@@ -109,24 +115,11 @@ class WeightedMisfit:
             )
         }
 
-    def predicted(
-        self,
-        group: Group,
-        labels: Sequence[str],
-        values: Float[np.ndarray, "trial parameter"],
-        *,
-        slopes: bool,
-    ) -> Predicted:
-        """Columns for trial values of some parameters, and perhaps slopes by them."""
-        every = np.tile(group.values, (len(values), 1))
-        every[:, [group.place(label) for label in labels]] = values
-        return self.predictions.of(group, every, labels if slopes else ())
-
     def evaluated(
-        self, group: Group, labels: Sequence[str], values: Float[np.ndarray, "trial parameter"]
+        self, labels: Sequence[str], values: Float[np.ndarray, "trial parameter"]
     ) -> tuple[Float[np.ndarray, "trial row"], Float[np.ndarray, "trial row parameter"]]:
         """Rows for trial values of some parameters, and their slopes by them."""
-        found = self.predicted(group, labels, values, slopes=True)
+        found = self.predictions.of(self.predictions.group.at(labels, values), labels)
         rows = self.noise.noise_units(found.columns)
         slopes = self.noise.noise_units(np.moveaxis(found.slopes, 3, 0))
         return rows, np.moveaxis(slopes, 0, 2)
@@ -144,8 +137,8 @@ class WeightedMisfit:
         Errors are passed on as a model with effects of some `values` does there.
         """
         plain = dataclasses.replace(predictions, offset=None)
-        there = by_baseline(plain, plain.group, values)
-        by_error, phasors = plain.by_error(plain.group, values)
+        there = by_baseline(plain, values)
+        by_error, phasors = plain.by_error(values)
         by_error = by_error + _of_missing_force(plain, there.columns[0], by_error)
         lost = ~np.isfinite(by_error).all(axis=(1, 2))
         by_error[lost] = self.passed_on.by_error[lost]
@@ -155,10 +148,6 @@ class WeightedMisfit:
         errors = self.errors._replace(slopes=slopes)
         passed_on = ErrorPropagation(by_error, phasors, own)
         return _weighted(predictions, baseline, errors, passed_on, {})
-
-    def with_phases(self, phase: Float[np.ndarray, " state"]) -> "WeightedMisfit":
-        """The same with velocities of unknown phase at these phases, rad."""
-        return dataclasses.replace(self, predictions=self.predictions.with_phases(phase))
 
     def with_states(self, chosen: ComparedColumns) -> "WeightedMisfit":
         """The same states under other errors."""
@@ -174,10 +163,10 @@ def weighted_misfit(predictions: Predictions) -> WeightedMisfit:
     """
     plain = dataclasses.replace(predictions, offset=None)
     baseline, slopes = _baseline_of(plain)
-    errors = ErrorPropagation(*plain.by_error(plain.group, plain.group.values), slopes)
+    errors = ErrorPropagation(*plain.by_error(plain.group.values), slopes)
     missing = _of_missing_force(plain, baseline.columns, errors.by_error)
     passed_on = _by_reference(plain, errors._replace(by_error=errors.by_error + missing))
-    if plain.added is not None:
+    if np.any(plain.added):
         plain = plain.carried_back(passed_on.by_error)
         baseline, _ = _baseline_of(plain)
     return _weighted(plain, baseline, errors, passed_on, {})
@@ -186,17 +175,14 @@ def weighted_misfit(predictions: Predictions) -> WeightedMisfit:
 def _baseline_of(
     predictions: Predictions,
 ) -> tuple[BaselinePrediction, Float[np.ndarray, "state column direction"]]:
-    group = predictions.group
-    found = by_baseline(predictions, group, group.values)
+    found = by_baseline(predictions, predictions.group.values)
     baseline = BaselinePrediction(
         found.columns[0], found.phasors[0, :, 0], found.force_slopes[0, :, -2:]
     )
     return baseline, found.slopes[0]
 
 
-def by_baseline(
-    predictions: Predictions, group: Group, values: Float[np.ndarray, " parameter"]
-) -> Predicted:
+def by_baseline(predictions: Predictions, values: Float[np.ndarray, " parameter"]) -> Predicted:
     """Slopes by the baseline's uncertain parameters, times 1σ, and by the linear mode's two.
 
     Of these by its natural frequency as stiffness changes it: 2ζω stays as it is.
@@ -204,7 +190,7 @@ def by_baseline(
     stated, modes = predictions.stated, predictions.model.modes
     j = modes.mode_of_interest
     two = (f"mode_{j + 1}.natural_frequency", f"mode_{j + 1}.damping_ratio")
-    found = predictions.of(group, values[None], (*stated, *two))
+    found = predictions.of(values[None], (*stated, *two))
     share = float(modes.damping_ratio[j]) / float(modes.natural_frequency[j])
     for slopes in (found.slopes, found.force_slopes):
         slopes[..., -2] -= share * slopes[..., -1]
@@ -233,11 +219,15 @@ def _of_missing_force(
 
 def _by_reference(predictions: Predictions, passed_on: ErrorPropagation) -> ErrorPropagation:
     """Errors of the force passed on as smooth curves do, where these are known."""
-    if predictions.reference is None:
+    reference = predictions.reference
+    if reference is None:
         return passed_on
     n_sensors = np.asarray(predictions.chosen.states.velocity).shape[1]
-    by_error = passed_on_by(predictions.reference, passed_on.by_error, n_sensors)
-    return passed_on._replace(by_error=by_error)
+    changed = passed_on.by_error.copy()
+    for place, slope in ((1, reference.by_velocity), (1 + n_sensors, reference.by_phase)):
+        changed[reference.rows, 0, place] = slope.real
+        changed[reference.rows, 1, place] = slope.imag
+    return passed_on._replace(by_error=changed)
 
 
 def _weighted(
@@ -248,31 +238,28 @@ def _weighted(
     starts: dict[tuple, Float[np.ndarray, "trial state column"]],
 ) -> WeightedMisfit:
     """Weighted as errors are `passed_on`."""
-    own, by_linear = passed_on.slopes[:, :, :-2], passed_on.slopes[:, :, -2:]
-    gain = predictions.force_gain_std * passed_on.by_error[:, :, :1]
-    parts = [own, gain] if np.any(gain) else [own]
-    of_level = np.asarray(predictions.chosen.states.level)[:, None, None]
-    levels = of_level == np.array(predictions.free_level_forces, dtype=int)
-    parts.append(FREE_LEVEL_FORCE_STD * passed_on.by_error[:, :, :1] * levels)
-    shared = np.concatenate(parts, axis=2)
-    of_errors = passed_on.by_error, passed_on.phasors
-    noise = noise_model(predictions, *of_errors, shared, by_linear)
+    noise = _noise(predictions, passed_on)
     base = noise.noise_units(baseline.columns[None])[0]
-    linear = noise.noise_units(np.moveaxis(by_linear, 2, 0)).T
+    linear = noise.noise_units(np.moveaxis(passed_on.slopes[:, :, -2:], 2, 0)).T
     return WeightedMisfit(predictions, baseline, errors, passed_on, noise, base, linear, starts)
 
 
-def _start_changes(
-    misfit: WeightedMisfit, candidate: EffectCandidate
-) -> Float[np.ndarray, "trial state column"]:
-    group, labels = misfit.predictions.group, parameter_labels(candidate.kind)
-    starts = np.array(candidate.starts)
-    found = misfit.predicted(group, labels, starts, slopes=False)
-    changes = found.columns - misfit.baseline.columns
-    lost = ~np.isfinite(misfit.noise.noise_units(changes)).all(axis=1)
-    if lost.any():  # too strong to have a motion: what a weaker one does, scaled up
-        starts[:, 0] *= _WEAK
-        found = misfit.predicted(group, labels, starts[lost], slopes=False)
-        weak = found.columns - misfit.baseline.columns
-        changes[lost] = weak / _WEAK**candidate.strength_order
-    return changes
+def _noise(predictions: Predictions, passed_on: ErrorPropagation) -> NoiseModel:
+    """The noise of states with errors of the baseline model and of whole levels."""
+    states, n_levels = predictions.chosen.states, predictions.chosen.n_levels
+    level, n = np.asarray(states.level), np.asarray(states.velocity).shape[1]
+    own, by_linear = passed_on.slopes[:, :, :-2], passed_on.slopes[:, :, -2:]
+    by_error, force = passed_on.by_error, passed_on.by_error[:, :, :1]
+    gain = predictions.force_gain_std * force
+    free = level[:, None, None] == np.array(predictions.free_level_forces, dtype=int)
+    shared = [own, *([gain] if np.any(gain) else []), FREE_LEVEL_FORCE_STD * force * free]
+    of_no_level = sum(part.shape[2] for part in shared)
+    member = (level[:, None] == np.arange(n_levels)).astype(float)
+    inputs = (by_error[:, :, 1 : n + 1].sum(axis=2), by_error[:, :, n + 1 :].sum(axis=2))
+    slopes, stds = (*inputs, *np.moveaxis(by_linear, 2, 0)), predictions.model.level_stds
+    kinds = [k for k, std in enumerate(stds) if std > 0]
+    shared += [stds[k] * slopes[k][:, :, None] * member[:, None, :] for k in kinds]
+    whiten, known = predictions.whitened_for(by_error, passed_on.phasors)
+    rows = np.asarray(whitened_columns(whiten, np.concatenate(shared, axis=2)))[known]
+    shared_kind = np.append(np.full(of_no_level, -1), np.repeat(kinds, n_levels)).astype(int)
+    return NoiseModel(whiten, known, shared_covariance(rows), shared_kind, *np.nonzero(known))

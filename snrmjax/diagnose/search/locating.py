@@ -1,23 +1,18 @@
 """Which part of the force balance disagrees: stiffness, damping, harmonics, or none of them."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float
+from scipy.optimize import least_squares
 
 from snrmjax.diagnose import priors
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
 from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
-from snrmjax.numerics.levenberg_marquardt import StepRule, minimise
 
 _FREE = 6  # of a free curve of amplitude
-_SEEN = 2.0  # 1σ beyond which a free curve counts as changed at an amplitude
-_STEP = 0.01
-_POWERS = np.arange(-4.0, 8.0, _STEP)  # of amplitude, among which one is looked for
-_TELLING = 16.0  # of χ², that a power must explain to be reported
-_RULE = StepRule(steps=30, settled=0.02)  # of a fit of curves to sizes
-_STRAIGHT = 0.02  # of a change, by which straight pieces miss a power
 
 
 class Located(NamedTuple):
@@ -30,20 +25,7 @@ class Located(NamedTuple):
     exponent_std: float | None = None
 
 
-class FreeFit(NamedTuple):
-    """Stiffness and damping as free functions of amplitude, on top of the baseline."""
-
-    chi_square: float
-    freedom: int
-    parts: tuple[Located, ...]
-
-    @property
-    def p_value(self) -> float:
-        """Probability by chance of what no function of amplitude explains."""
-        return chi_square_p_value(self.chi_square, self.freedom)
-
-
-def locate_misfit(misfit: WeightedMisfit, base: EffectFit) -> FreeFit:
+def locate_misfit(misfit: WeightedMisfit, base: EffectFit) -> tuple[Located, ...]:
     """Fit free curves of stiffness and damping to the force, and test every part by itself.
 
     Where sizes alone are compared, states off resonance determine the stiffness and those near it
@@ -58,7 +40,7 @@ def locate_misfit(misfit: WeightedMisfit, base: EffectFit) -> FreeFit:
     hats = np.stack([np.interp(amplitude, knots, row) for row in np.eye(_FREE)], axis=1)
     rows = np.where(of_force, base.rows, 0.0)
     force = _Rows(misfit, of_force)
-    nothing = force.chi_square(rows, np.zeros((len(rows), 0)))[0]
+    nothing = float(np.sum(force.decorrelated(rows) ** 2))
     both = [_curves(misfit, rows, hats, [k]) for k in range(2)]
     alone = [force.fitted(curves, np.zeros(_FREE)) for curves in both]
     starts = (np.append(alone[0][1], np.zeros(_FREE)), np.append(np.zeros(_FREE), alone[1][1]))
@@ -72,15 +54,13 @@ def locate_misfit(misfit: WeightedMisfit, base: EffectFit) -> FreeFit:
     for k, name in enumerate(("stiffness", "damping")):
         p_value = chi_square_p_value(alone[1 - k][0] - free, _FREE)
         if p_value < priors.REJECTED:
-            own = slice(k * _FREE, (k + 1) * _FREE)
-            parts.append(
-                Located(
-                    name,
-                    _range(speed, hats, values[own], covariance[own, own]),
-                    p_value,
-                    *power_of_amplitude(knots, values[own], covariance[own, own]),
-                )
-            )
+            some = slice(k * _FREE, (k + 1) * _FREE)
+            own, spread = values[some], covariance[some, some]
+            std = np.sqrt(np.maximum(np.einsum("sk,kl,sl->s", hats, spread, hats), 0.0))
+            seen = np.abs(hats @ own) > 2 * std
+            where = speed[seen] if seen.any() else speed
+            ends = float(where.min()), float(where.max())
+            parts.append(Located(name, ends, p_value, *power_of_amplitude(knots, own, spread)))
     n_force = int(of_force.sum())
     left = chi_square_p_value(free, n_force - 2 * _FREE)
     everywhere = (float(speed.min()), float(speed.max()))
@@ -95,17 +75,15 @@ def locate_misfit(misfit: WeightedMisfit, base: EffectFit) -> FreeFit:
         mine = (noise.column >= first) & (noise.column < first + 2)
         if not mine.any():
             continue
-        square = _Rows(misfit, mine).chi_square(
-            np.where(mine, base.rows, 0.0), np.zeros((len(rows), 0))
-        )[0]
-        p_value = chi_square_p_value(square, int(mine.sum()))
+        left_of = _Rows(misfit, mine).decorrelated(np.where(mine, base.rows, 0.0))
+        p_value = chi_square_p_value(float(left_of @ left_of), int(mine.sum()))
         if p_value < priors.REJECTED:
             large = np.abs(base.rows[mine]) > 2.5
             where = speed[noise.state[mine][large]] if large.any() else speed
             parts.append(
                 Located(f"harmonic_{order}", (float(where.min()), float(where.max())), p_value)
             )
-    return FreeFit(float(free), n_force - 2 * _FREE, tuple(parts))
+    return tuple(parts)
 
 
 def power_of_answer(
@@ -119,7 +97,7 @@ def power_of_answer(
     if misfit.predictions.chosen.phase_unknown.any():
         return None  # sizes are not linear in what an answer changes
     alone = baseline._replace(rows=baseline.rows - fit.rows)
-    powers = [one.exponent for one in locate_misfit(misfit, alone).parts if one.part == part]
+    powers = [one.exponent for one in locate_misfit(misfit, alone) if one.part == part]
     return powers[0] if powers else None
 
 
@@ -160,14 +138,6 @@ def _curves(
     )
 
 
-class _Linearised(NamedTuple):
-    """The problem at some values of the curves."""
-
-    slopes: Float[np.ndarray, "row value"]
-    residuals: Float[np.ndarray, " kept"]
-    jacobian: Float[np.ndarray, "kept value"]
-
-
 class _Rows:
     """Least squares on some of the rows."""
 
@@ -182,10 +152,8 @@ class _Rows:
     def chi_square(
         self, rows: np.ndarray, columns: Float[np.ndarray, "row column"]
     ) -> tuple[float, np.ndarray, np.ndarray]:
-        left = self.decorrelated(rows)
-        if not columns.shape[1]:
-            return float(left @ left), np.zeros(0), np.zeros((0, 0))
-        arms = self.decorrelated(columns)
+        """χ², the most likely values of some columns, and their covariance."""
+        left, arms = self.decorrelated(rows), self.decorrelated(columns)
         size = np.linalg.norm(arms, axis=0)
         size = np.where(size > 0, size, 1.0)
         inverse = np.linalg.pinv((arms / size).T @ (arms / size), rcond=1e-10, hermitian=True)
@@ -200,28 +168,11 @@ class _Rows:
         if not np.any(curves.weight > 0):
             return self.chi_square(curves.rows, curves.arms)
 
-        def linearised(points: np.ndarray) -> list[_Linearised]:
-            pairs = [curves.at(values) for values in points]
-            return [
-                _Linearised(slopes, self.decorrelated(rows), self.decorrelated(slopes))
-                for rows, slopes in pairs
-            ]
+        def part(k: int) -> Callable[[np.ndarray], np.ndarray]:
+            return lambda values: self.decorrelated(curves.at(values)[k])
 
-        anywhere = np.full(len(start), np.inf)
-        points = start[None]
-        (end,) = minimise(linearised, points, linearised(points), (-anywhere, anywhere), _RULE)
-        covariance = self.chi_square(curves.at(end.point)[0], end.linearised.slopes)[2]
-        return end.sum_of_squares, end.point, covariance
-
-
-def _range(
-    speed: np.ndarray, hats: np.ndarray, values: np.ndarray, covariance: np.ndarray
-) -> tuple[float, float]:
-    curve = hats @ values
-    std = np.sqrt(np.maximum(np.einsum("sk,kl,sl->s", hats, covariance, hats), 0.0))
-    seen = np.abs(curve) > _SEEN * std
-    where = speed[seen] if seen.any() else speed
-    return float(where.min()), float(where.max())
+        found = least_squares(part(0), start, part(1), method="lm")
+        return 2 * float(found.cost), found.x, self.chi_square(*curves.at(found.x))[2]
 
 
 def power_of_amplitude(
@@ -232,16 +183,19 @@ def power_of_amplitude(
     Least squares on the curve with its full covariance: uncertainty of the linear parameters
     moves every amplitude alike, and changes that are not significant by themselves are kept.
     """
-    straight = (_STRAIGHT * values) ** 2 + 1e-12 * np.trace(covariance)
+    step = 0.01
+    powers = np.arange(-4.0, 8.0, step)
+    # Straight pieces miss a power by a fiftieth of the change.
+    straight = (0.02 * values) ** 2 + 1e-12 * np.trace(covariance)
     doubt = covariance + np.diag(straight)
     root = np.linalg.inv(np.linalg.cholesky(doubt))
-    curve, shapes = root @ values, root @ np.exp(np.outer(logarithm, _POWERS))
+    curve, shapes = root @ values, root @ np.exp(np.outer(logarithm, powers))
     explained = (curve @ shapes) ** 2 / np.sum(shapes**2, axis=0)
     best = int(np.argmax(explained))
     left = float(curve @ curve - explained[best])
-    if explained[best] < _TELLING or chi_square_p_value(left, _FREE - 2) < priors.REJECTED:
+    if explained[best] < priors.TELLING or chi_square_p_value(left, _FREE - 2) < priors.REJECTED:
         return None, None
     below = np.flatnonzero(explained > explained[best] - 1.0)
-    if below[0] == 0 or below[-1] == len(_POWERS) - 1:
+    if below[0] == 0 or below[-1] == len(powers) - 1:
         return None, None
-    return float(_POWERS[best]), float(0.5 * (_POWERS[below[-1]] - _POWERS[below[0]]) + _STEP / 2)
+    return float(powers[best]), float(0.5 * (powers[below[-1]] - powers[below[0]]) + step / 2)

@@ -1,9 +1,9 @@
-"""Stepwise search for the effects that explain a misfit, and for those that fit equally well.
+"""Stepwise search for the effects that explain a misfit, and how large others would have to be.
 
 What is worth a fit is seen from the gain that is expected if its starts are scaled to fit best.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -16,35 +16,22 @@ from snrmjax.diagnose.misfit.effect_fit import (
     fit_effect,
     fit_effects,
     started,
+    unfitted,
     with_errors_passed_on,
 )
 from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
-from snrmjax.model.effect_metadata import MotionScales
-from snrmjax.model.effects import EFFECTS
+from snrmjax.model.effect_base import AbstractEffect
+from snrmjax.model.effect_metadata import VISIBLE_CHANGE, MotionScales
+from snrmjax.model.effect_shape import shape_of, starts_of
+from snrmjax.model.effects import EFFECTS, effect_parameters
 from snrmjax.numerics.blocks import over_cores
 from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
 
-DETECTED = 10.0
-"""Gain of Schwarz's criterion from which on an effect counts as detected."""
-
-AS_GOOD = 6.0
-"""Difference of Schwarz's criterion within which two models count as equally good."""
-
-_NEAR = 40.0  # of the criterion: candidates that far behind the best are fitted again
-_DOUBTFUL = 0.05  # probability of a fit below which pairs without the best effect are fitted
 _HOPELESS = 5.0  # times χ² of the best fit so far, or of noise: others are given up on the way
 _PAIRS = 8  # that are fitted from their own starts
-# Candidates are fitted when a start of theirs would lower χ² by so much, beyond the first few by
-# such a share of what the best would.
-_TRIED, _WORTH, _SHARE = 8, 4.0, 0.25
 _ONE = 2  # parameters of one effect; one with more is compared with two simple effects
 _MOST = 3  # effects of an answer
-_SHARE_OF_SIZES = 0.02  # where sizes alone are compared, which are not linear in an effect
-_KEPT = 2  # starts of a candidate
-_SCALED = (0.1, 10.0)  # times its own strength, that a start is taken
-_TIMES = 3  # that a kind may be in pairs
-_ALIKE = 1e-3  # 1 − cos² between changes, less than which is not relied upon
 
 
 class TriedEffect(NamedTuple):
@@ -98,31 +85,34 @@ def find_effects(
 
 
 def _searched(misfit: WeightedMisfit, every: dict[str, EffectCandidate]) -> FoundEffects:
-    misfit, singles, rows = _tried(misfit, every, baseline_fit(misfit))
+    misfit, singles, rows = _tried(misfit, every)
     nothing, table = baseline_fit(misfit), [rows]
     best = _best(misfit, [nothing, *singles])
     considered = [nothing, *singles]
-    if _gain(misfit, nothing, best) <= DETECTED:
+    if _gain(misfit, nothing, best) <= priors.DETECTED:
         return FoundEffects(misfit, nothing, nothing, tuple(table), tuple(considered))
     jobs = [(c, best) for c in _promising(misfit, every, best)]
-    unexplained = _is_below(misfit, best, _DOUBTFUL)
+    unexplained = _is_below(misfit, best, 0.05)
     # Two simple effects may do what one with many parameters does.
     if unexplained or len(best.values) > _ONE:
         jobs += _pairs(misfit, every, best, unexplained=unexplained)
     pairs = fit_effects(misfit, jobs, _hopeless(best))
     pair = _best(misfit, [best, *pairs])
     considered += pairs
-    if pair is best or _gain(misfit, best, pair) <= DETECTED:
+    if pair is best or _gain(misfit, best, pair) <= priors.DETECTED:
         return FoundEffects(misfit, best, nothing, tuple(table), tuple(considered))
     # Errors are passed on as by both. Each is chosen again beside the other one.
     misfit = with_errors_passed_on(misfit, pair)
     nothing = baseline_fit(misfit)
-    alone = [fit_effect(misfit, _also_from(every[kind], pair)) for kind in pair.kinds]
+    alone = []
+    for kind in pair.kinds:
+        starts = (*every[kind].starts, pair.of_kind(kind))
+        alone.append(fit_effect(misfit, every[kind]._replace(starts=starts)))
     others = [fit for fit in singles if fit.kinds[0] not in pair.kinds]
     one, two = pair.kinds
     together = fit_effect(misfit, _where(every, pair, two), started(_where(every, pair, one)))
     considered = [nothing, *alone, together]
-    again = [(_from(every, fit), nothing) for fit in others]
+    again = [(_where(every, fit, fit.kinds[0]), nothing) for fit in others]
     considered += fit_effects(misfit, again, _hopeless(together))
     for kind, other in zip(pair.kinds, reversed(alone), strict=True):
         rivals = [c for c in _promising(misfit, every, other) if c.kind != kind]
@@ -135,7 +125,7 @@ def _searched(misfit: WeightedMisfit, every: dict[str, EffectCandidate]) -> Foun
         table.append(_table(misfit, best, thirds))
         considered += thirds
         third = _best(misfit, [best, *thirds])
-        best = third if _gain(misfit, best, third) > DETECTED else best
+        best = third if _gain(misfit, best, third) > priors.DETECTED else best
     return FoundEffects(misfit, best, nothing, tuple(table), tuple(considered))
 
 
@@ -232,48 +222,38 @@ def _promising(
     over_cores(misfit.start_changes, others)  # many short programs
     changes = [screened(misfit, c, before) for c in others]
     changes.sort(key=lambda pair: -pair[0])
-    share = _SHARE_OF_SIZES if misfit.predictions.sizes.alone.any() else _SHARE
-    least = max(_WORTH, share * max((gain for gain, _ in changes), default=0.0))
-    worth = [_WORTH if n < _TRIED else least for n in range(len(changes))]
+    # Sizes alone are not linear in an effect.
+    share = 0.02 if misfit.predictions.sizes.alone.any() else 0.25
+    few = 4.0  # of χ², that is worth a fit; beyond the first eight such a share of the largest
+    least = max(few, share * max((gain for gain, _ in changes), default=0.0))
+    worth = [*[few] * 8, *[least] * len(changes)][: len(changes)]
     return [c for (gain, c), need in zip(changes, worth, strict=True) if gain > need]
 
 
 def _tried(
-    misfit: WeightedMisfit, every: dict[str, EffectCandidate], before: EffectFit
+    misfit: WeightedMisfit, every: dict[str, EffectCandidate]
 ) -> tuple[WeightedMisfit, list[EffectFit], tuple[TriedEffect, ...]]:
     """Fits of candidates, those near the best again with errors passed on as the best one does.
 
     Returns the misfit so weighted, these fits, and all first fits as rows of the table.
     """
-    fits = fit_effects(misfit, [(c, before) for c in _promising(misfit, every, before)])
-    rows = _table(misfit, before, fits)
+    nothing = baseline_fit(misfit)
+    fits = fit_effects(misfit, [(c, nothing) for c in _promising(misfit, every, nothing)])
+    rows = _table(misfit, nothing, fits)
     fits = [fit for fit in fits if np.isfinite(fit.chi_square)]
-    if not fits:
-        return misfit, [], rows
-    best = min(fits, key=lambda fit: fit.criterion(misfit.n_rows))
-    if _gain(misfit, before, best) <= DETECTED:
+    best = min(fits, key=lambda fit: fit.criterion(misfit.n_rows), default=nothing)
+    if _gain(misfit, nothing, best) <= priors.DETECTED:
         return misfit, fits, rows
-    least = best.criterion(misfit.n_rows)
     again = with_errors_passed_on(misfit, best)
-    reach = least + max(_NEAR, 0.5 * best.chi_square)
+    reach = best.criterion(misfit.n_rows) + max(40.0, 0.5 * best.chi_square)
     near = [fit for fit in fits if fit.criterion(misfit.n_rows) < reach]
-    nothing = baseline_fit(again)
-    return again, fit_effects(again, [(_from(every, fit), nothing) for fit in near]), rows
+    jobs = [(_where(every, fit, fit.kinds[0]), baseline_fit(again)) for fit in near]
+    return again, fit_effects(again, jobs), rows
 
 
-def _also_from(one: EffectCandidate, pair: EffectFit) -> EffectCandidate:
-    """A candidate that also begins at its parameters in a pair."""
-    return one._replace(starts=(*one.starts, pair.of_kind(one.kind)))
-
-
-def _where(every: dict[str, EffectCandidate], pair: EffectFit, kind: str) -> EffectCandidate:
-    """A candidate that begins at its parameters in a pair."""
-    return every[kind]._replace(starts=(pair.of_kind(kind),))
-
-
-def _from(every: dict[str, EffectCandidate], fit: EffectFit) -> EffectCandidate:
-    """A candidate that begins where a fit to it ended."""
-    return every[fit.kinds[-1]]._replace(starts=(tuple(fit.values.tolist()),))
+def _where(every: dict[str, EffectCandidate], fit: EffectFit, kind: str) -> EffectCandidate:
+    """A candidate that begins where a fit of it, or of it beside others, ended."""
+    return every[kind]._replace(starts=(fit.of_kind(kind),))
 
 
 def _gain(misfit: WeightedMisfit, before: EffectFit, after: EffectFit) -> float:
@@ -315,10 +295,7 @@ def screened(
     Returns the fall and the candidate with its best starts so scaled.
     """
     changes = misfit.noise.noise_units(misfit.start_changes(candidate))
-    if beside.slopes.shape[1]:
-        basis = np.linalg.qr(misfit.noise.decorrelated(beside.slopes.T).T)[0]
-    else:
-        basis = np.zeros((misfit.n_rows, 0))
+    basis = np.linalg.qr(misfit.noise.decorrelated(beside.slopes.T).T)[0]
     left = misfit.noise.decorrelated(beside.rows)
     moves = np.flatnonzero(np.isfinite(changes).all(axis=1))
     if not moves.size:
@@ -329,7 +306,7 @@ def screened(
     factor = -(arms @ left) / np.where(size > 0, size, np.inf)
     factor = np.where((factor < 0) & (candidate.lower[0] >= 0), 0.0, factor)
     gains = factor**2 * size
-    best = np.argsort(gains)[::-1][:_KEPT]
+    best = np.argsort(gains)[::-1][:2]
     starts = tuple(_scaled(candidate, int(moves[k]), float(factor[k])) for k in best)
     return float(np.max(gains)), candidate._replace(starts=starts)
 
@@ -340,7 +317,7 @@ def screened_pairs(
     """The expected fall of Schwarz's criterion if starts of two effects are scaled to fit best.
 
     Of every two effects the best starts, so scaled; the best pair first. No effect is in more
-    than a few pairs: a strong one would be in all of them.
+    than three pairs: a strong one would be in all of them.
     """
     rows = [misfit.noise.noise_units(misfit.start_changes(c)) for c in candidates]
     whose = np.repeat(np.arange(len(candidates)), [len(some) for some in rows])
@@ -351,7 +328,7 @@ def screened_pairs(
     whose, which, arms, size = whose[moves], which[moves], arms[moves], size[moves]
     arms = arms / size[:, None]
     along, across = -arms @ misfit.noise.decorrelated(misfit.base), arms @ arms.T
-    left = np.maximum(1 - across**2, _ALIKE)
+    left = np.maximum(1 - across**2, 1e-3)  # of changes that are less alike
     factor = (along[:, None] - across * along) / left / size[:, None]  # of one beside another
     least = [-np.inf if c.strength_order == 1 and c.lower[0] < 0 else 0.0 for c in candidates]
     good = factor > np.array(least)[whose][:, None]
@@ -363,7 +340,7 @@ def screened_pairs(
     for place in np.argsort(-gain, axis=None)[: int(np.isfinite(gain).sum())]:
         i, j = divmod(int(place), len(whose))
         kinds = (int(whose[i]), int(whose[j]))
-        if kinds in seen or times[list(kinds)].max() >= _TIMES:
+        if kinds in seen or times[list(kinds)].max() >= 3:
             continue
         seen.add(kinds)
         times[list(kinds)] += 1
@@ -380,5 +357,63 @@ def _scaled(candidate: EffectCandidate, start: int, factor: float) -> tuple[floa
     strength, *shape = candidate.starts[start]
     # Those of second order change as the square of their strength, whatever its sign.
     times = float(np.sqrt(abs(factor))) if candidate.strength_order > 1 else factor
-    times = float(np.clip(abs(times), *_SCALED)) * (-1.0 if times < 0 else 1.0)
+    times = float(np.clip(abs(times), 0.1, 10.0)) * (-1.0 if times < 0 else 1.0)
     return (strength * times, *shape)
+
+
+def detection_limits(
+    misfit: WeightedMisfit, fit: EffectFit, scales: MotionScales, excluded: Collection[str]
+) -> dict[str, float]:
+    """The least strength of every further effect that would have been detected.
+
+    By parameter, in its own unit. Not given for the effects of the answer, for those `excluded`
+    from the search, and for what the data do not show at all.
+    """
+    limits = {}
+    for kind in EFFECTS:
+        if kind in excluded or kind in fit.kinds or not EFFECTS[kind].searched:
+            continue
+        tried = candidate(kind, scales)
+        change = misfit.first_change(tried)
+        square = misfit.chi_square(change)
+        if not square > 0:
+            continue
+        need = priors.DETECTED + len(tried.unit) * np.log(misfit.n_rows)
+        power = 2 if misfit.predictions.chosen.orders else 2 * tried.strength_order
+        name = f"{kind}.{effect_parameters(kind)[0]}"
+        limit = float(abs(tried.starts[0][0]) * (need / square) ** (1 / power))
+        limits[name] = _corrected(misfit, tried, limit, need)
+    return limits
+
+
+def _corrected(misfit: WeightedMisfit, one: EffectCandidate, limit: float, need: float) -> float:
+    """A limit corrected by trials at it where sizes are compared: they are not linear in it."""
+    if not misfit.predictions.sizes.alone.any():
+        return limit
+    first, *shape = one.starts[0]
+    for _ in range(4):
+        start = (float(np.copysign(limit, first)), *shape)
+        rows = unfitted(misfit, one._replace(starts=(start,))).rows
+        square = misfit.chi_square(rows - misfit.base)
+        if not 0 < square < np.inf:
+            break
+        # χ² grows with a power between the second and the fourth.
+        limit *= float(np.clip(need / square, 0.01, 100.0)) ** (1 / 3)
+    return limit
+
+
+def beyond_data(effect: type[AbstractEffect], limit: float, scales: MotionScales | None) -> bool:
+    """Whether an effect at its detection limit would exceed all that was measured ten times.
+
+    Arguments: `limit` of its strength, in its own unit; `scales` of the measured motions, without
+    which relative strengths alone are judged.
+    """
+    unit = next(iter(effect.parameters().values())).unit
+    if not np.isfinite(limit) or (unit == "1" and limit > priors.BEYOND_DATA):
+        return True
+    starts = [] if scales is None else starts_of(effect, scales)
+    if not starts or not starts[0][0]:
+        return False
+    shape = shape_of(effect)
+    order = 1 if shape is None else shape.strength_order
+    return bool(VISIBLE_CHANGE * (limit / abs(starts[0][0])) ** order > priors.BEYOND_DATA)

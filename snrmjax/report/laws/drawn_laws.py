@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from snrmjax.diagnose.laws.law_table import SURE, DrawnLaw
+from snrmjax.diagnose.laws.law_search import SURE, DrawnLaw
 from snrmjax.model.effect_metadata import Argument
 from snrmjax.report.html import ReportTable, number, with_error
 from snrmjax.report.style import (

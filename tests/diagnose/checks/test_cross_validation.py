@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import chi2
 from truths.made_up_misfits import LEVEL, N_ROWS, fit_to, misfit_of, noise
 
-from snrmjax.diagnose.checks.cross_validation import HeldOut, HeldOutLevels, held_out, missed_levels
+from snrmjax.diagnose.checks.residuals import HeldOut, HeldOutLevels, held_out, missed_levels
 
 
 def test_a_level_left_out_is_judged_with_what_the_others_leave_open():

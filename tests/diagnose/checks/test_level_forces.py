@@ -7,7 +7,7 @@ import pytest
 from truths.balanced_sets import balanced, linear_model, quadratic
 
 import snrmjax as sj
-from snrmjax.diagnose.checks.level_forces import (
+from snrmjax.diagnose.checks.gains import (
     LevelForces,
     level_forces_sentence,
     level_gains,
@@ -39,7 +39,7 @@ def test_the_level_is_found_and_its_gain_is_that_of_the_set():
     predictions, found = searched(data)
     rival = suspected_level_forces(found, 1.0)
     assert (rival.levels, rival.kinds, rival.is_better) == ((LEVEL,), (), True)
-    misfit = weighted_misfit(predictions.with_level_forces_free(rival.places))
+    misfit = weighted_misfit(dataclasses.replace(predictions, free_level_forces=rival.places))
     gains = level_gains(misfit, baseline_fit(misfit))
     # Of a mean of nine states of 1 % in velocity and 0.7° in phase; noise may favour either part.
     assert 0.01 / 3 / 2 < gains[LEVEL].std < 0.01 / 3 * 1.5

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from truths.made_up_misfits import noise_of
 
-from snrmjax.diagnose.checks.patterns import left_curve, pattern
+from snrmjax.diagnose.checks.residuals import left_curve, pattern
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
 
 LEVELS, PER_LEVEL, DAMPING = 5, 16, 0.01

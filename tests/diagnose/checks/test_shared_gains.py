@@ -9,7 +9,7 @@ from truths.balanced_sets import balanced, linear_model, quadratic
 from truths.exact_states import GAIN, driven, modes
 
 import snrmjax as sj
-from snrmjax.diagnose.checks.shared_gains import (
+from snrmjax.diagnose.checks.gains import (
     doubts_on_gains,
     gain_found,
     modal_mass_found,

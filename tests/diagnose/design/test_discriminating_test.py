@@ -24,10 +24,14 @@ from snrmjax.diagnose.design.design_points import (
     refitted_chi_square,
     shared_by_both,
 )
-from snrmjax.diagnose.design.discriminating_test import DiscriminatingTest, discriminating_test
-from snrmjax.diagnose.design.recommendation import recommendation
+from snrmjax.diagnose.design.discriminating_test import (
+    DiscriminatingTest,
+    discriminating_test,
+    recommendation,
+)
 from snrmjax.diagnose.evidence import weights_of
 from snrmjax.diagnose.misfit.candidates import only_by_calibration
+from snrmjax.diagnose.misfit.noise_model import shared_covariance
 from snrmjax.diagnose.misfit.predictions import predictions_of, scales_of
 from snrmjax.diagnose.misfit.weighted_misfit import weighted_misfit
 from snrmjax.diagnose.search.model_search import find_effects
@@ -46,9 +50,10 @@ def test_a_sum_of_squares_is_refitted_with_all_that_is_free():
     # The same by one regression: shared errors are parameters that were measured as zero.
     matrix = np.block([[rows.slopes / [1e6, 1e-3], shared], [np.zeros((4, 2)), np.eye(4)]])
     left = np.linalg.lstsq(matrix, np.append(rows.left, np.zeros(4)))[1]
-    assert refitted_chi_square(rows, shared) == pytest.approx(left[0], rel=1e-9)
+    covariance = shared_covariance(shared)
+    assert refitted_chi_square(rows, covariance) == pytest.approx(left[0], rel=1e-9)
     # What a parameter can do by itself costs nothing.
-    assert refitted_chi_square(Rows(rows.slopes[:, 0], rows.slopes), shared) < 1e-9
+    assert refitted_chi_square(Rows(rows.slopes[:, 0], rows.slopes), covariance) < 1e-9
 
 
 def test_a_free_force_of_a_measured_level_says_nothing_of_a_further_test():

@@ -3,8 +3,7 @@
 from types import SimpleNamespace
 
 from snrmjax.diagnose.checks.doubts import doubts
-from snrmjax.diagnose.design.discriminating_test import DiscriminatingTest
-from snrmjax.diagnose.design.recommendation import recommendation
+from snrmjax.diagnose.design.discriminating_test import DiscriminatingTest, recommendation
 
 
 def found_with(*classes, orders=()):

@@ -8,8 +8,7 @@ from truths.balanced_sets import balanced, files, linear_model, quadratic
 
 import snrmjax as sj
 from snrmjax.diagnose.diagnosis import Verdict
-from snrmjax.diagnose.laws.law_search import fit_laws
-from snrmjax.diagnose.laws.law_table import drawn_tables
+from snrmjax.diagnose.laws.law_search import drawn_tables, fit_laws
 from snrmjax.diagnose.misfit.candidates import candidate
 from snrmjax.diagnose.misfit.effect_fit import fit_effect, with_errors_passed_on
 from snrmjax.diagnose.misfit.predictions import predictions_of, scales_of

@@ -12,9 +12,9 @@ from truths.balanced_sets import HERE, KEYS, balanced, files, linear_model, quad
 
 import snrmjax as sj
 from snrmjax.cli import diagnose
-from snrmjax.diagnose.misfit.amplitudes import Sizes, sizes_of
 from snrmjax.diagnose.misfit.candidates import candidate, parameter_labels
 from snrmjax.diagnose.misfit.effect_fit import at_phases_of, fit_effect, unfitted
+from snrmjax.diagnose.misfit.noise_model import Sizes, sizes_of
 from snrmjax.diagnose.misfit.predictions import predictions_of, scales_of
 from snrmjax.diagnose.misfit.weighted_misfit import weighted_misfit
 from snrmjax.identify.calibrate.calibration import calibrate_model
@@ -47,10 +47,9 @@ def stripped(name):
 def at_starts(predictions, kind):
     """What the first start of a kind makes of the states, by its first parameter."""
     one = candidate(kind, scales_of(predictions))
-    group, labels = predictions.group, parameter_labels(kind)
-    values = group.values.copy()
-    values[[group.place(label) for label in labels]] = one.starts[0]
-    found = predictions.of(group, values[None], labels[:1])
+    labels = parameter_labels(kind)
+    values = predictions.group.at(labels, np.array(one.starts[0]))
+    found = predictions.of(values[None], labels[:1])
     slopes = (one.unit[0] * found.slopes, one.unit[0] * found.force_slopes)
     return found._replace(slopes=slopes[0], force_slopes=slopes[1])
 
@@ -84,7 +83,7 @@ def test_every_effect_has_the_same_sizes_whatever_the_phases():
 def alone(predictions):
     """The baseline by itself."""
     group = predictions.group
-    return predictions.of(group, group.values[None])
+    return predictions.of(group.values[None])
 
 
 def test_given_phases_of_unknown_worth_are_not_used():
@@ -126,7 +125,7 @@ def test_errors_are_passed_on_to_sizes():
     model, data = files("blind_03")
     predictions = predictions_of(model, without_phases(data))
     group = predictions.group
-    slopes, _ = predictions.by_error(group, group.values)
+    slopes, _ = predictions.by_error(group.values)
     data, step = without_phases(data), 1e-3
     louder, softer = (
         predictions_of(

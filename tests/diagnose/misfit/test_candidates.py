@@ -66,13 +66,13 @@ def test_a_law_is_found_along_the_narrow_valley_of_precise_data():
     one = candidate(kind, scales_of(predictions))
     one = one._replace(starts=one.starts[:1])  # p = 1.2, a hundred of its 1σ away
     found = fit_effect(misfit, one)
-    group, labels = predictions.group, parameter_labels(kind)
+    labels = parameter_labels(kind)
     at = float(scales_of(predictions).amplitude)
 
     def left(point):
         size, p = point
         values = np.array([[size * at ** (1 - p), p]])
-        return misfit.noise.decorrelated(misfit.evaluated(group, labels, values)[0][0])
+        return misfit.noise.decorrelated(misfit.evaluated(labels, values)[0][0])
 
     c, p = one.starts[0]
     begin = [c * at ** (p - 1), p]

@@ -9,14 +9,14 @@ from truths.balanced_sets import OMEGA, PARTICIPATION, SHAPE, linear_model
 import snrmjax as sj
 from snrmjax.diagnose.answers import Search
 from snrmjax.diagnose.misfit.candidates import candidate
-from snrmjax.diagnose.misfit.corrected_records import (
+from snrmjax.diagnose.misfit.effect_fit import (
     at_reference,
+    baseline_fit,
+    fit_effect,
     likely_errors,
-    with_corrected_records,
     without_errors,
 )
-from snrmjax.diagnose.misfit.effect_fit import baseline_fit, fit_effect
-from snrmjax.diagnose.misfit.predictions import predictions_of, scales_of
+from snrmjax.diagnose.misfit.predictions import predictions_of, scales_of, with_corrected_records
 from snrmjax.diagnose.misfit.reference import with_reference
 from snrmjax.diagnose.misfit.weighted_misfit import weighted_misfit
 
@@ -202,7 +202,7 @@ def test_errors_of_levels_pass_on_harmonics_and_not_their_noise():
     predictions = predictions_of(
         linear_model(damping=RATIO), with_noise_as_harmonics(hardening(0.0))
     )
-    by_error, _ = predictions.by_error(predictions.group, predictions.group.values)
+    by_error, _ = predictions.by_error(predictions.group.values)
     assert by_error.shape[1:] == (6, 3)
     assert np.max(np.abs(by_error[:, :2])) > 0.5
     # Slopes are differences, whose second order is of the noise: 0.2 at most, times a small step.

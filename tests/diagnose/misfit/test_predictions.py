@@ -85,10 +85,9 @@ def test_an_effect_of_ones_own_is_treated_alike_whenever_it_is_registered(
     # Without strength it counts for nothing: a linear mode at resonance.
     found = SmoothFriction(jnp.array(0.01), jnp.array(3e-4))
     completed = dataclasses.replace(model, effects=(found,))
-    models = simulation.LevelModels(model, completed)
-    before = simulation.level_simulations(models, data, 0).before
-    for force, curves in zip(simulation.level_forces(data).values(), before, strict=True):
-        largest = max(np.max(np.abs(curve.velocity[:, 1, 0])) for curve in curves)
+    before = simulation.predicted_levels(model, completed, data, 0).before
+    for force, curve in zip(simulation.level_forces(data).values(), before, strict=True):
+        largest = np.max(np.abs(curve.velocity[:, 1, 0]))
         assert largest == pytest.approx(2.0 * 3.0 * force / (2 * ZETA * OMEGA), rel=1e-2)
 
 
@@ -120,10 +119,9 @@ def test_what_states_miss_is_what_newtons_method_finds(predictions, kind):
 def test_slopes_are_those_of_finite_differences(predictions, kind):
     ours, _ = predictions
     values = moderate(kind, scales_of(ours))
-    group, labels = ours.group, parameter_labels(kind)
-    every = group.values.copy()
-    every[[group.place(label) for label in labels]] = values
-    slopes = ours.of(group, every[None], labels).slopes[0]
+    labels = parameter_labels(kind)
+    every = ours.group.at(labels, values)
+    slopes = ours.of(every[None], labels).slopes[0]
     for k in range(len(labels)):
         step = np.zeros(len(labels))
         step[k] = 1e-3 * (abs(values[k]) or 1.0)
@@ -136,30 +134,28 @@ def test_slopes_are_those_of_finite_differences(predictions, kind):
 
 def asked(ours, kind, values):
     """Complex force misfits of trials, over the measured force."""
-    group, labels = ours.group, parameter_labels(kind)
-    every = np.tile(group.values, (len(values), 1))
-    every[:, [group.place(label) for label in labels]] = values
-    found = ours.of(group, every)
+    found = ours.of(ours.group.at(parameter_labels(kind), values))
     return found.columns[..., 0] + 1j * found.columns[..., 1]
 
 
 def missed_by(ours):
     """The same of the baseline."""
     group = ours.group
-    found = ours.of(group, group.values[None])
+    found = ours.of(group.values[None])
     return found.columns[0, :, 0] + 1j * found.columns[0, :, 1]
 
 
 def test_where_no_motion_ends_a_step_the_way_towards_it_is_the_slope(predictions):
     ours, _ = predictions
     group, label = ours.group, "cubic_stiffness.coefficient"
-    usual = ours.of(group, group.values[None], [label]).slopes[0, :, :2, 0]
+    usual = ours.of(group.values[None], [label]).slopes[0, :, :2, 0]
     far = group._replace(unit=1e7 * group.unit)
-    there = group.values.copy()
-    there[group.place(label)] = 2.5e-4 * far.unit[group.place(label)]
-    lost = ~np.isfinite(ours.of(group, there[None]).columns).all(axis=(0, 2))
+    there = group.at([label], 2.5e-4 * far.unit[group.places([label])])
+    lost = ~np.isfinite(ours.of(there[None]).columns).all(axis=(0, 2))
     assert lost[4:].all()  # the larger motions
-    slopes = ours.of(far, group.values[None], [label]).slopes[0, :, :2, 0]
+    slopes = (
+        dataclasses.replace(ours, group=far).of(group.values[None], [label]).slopes[0, :, :2, 0]
+    )
     # What holds the motion is linear in the coefficient, and so is the first step.
     np.testing.assert_allclose(slopes[lost], usual[lost], rtol=0, atol=1e-2 * np.abs(usual).max())
 
@@ -171,7 +167,7 @@ def test_what_the_model_is_unsure_of_has_slopes_however_small_it_is(predictions)
     potential = sj.model.polynomial_potential({"1111": 1e3}, 1, coefficient_std={"1111": 1e6})
     ours = predictions_of(dataclasses.replace(sj.model.structure(linear, potential), name=""), data)
     group = ours.group
-    slopes = ours.of(group, group.values[None], ["potential.1111"]).slopes[0]
+    slopes = ours.of(group.values[None], ["potential.1111"]).slopes[0]
     frequency, velocity = np.asarray(data.frequency), np.asarray(data.velocity)[:, 0]
     # ∂V/∂q = 4 a q³, whose fundamental is 3 a |q|² q.
     q = velocity / (2j * frequency)
@@ -183,11 +179,11 @@ def test_shapes_of_ones_own_effect_have_slopes_whatever_their_size(own_friction)
     """A knee of 3e-4 m/s, of which nothing says that one is no unit for it."""
     ours, group, labels = own_friction
     values = group.values.copy()
-    places = [group.place(label) for label in labels]
+    places = group.places(labels)
     values[places] = 0.3 * group.unit[places[0]], 3e-4
-    slopes = ours.of(group, values[None], labels).slopes[0, :, :, 1]
+    slopes = ours.of(values[None], labels).slopes[0, :, :, 1]
     ends = np.stack([values, values])
     ends[:, places[1]] += np.array([1e-3, -1e-3]) * 3e-4
-    columns = ours.of(group, ends).columns
+    columns = ours.of(ends).columns
     expected = (columns[0] - columns[1]) / (2e-3 * 3e-4)
     np.testing.assert_allclose(slopes, expected, atol=0.03 * np.abs(expected).max())

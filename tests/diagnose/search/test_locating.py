@@ -99,7 +99,7 @@ def test_quadratic_softening_has_the_power_of_its_own_motion():
     law = by_linear[:, 0] * np.repeat(change, 2)
     nothing = EffectFit((), (), none, 0.0, left - law, no_slopes, none, none)
     fit = nothing._replace(kinds=("quadratic_stiffness",), rows=left)
-    parts = locate_misfit(misfit, nothing).parts
+    parts = locate_misfit(misfit, nothing)
     (part,) = (one for one in parts if one.part == "stiffness")
     own = power_of_answer(misfit, nothing, fit, "stiffness")
     assert power_of_answer(misfit, nothing, fit, "damping") is None

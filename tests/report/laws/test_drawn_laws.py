@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from snrmjax.diagnose.laws.law_table import DrawnLaw
+from snrmjax.diagnose.laws.law_search import DrawnLaw
 from snrmjax.model.effect_metadata import Argument
 from snrmjax.report.laws.drawn_laws import drawn_laws_figure, law_tables
 
