@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from snrmjax.identify.checks.instruments import saying_what_is_undetermined
+from snrmjax.identify.checks.instruments import notes_on_instruments
 from snrmjax.identify.checks.residual_autocorrelation import (
     along_resonance,
     residual_autocorrelation,
@@ -238,7 +238,6 @@ class JointFit(AbstractResult):
 
 @on_one_core
 @naming_wrong_phases
-@saying_what_is_undetermined(LEVEL_ERRORS)
 def fit_jointly(
     data: SteadyStates,
     modes: LinearModes | Structure,
@@ -334,7 +333,9 @@ def fit_jointly(
         level_numbers=level_numbers(data, modes),
     )
     said = best.noise._replace(level=tuple(told.tolist()))
-    return dataclasses.replace(fit, notes=_notes(fit, said, 0.5 * view.wandering, level_std))
+    notes = notes_on_instruments(fit, LEVEL_ERRORS)
+    notes += _notes(fit, said, 0.5 * view.wandering, level_std)
+    return dataclasses.replace(fit, notes=notes)
 
 
 def _notes(
