@@ -7,6 +7,7 @@ from .calibrate.calibrated_model import CalibratedModel
 from .calibrate.calibration import calibrate_model
 from .calibrate.inverse_force import InverseForce, inverse_force
 from .curves.families import FAMILIES
+from .inference.contributions import Contribution, Contributions, contributions
 from .inference.corrected_states import corrected_states
 from .inference.fitted_curves import fitted_values
 from .inference.fitted_response import FittedResponse, fitted_response, predicted_resonance
@@ -18,22 +19,7 @@ from .inference.optimal_design import (
     NextMeasurements,
     next_measurements,
 )
-from .inference.profiles import IntervalEnd, Profile, profile
-from .inference.resampling import (
-    ComparedBand,
-    ComparedBands,
-    bootstrap,
-    compare_bands,
-    inference_data,
-    sample_posterior,
-)
-from .inference.sensitivity import (
-    Contribution,
-    Contributions,
-    Sensitivity,
-    contributions,
-    sensitivity,
-)
+from .inference.refits import IntervalEnd, Profile, bootstrap, profile
 from .joint.family_fit import FitStatus
 from .joint.joint_fit import JointFit, NoiseEstimate, fit_jointly
 from .modal.base_motion import BaseResponses, relative_to_base
@@ -53,7 +39,7 @@ from .pointwise.backbone_points import identify_points
 from .pointwise.inversion import closed_form, invert_amplitude_phase, invert_phasor
 from .pointwise.inversion_result import PointStatus, SnrmPoints
 from .pointwise.points_result import BackbonePoints
-from .pointwise.prediction import predict_response, resonance_by_fixed_point, resonances
+from .pointwise.prediction import predict_response, resonances
 from .pointwise.prediction_result import PredictedResponse, Resonance
 from .pointwise.snrm import nonlinear_mode_velocity, reference_sensor, snrm_velocity
 from .prediction.new_level import ON_THE_CURVES, DayToDay, LevelTrend, NewLevel, new_level
@@ -85,8 +71,6 @@ __all__ = [
     "BaseResponses",
     "CalibratedModel",
     "Calibration",
-    "ComparedBand",
-    "ComparedBands",
     "Contribution",
     "Contributions",
     "DayToDay",
@@ -116,7 +100,6 @@ __all__ = [
     "Resonance",
     "ResonanceDistribution",
     "ScaledModes",
-    "Sensitivity",
     "SensorMasses",
     "SnrmPoints",
     "StateResponses",
@@ -125,7 +108,6 @@ __all__ = [
     "calibrate_model",
     "calibrate_to_backbone",
     "closed_form",
-    "compare_bands",
     "contributions",
     "corrected_states",
     "decay_modes",
@@ -137,7 +119,6 @@ __all__ = [
     "fitted_values",
     "identify_backbone",
     "identify_points",
-    "inference_data",
     "inverse_force",
     "invert_amplitude_phase",
     "invert_phasor",
@@ -151,12 +132,9 @@ __all__ = [
     "profile",
     "reference_sensor",
     "relative_to_base",
-    "resonance_by_fixed_point",
     "resonances",
     "responses_of_states",
-    "sample_posterior",
     "scale_modes",
     "scale_of",
-    "sensitivity",
     "snrm_velocity",
 ]

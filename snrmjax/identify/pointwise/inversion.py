@@ -121,29 +121,6 @@ def _invert_phasor(
     )
 
 
-def invert_one(
-    modal_constant: Float[Array, ""],
-    frequency: Float[Array, ""],
-    velocity: Complex[Array, ""],
-    residual_velocity: Complex[Array, ""],
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """ω̃ and ζ̃ of a single steady state, bare: for derivatives by `jax.jacfwd` or `jax.grad`.
-
-    The same Newton solve as `invert_phasor`, whose arguments it takes, without statuses and
-    without the other root; NaN where there is no real ω̃.
-    """
-    mode_velocity = velocity - residual_velocity
-    natural, damping, _ = _newton(
-        modal_constant,
-        frequency,
-        jnp.abs(velocity),
-        *_direction(mode_velocity),
-        residual_velocity,
-        jnp.abs(mode_velocity),
-    )
-    return natural, damping
-
-
 def invert_amplitude_phase(
     modal_constant: Float[Array, "*batch"],
     frequency: Float[Array, "*batch"],

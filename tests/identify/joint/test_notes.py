@@ -6,7 +6,7 @@ from truths.exact_states import TRUE, modes, noisy
 from truths.joint_fits import noisy_fit
 
 import snrmjax as sj
-from snrmjax.identify.inference.sensitivity import contributions
+from snrmjax.identify.inference.contributions import contributions
 from snrmjax.identify.joint.notes import (
     NoiseAndLevels,
     notes_on_autocorrelation,
