@@ -6,7 +6,6 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from snrmjax.identify.curves.families import values_and_slopes
 from snrmjax.identify.curves.family_base import AbstractFamily
 from snrmjax.identify.curves.splines import SmoothingSpline, Spline
 from snrmjax.identify.joint.force_balance import Unknowns
@@ -186,10 +185,10 @@ def _linearised(
     curve: AbstractFamily, amplitude: Float[np.ndarray, " point"]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Values, derivatives by the parameters, and by the amplitude by central differences."""
-    values, slopes = values_and_slopes(curve, amplitude)
+    values, slopes = curve.values_and_slopes(amplitude)
     step = _STEP * np.maximum(amplitude, 1e-3 * float(curve.scale))
     (above, _), (below, _) = (
-        values_and_slopes(curve, np.maximum(amplitude + sign * step, 0.0)) for sign in (1, -1)
+        curve.values_and_slopes(np.maximum(amplitude + sign * step, 0.0)) for sign in (1, -1)
     )
     width = amplitude + step - np.maximum(amplitude - step, 0.0)
     with np.errstate(invalid="ignore"):

@@ -4,15 +4,14 @@ import dataclasses
 import functools
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Complex, Float
 from scipy.optimize import minimize
 
-from snrmjax.identify.curves.families import ARGUMENTS, FAMILIES, Choice, values_and_slopes
+from snrmjax.identify.curves.families import ARGUMENTS, FAMILIES, Choice
 from snrmjax.identify.curves.family_base import AbstractFamily, Argument
-from snrmjax.identify.curves.splines import SmoothingSpline, bends_of
+from snrmjax.identify.curves.splines import SmoothingSpline
 from snrmjax.identify.joint.force_balance import (
     STATE_ERRORS,
     BalanceProblem,
@@ -267,7 +266,7 @@ def _curve(found: TestPosterior, choice: Choice, which: int) -> AbstractFamily:
     values = (curves.squared_frequency, curves.modal_damping)[which]
     std = np.sqrt(curves.covariance[:, which, which])
     family, n = FAMILIES[choice.kind], len(x)
-    sizes = family.sizes(n, found.states.n_levels) if choice.size is None else (choice.size,)
+    sizes = family.orders if choice.size is None else (choice.size,)
     tried: list[tuple[float, int, AbstractFamily]] = []
     for size in sizes:
         for argument in (choice.argument,) if choice.argument else ARGUMENTS:
@@ -278,7 +277,7 @@ def _curve(found: TestPosterior, choice: Choice, which: int) -> AbstractFamily:
                         f"{choice.kind}:{size} has {one.parameters.shape[0]} parameters, but "
                         f"there are {n} states only: choose a smaller family."
                     )
-                off = np.sqrt(np.mean(((values_and_slopes(one, at)[0] - values) / std) ** 2))
+                off = np.sqrt(np.mean(((one.values_and_slopes(at)[0] - values) / std) ** 2))
                 tried.append((float(off), one.parameters.shape[0], one))
     # The simplest that lies in the band of the smooth curve, or else the nearest to it.
     inside = [row for row in tried if row[0] < 1.0]
@@ -297,14 +296,9 @@ def _smooth(found: TestPosterior, argument: Argument, which: int) -> SmoothingSp
     if argument == "velocity":
         speed = displacement * np.sqrt(curves.squared_frequency)
         knots, scale = (speed / speed[-1]) ** 2, float(speed[-1])
-    blank = SmoothingSpline.through(knots, values, jax.device_put(scale), argument)
     size = found.units[which] * found.hyper.bends[which] / found.modal_mass[0]
     std = size * np.exp(basis.directions @ found.hyper.along)
-    return eqx.tree_at(
-        lambda one: (one.bends, one.bend_std),
-        blank,
-        (jax.device_put(bends_of(knots)), jax.device_put(std)),
-    )
+    return SmoothingSpline.through(knots, values, jax.device_put(scale), argument, std)
 
 
 def _complex_gain(problem: BalanceProblem) -> complex:

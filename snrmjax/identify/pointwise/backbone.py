@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from snrmjax.identify.curves.families import values_and_slopes
 from snrmjax.identify.curves.family_base import AbstractCurve
 from snrmjax.identify.pointwise.inversion_result import spans
 from snrmjax.identify.pointwise.points_result import AmplitudeArgument
@@ -133,7 +132,7 @@ class Backbone(AbstractResult):
             return self._values(amplitude)
         at = np.asarray(amplitude, dtype=float)
         curves = self.squared_frequency, self.modal_damping
-        (squared, by_squared), (modal, by_modal) = (values_and_slopes(c, at) for c in curves)
+        (squared, by_squared), (modal, by_modal) = (c.values_and_slopes(at) for c in curves)
         found = _banded(np, at, self, (squared, by_squared), (modal, by_modal))
         return BackboneValues(*jax.device_put(found))
 
