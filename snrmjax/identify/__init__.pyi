@@ -26,6 +26,7 @@ from .modal.base_motion import BaseResponses, relative_to_base
 from .modal.free_decay import DecayModes, fit_free_decay
 from .modal.linear_fit import fit_linear_modes
 from .modal.modal_fit import LinearModalFit
+from .modal.modes_of_tests import find_modes
 from .modal.response_data import joined_responses
 from .modal.state_responses import (
     AmplitudeDependence,
@@ -44,7 +45,6 @@ from .pointwise.prediction_result import PredictedResponse, Resonance
 from .pointwise.snrm import nonlinear_mode_velocity, reference_sensor, snrm_velocity
 from .prediction.new_level import ON_THE_CURVES, DayToDay, LevelTrend, NewLevel, new_level
 from .prediction.resonance_distribution import ResonanceDistribution
-from .scaling.request import ModesRequest, find_modes, scale_of
 from .scaling.scale import (
     AddedMassTest,
     Calibration,
@@ -52,7 +52,6 @@ from .scaling.scale import (
     Free,
     KnownShape,
     SensorMasses,
-    decay_modes,
     scale_modes,
 )
 from .scaling.scaled_modes import ScaledModes
@@ -89,7 +88,6 @@ __all__ = [
     "LinearModalFit",
     "LocatedStatus",
     "MeasuredBackbone",
-    "ModesRequest",
     "NewLevel",
     "NextMeasurement",
     "NextMeasurements",
@@ -110,7 +108,6 @@ __all__ = [
     "closed_form",
     "contributions",
     "corrected_states",
-    "decay_modes",
     "find_modes",
     "fit_free_decay",
     "fit_jointly",
@@ -135,6 +132,5 @@ __all__ = [
     "resonances",
     "responses_of_states",
     "scale_modes",
-    "scale_of",
     "snrm_velocity",
 ]
