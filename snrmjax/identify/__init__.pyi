@@ -29,7 +29,6 @@ from .modal.modal_fit import LinearModalFit
 from .modal.modes_of_tests import find_modes
 from .modal.response_data import joined_responses
 from .modal.state_responses import (
-    AmplitudeDependence,
     StateResponses,
     amplitude_dependence,
     levels_by_velocity,
@@ -61,7 +60,6 @@ __all__ = [
     "ON_THE_CURVES",
     "AddedMassTest",
     "AdviceStatus",
-    "AmplitudeDependence",
     "Anchor",
     "Backbone",
     "BackboneCalibration",

@@ -11,7 +11,6 @@ from snrmjax.identify.modal.state_responses import (
     amplitude_dependence,
     levels_by_velocity,
     responses_of_states,
-    widened,
 )
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
 from snrmjax.measure.recordings.time_recording import TimeRecording
@@ -54,8 +53,7 @@ def find_modes(
         second = _of_responses(other.responses, base, {**settings, **by_hand})
     except ValueError as error:
         return found, (f"level {above[0]} cannot be compared with level {chosen}: {error}",)
-    seen = amplitude_dependence(found, second, (lowest.velocity, other.velocity))
-    return widened(found, seen), seen.notes
+    return amplitude_dependence(found, second, (lowest.velocity, other.velocity))
 
 
 def _of_responses(
