@@ -21,7 +21,8 @@ from .inference.optimal_design import (
 )
 from .inference.refits import IntervalEnd, Profile, bootstrap, profile
 from .joint.family_fit import FitStatus
-from .joint.joint_fit import JointFit, NoiseEstimate, fit_jointly
+from .joint.joint_fit import JointFit, fit_jointly
+from .joint.notes import NoiseEstimate
 from .modal.base_motion import BaseResponses, relative_to_base
 from .modal.free_decay import DecayModes, fit_free_decay
 from .modal.linear_fit import fit_linear_modes

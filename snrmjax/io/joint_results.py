@@ -22,7 +22,8 @@ from snrmjax.identify.joint.force_balance import (
     PriorStd,
     Unknowns,
 )
-from snrmjax.identify.joint.joint_fit import JointFit, NoiseEstimate
+from snrmjax.identify.joint.joint_fit import JointFit
+from snrmjax.identify.joint.notes import NoiseEstimate
 from snrmjax.identify.test_model.states import LEVEL_ERRORS
 from snrmjax.io.files import FilePath, read_text, write_atomically
 from snrmjax.io.results import write_values

@@ -202,7 +202,7 @@ def values_with_slopes(
 
     Raises `ValueError` where the backbone has a velocity at several displacements.
     """
-    found = on_backbone(fit.unknowns, velocity, displacement_near(fit, velocity))
+    found = on_backbone(fit.unknowns, velocity, _displacement_near(fit, velocity))
     return found.values, _of_all(fit, found.slopes)
 
 
@@ -223,7 +223,7 @@ def _of_all(fit: JointFit, slopes: np.ndarray) -> Float[np.ndarray, "point curve
     return np.pad(slopes, ((0, 0), (0, 0), (0, len(fit.covariance) - slopes.shape[2])))
 
 
-def displacement_near(
+def _displacement_near(
     fit: JointFit, velocity: Float[np.ndarray, " point"]
 ) -> Float[np.ndarray, " point"]:
     """Displacement of the backbone at velocities, to one part in a few hundred.
@@ -245,13 +245,6 @@ class _Reached(NamedTuple):
     displacement: np.ndarray
     speed: np.ndarray
     turns_back_at: float | None  # m/s, below the velocity that was asked for
-
-    @property
-    def once(self) -> float:
-        """The velocity, below which the backbone has each exactly once."""
-        if self.turns_back_at is None:
-            return float(self.speed[-1])
-        return float(np.min(self.speed[np.argmax(self.speed == self.turns_back_at) :]))
 
 
 def _near(fit: JointFit, velocity: float) -> _Reached:

@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Float, Int
+from jaxtyping import Array, Complex, Float, Int
 
 from snrmjax.identify.curves.family_base import AbstractCurve, AbstractFamily
 from snrmjax.identify.pointwise.backbone_points import modal_filter, off_resonance_error_factor
@@ -147,8 +147,10 @@ def stated_prior(
     return PriorStd(jnp.asarray(level_std), jnp.asarray(np.concatenate(linear)), of_force)
 
 
-def balance_data(data: SteadyStates, modes: LinearModes) -> tuple[BalanceData, bool]:
-    """The states with a measured velocity, and whether their noise is stated.
+def balance_data(
+    data: SteadyStates, modes: LinearModes
+) -> tuple[BalanceData, bool, tuple[int, ...]]:
+    """The states with a measured velocity, whether their noise is stated, their levels' numbers.
 
     Where nobody stated any noise, force, amplitude and phase get the same relative error, larger
     off resonance (`off_resonance_error_factor`); the fit then finds its size. Without an error of
@@ -159,8 +161,13 @@ def balance_data(data: SteadyStates, modes: LinearModes) -> tuple[BalanceData, b
     """
     check_phases(data, "a joint fit")
     r = reference_sensor(modes)
-    velocity, share, errors = _filtered(data, modes)
-    force, keep = _measured(data, velocity)
+    relative = relative_errors(jax.tree.map(np.asarray, data))
+    filtered = _one_sensor(data, modes, r, data.velocity, relative)
+    velocity, share, errors, _ = map(np.asarray, filtered)
+    # The force in N, or the drive in V where only that is known.
+    driven = not np.any(np.isfinite(np.asarray(data.force)))
+    force = np.asarray(data.drive if driven else data.force)
+    keep = np.isfinite(np.abs(velocity)) & (np.abs(velocity) > 0) & np.isfinite(force) & (force > 0)
     known = bool(np.all(np.isfinite(errors[keep]))) and bool(np.all(errors[keep][:, 1:3] > 0))
     if not known:
         far = off_resonance_error_factor(velocity)
@@ -182,36 +189,11 @@ def balance_data(data: SteadyStates, modes: LinearModes) -> tuple[BalanceData, b
             sensor=r,
         ),
         known,
+        tuple(levels.tolist()),
     )
-
-
-def level_numbers(data: SteadyStates, modes: LinearModes) -> tuple[int, ...]:
-    """The numbers that the data's own record gives the levels of `balance_data`, in its order."""
-    velocity, *_ = _filtered(data, modes)
-    keep = _measured(data, velocity)[1]
-    return tuple(int(one) for one in np.unique(np.asarray(data.level)[keep]))
-
-
-def _filtered(data: SteadyStates, modes: LinearModes) -> tuple[np.ndarray, ...]:
-    """What the sensors together say of one of them: velocity, shares, relative errors."""
-    errors = relative_errors(jax.tree.map(np.asarray, data))
-    given = (reference_sensor(modes), data.velocity, errors)
-    velocity, share, std, _ = _one_sensor(data, modes, *given)
-    return np.asarray(velocity), np.asarray(share), np.asarray(std)
 
 
 _one_sensor = compiled(modal_filter)
-
-
-def _measured(
-    data: SteadyStates, velocity: Complex[np.ndarray, " state"]
-) -> tuple[Float[np.ndarray, " state"], Bool[np.ndarray, " state"]]:
-    """The force in N, or the drive in V where only that is known; the states that have all."""
-    driven = not np.any(np.isfinite(np.asarray(data.force)))
-    force = np.asarray(data.drive if driven else data.force)
-    return force, np.isfinite(np.abs(velocity)) & (np.abs(velocity) > 0) & np.isfinite(force) & (
-        force > 0
-    )
 
 
 def with_deviations(modes: LinearModes, deviation: Array, spread: Array) -> LinearModes:

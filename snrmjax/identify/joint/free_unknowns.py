@@ -55,12 +55,6 @@ class Unravel(eqx.Module):
         ]
         return eqx.combine(jax.tree.unflatten(structure, parts), fixed)
 
-    @property
-    def level_places(self) -> Int[np.ndarray, "level error"]:
-        """Where in the vector the deviations of levels are."""
-        level, end = self.unknowns.level, self.vector().size - self.unknowns.linear.size
-        return end - level.size + np.arange(level.size).reshape(level.shape)
-
 
 class PackedUnknowns(NamedTuple):
     """The free unknowns as compiled programs take them: with curves of one form and size.
