@@ -36,6 +36,7 @@ from snrmjax.model.parameters import (
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import mapped
 from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.least_squares import inverse_of
 from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
 
 
@@ -399,11 +400,8 @@ def _notes(
 
 
 def _inverse_of_square(jacobian: np.ndarray) -> np.ndarray:
-    """(JᵀJ)⁻¹ by singular values of the scaled columns; infinite for what has no influence."""
-    size = np.linalg.norm(jacobian, axis=0)
-    seen = np.flatnonzero(size > 0)
-    _, values, rows = np.linalg.svd(jacobian[:, seen] / size[seen], full_matrices=False)
-    root = (rows.T / values) / size[seen, None]
-    inverse = np.diag(np.where(size > 0, 0.0, np.inf))
-    inverse[np.ix_(seen, seen)] = root @ root.T
+    """(JᵀJ)⁻¹; infinite for what has no influence."""
+    seen = np.any(jacobian != 0, axis=0)
+    inverse = np.diag(np.where(seen, 0.0, np.inf))
+    inverse[np.ix_(seen, seen)] = inverse_of(jacobian[:, seen])
     return inverse

@@ -10,7 +10,7 @@ from snrmjax.identify.curves.family_base import AbstractFamily
 from snrmjax.identify.curves.splines import SmoothingSpline, Spline
 from snrmjax.identify.joint.force_balance import Unknowns
 from snrmjax.identify.joint.joint_fit import JointFit
-from snrmjax.identify.pointwise.backbone import Backbone, BackboneValues
+from snrmjax.identify.pointwise.backbone import Backbone, BackboneValues, banded_values
 from snrmjax.identify.pointwise.points_result import AmplitudeArgument
 
 _SCAN = 256  # displacements of the backbone, on which a velocity is looked for
@@ -48,19 +48,7 @@ def fitted_values(
         stiffness, dissipation = np.asarray(fit.prior.level)[2:]
         covariance[:, 0, 0] += (squared * stiffness) ** 2
         covariance[:, 1, 1] += (damping * dissipation) ** 2
-    omega, zeta = np.sqrt(squared), damping / (2 * np.sqrt(squared))
-    # ζ̃ = δ/(2√s): dζ̃ = dδ/(2ω̃) − ζ̃ ds/(2s).
-    slope = np.stack([-zeta / (2 * squared), 1 / (2 * omega)], axis=1)
-    zeta_std = np.sqrt(np.einsum("oc,ocd,od->o", slope, covariance, slope))
-    return BackboneValues(
-        velocity=jax.device_put(at),
-        natural_frequency=jax.device_put(omega),
-        natural_frequency_std=jax.device_put(np.sqrt(covariance[:, 0, 0]) / (2 * omega)),
-        damping_ratio=jax.device_put(zeta),
-        damping_ratio_std=jax.device_put(zeta_std),
-        modal_damping=jax.device_put(damping),
-        modal_damping_std=jax.device_put(np.sqrt(covariance[:, 1, 1])),
-    )
+    return banded_values(at, squared, damping, covariance)
 
 
 def values_to_the_largest(fit: JointFit, n_points: int) -> BackboneValues:

@@ -104,8 +104,9 @@ def resonance_distribution(
     passive structure stays positive: draws that fall below zero before they have a resonance are
     left out; one law in twenty ends with the data, and damping stays as it is there.
 
-    Arguments: `force` in N; `amplitude` up to `ratio` times the largest measured one; `other` is the velocity of the other modes in units of the mode's own direction;
-    with `gain_of_force` a level's gain is that of its recorded force, else of its velocity.
+    Arguments: `force` in N; `amplitude` up to `ratio` times the largest measured one; `other`
+    is the velocity of the other modes in units of the mode's own direction; with `gain_of_force` a
+    level's gain is that of its recorded force, else of its velocity.
     """
     rng, edge = np.random.default_rng(0), int(np.searchsorted(amplitude, amplitude[-1] / ratio))
     gain, phase, stiffness, loss = (new.std * rng.normal(size=(_DRAWS, len(new.std)))).T
