@@ -10,9 +10,7 @@ from jaxtyping import Array, Float
 
 from snrmjax.identify.curves.family_base import AbstractCurve
 from snrmjax.identify.curves.packed_curve import packed
-from snrmjax.identify.inference.fitted_curves import (
-    values_at_displacement,
-)
+from snrmjax.identify.inference.fitted_curves import values_at_displacement
 from snrmjax.identify.inference.table_result import AbstractTable
 from snrmjax.identify.joint.force_balance import (
     STATE_ERRORS,
@@ -21,9 +19,7 @@ from snrmjax.identify.joint.force_balance import (
     weighting_at,
 )
 from snrmjax.identify.joint.free_unknowns import Unravel, padded_problem
-from snrmjax.identify.joint.joint_fit import (
-    JointFit,
-)
+from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.joint.residuals import (
     all_residuals,
 )
@@ -139,7 +135,7 @@ def contributions(fit: JointFit, *, n_amplitudes: int = 25) -> Contributions:
     by_state = np.einsum("pq,siq,sie->pse", inverse, points, by_error) * np.asarray(fit.data.std)
     measured = np.asarray(fit.motion().displacement)
     at = np.linspace(measured.min(), measured.max(), n_amplitudes)
-    slopes = values_at_displacement(fit, at)[1]
+    slopes = values_at_displacement(fit, at).slopes
 
     rows: list[tuple[str, str, np.ndarray]] = []
     for k, kind in enumerate(STATE_ERRORS):

@@ -176,7 +176,7 @@ def predicted_resonance(
     new = new_level(fit, force) if of is None else of
     amplitude = amplitudes_to(fit.largest[0], largest_amplitude_ratio)
 
-    values, slopes, _ = values_at_displacement(fit, amplitude)
+    values, slopes, *_ = values_at_displacement(fit, amplitude)
     root = covariance_root(fit.covariance)
     load, names = force, fit.names()
     by_load = -float(fit.prior.linear[-1]) * root[-1]
