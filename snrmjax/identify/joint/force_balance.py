@@ -6,7 +6,7 @@ curve, however the response folds.
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -93,17 +93,13 @@ class BalanceProblem(eqx.Module):
         r, j = self.data.sensor, self.modes.mode_of_interest
         return self.modes.mode_shape[r, j] * self.modes.participation[j]
 
-    def log_modal_mass(self, unknowns: Unknowns) -> Float[Array, ""]:
-        """By how much the fit's modal mass exceeds the model's: the logarithm of their ratio."""
-        return log_modal_mass(unknowns, self.prior.linear)
-
     def modal_mass_of(self, unknowns: Unknowns) -> Float[Array, ""]:
         """The modal mass in kg, seen from force and sensor, that the fit found."""
         return 1 / jnp.abs(self.constant_of(unknowns))
 
     def constant_of(self, unknowns: Unknowns) -> Float[Array, ""]:
         """`modal_constant` with the modal mass that the fit found."""
-        return self.modal_constant * jnp.exp(-self.log_modal_mass(unknowns))
+        return self.modal_constant * jnp.exp(-log_modal_mass(unknowns, self.prior.linear))
 
 
 def log_modal_mass(unknowns: Unknowns, linear_std: Float[Array, " deviation"]) -> Float[Array, ""]:
@@ -316,18 +312,6 @@ def no_errors(n_states: int) -> Float[Array, "state input"]:
     return jnp.asarray(np.zeros((n_states, len(STATE_ERRORS))))
 
 
-def error_slopes(
-    balance: Callable[[Array], Array], at: Float[Array, "state input"]
-) -> Float[Array, "state part input"]:
-    """Derivatives of the balance with respect to `STATE_ERRORS`, `at` some.
-
-    Every state has its own: one push forward for each input gives them all.
-    """
-    n_states, kinds = at.shape
-    directions = jnp.broadcast_to(jnp.eye(kinds)[:, None, :], (kinds, n_states, kinds))
-    return jnp.moveaxis(mapped(jax.linearize(balance, at)[1], directions), 0, 2)
-
-
 class Weighting(NamedTuple):
     """What turns a balance into independent residuals of unit variance, state by state."""
 
@@ -386,8 +370,15 @@ def nearest_errors(
 def slopes_by_error(
     unknowns: Unknowns, problem: BalanceProblem
 ) -> Float[Array, "state part input"]:
-    """Derivatives of the balance by the states' errors, at the corrected states."""
-    return error_slopes(lambda e: force_balance(unknowns, problem, e), problem.data.correction)
+    """Derivatives of the balance by the states' errors (`STATE_ERRORS`), at the corrected states.
+
+    Every state has its own: one push forward for each kind of error gives them all.
+    """
+    at = problem.data.correction
+    n_states, kinds = at.shape
+    directions = jnp.broadcast_to(jnp.eye(kinds)[:, None, :], (kinds, n_states, kinds))
+    along = jax.linearize(lambda error: force_balance(unknowns, problem, error), at)[1]
+    return jnp.moveaxis(mapped(along, directions), 0, 2)
 
 
 def whitener(

@@ -121,7 +121,7 @@ class JointFit(AbstractResult):
 
         Its 1σ, where one was stated, is then the fit's.
         """
-        share = jnp.exp(-self.problem.log_modal_mass(self.unknowns))
+        share = self.problem.constant_of(self.unknowns) / self.problem.modal_constant
         j, modes = self.modes.mode_of_interest, self.modes
         found = eqx.tree_at(
             lambda m: m.participation, modes, modes.participation.at[j].multiply(share)

@@ -141,9 +141,10 @@ def invert_amplitude_phase(
     (Array([500.], dtype=float64), Array([0.01], dtype=float64))
     """
     size, phase = jnp.asarray(amplitude), jnp.asarray(mode_phase)
-    given = (*map(jnp.asarray, (modal_constant, frequency)), size, jnp.cos(phase), jnp.sin(phase))
+    constant, omega, residual = map(jnp.asarray, (modal_constant, frequency, residual_velocity))
     unknown = jnp.full(size.shape, jnp.nan)
-    return _invert(_Member(*given, jnp.asarray(residual_velocity), unknown))
+    direction = jnp.cos(phase), jnp.sin(phase)
+    return _invert(_Member(constant, omega, size, *direction, residual, unknown))
 
 
 class _Member(NamedTuple):

@@ -211,9 +211,9 @@ def _change(
 
 
 def _resonance(backbone: Backbone, modes: LinearModes, force: float, amplitude: float) -> Resonance:
-    frequency, damping, velocity = _on_resonance(
-        backbone, modes, jnp.asarray(force), jnp.asarray(amplitude)
-    )
+    at, load = jnp.asarray(amplitude), jnp.asarray(force)
+    frequency, damping = backbone.natural_frequency(at), backbone.damping_ratio(at)
+    velocity = _velocity(backbone, modes, load, frequency, frequency, damping)
     return Resonance(
         force=force,
         amplitude=amplitude,
@@ -222,15 +222,6 @@ def _resonance(backbone: Backbone, modes: LinearModes, force: float, amplitude: 
         velocity=float(jnp.abs(velocity)),
         continued=amplitude > float(backbone.largest) * (1 + 1e-9),
     )
-
-
-@eqx.filter_jit
-def _on_resonance(
-    backbone: Backbone, modes: LinearModes, force: Array, amplitude: Array
-) -> tuple[Array, Array, Array]:
-    frequency = backbone.natural_frequency(amplitude)
-    damping = backbone.damping_ratio(amplitude)
-    return frequency, damping, _velocity(backbone, modes, force, frequency, frequency, damping)
 
 
 @eqx.filter_jit
