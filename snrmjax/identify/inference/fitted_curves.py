@@ -70,36 +70,8 @@ def as_backbone(
     velocity is then taken where it lies on the backbone. Against velocity the knots are where the
     backbone has them.
     """
-    largest = fit.largest[argument == "velocity"]
-    squared, damping = fit.unknowns.squared_frequency, fit.unknowns.modal_damping
-    smooth = all(
-        isinstance(one, SmoothingSpline) and one.argument == "displacement"
-        for one in (squared, damping)
-    )
-    own = smooth and argument == "displacement"
-    if own:
-        n = squared.parameters.shape[0] + damping.parameters.shape[0]
-        covariance = fit.covariance[:n, :n]
-    else:
-        displacement = reach * fit.largest[0] * np.linspace(0.0, 1.0, _KNOTS)
-        if smooth and isinstance(squared, Spline):
-            displacement = float(squared.scale) * np.sqrt(np.asarray(squared.knots))
-        with np.errstate(invalid="ignore"):
-            positive = values_at_displacement(fit, displacement).values[:, 0] > 0
-        # A polynomial may fall below zero beyond the data: there is no motion there.
-        displacement = displacement[: np.append(positive, False).argmin()]
-        found = values_at_displacement(fit, displacement)
-        if argument == "velocity":
-            found = values_at_velocity(fit, found.velocity)
-        at, values = getattr(found, argument), found.values
-        # Dry friction has no finite damping at rest: there the next knot's value stands.
-        values[0] = np.where(np.isfinite(values[0]), values[0], values[1])
-        squared, damping = (
-            Spline.through((at / at[-1]) ** 2, values[:, k], jax.device_put(at[-1]), argument)
-            for k in range(2)
-        )
-        rows = np.concatenate([found.slopes[:, 0], found.slopes[:, 1]])
-        covariance = rows @ fit.covariance @ rows.T
+    own = argument == "displacement" and _are_smooth(fit)
+    squared, damping, covariance = _own_curves(fit) if own else _redrawn(fit, argument, reach)
     motion = fit.motion()
     measured = np.abs(motion.velocity) if argument == "velocity" else motion.displacement
     return Backbone(
@@ -108,10 +80,48 @@ def as_backbone(
         covariance=jax.device_put(covariance),
         modal_constant=fit.problem.constant_of(fit.unknowns),
         smallest=jax.device_put(np.min(measured)),
-        largest=jax.device_put(largest),
+        largest=jax.device_put(fit.largest[argument == "velocity"]),
         argument=argument,
         sensor=fit.modes.sensors[fit.data.sensor],
     )
+
+
+def _are_smooth(fit: JointFit) -> bool:
+    """Whether both curves are smooth ones of the displacement, through the same knots."""
+    pair = fit.unknowns.squared_frequency, fit.unknowns.modal_damping
+    return all(isinstance(one, SmoothingSpline) and one.argument == "displacement" for one in pair)
+
+
+def _own_curves(fit: JointFit) -> tuple[AbstractFamily, AbstractFamily, np.ndarray]:
+    squared, damping = fit.unknowns.squared_frequency, fit.unknowns.modal_damping
+    n = squared.parameters.shape[0] + damping.parameters.shape[0]
+    return squared, damping, fit.covariance[:n, :n]
+
+
+def _redrawn(
+    fit: JointFit, argument: AmplitudeArgument, reach: float
+) -> tuple[AbstractFamily, AbstractFamily, np.ndarray]:
+    """Splines through values of both curves, and the covariance of these values."""
+    squared = fit.unknowns.squared_frequency
+    displacement = reach * fit.largest[0] * np.linspace(0.0, 1.0, _KNOTS)
+    if isinstance(squared, Spline) and _are_smooth(fit):
+        displacement = float(squared.scale) * np.sqrt(np.asarray(squared.knots))
+    with np.errstate(invalid="ignore"):
+        positive = values_at_displacement(fit, displacement).values[:, 0] > 0
+    # A polynomial may fall below zero beyond the data: there is no motion there.
+    displacement = displacement[: np.append(positive, False).argmin()]
+    found = values_at_displacement(fit, displacement)
+    if argument == "velocity":
+        found = values_at_velocity(fit, found.velocity)
+    at, values = getattr(found, argument), found.values
+    # Dry friction has no finite damping at rest: there the next knot's value stands.
+    values[0] = np.where(np.isfinite(values[0]), values[0], values[1])
+    pair = (
+        Spline.through((at / at[-1]) ** 2, values[:, k], jax.device_put(at[-1]), argument)
+        for k in range(2)
+    )
+    rows = np.concatenate([found.slopes[:, 0], found.slopes[:, 1]])
+    return *pair, rows @ fit.covariance @ rows.T
 
 
 class OnBackbone(NamedTuple):

@@ -241,9 +241,8 @@ def scale_modes(
     Signs: a participation is positive, over a base's acceleration negative (the force is −Γa).
 
     Arguments: `by` None gives relative shapes, one at the largest sensor, which is all that free
-    decays tell; `calibration` newtons
-    per volt where the reference is a voltage; `free` adds the rigid-body mode that the low
-    residuals show, or that of a stated mass.
+    decays tell; `calibration` newtons per volt where the reference is a voltage; `free` adds the
+    rigid-body mode that the low residuals show, or that of a stated mass.
     Returns `ScaledModes`; modes that hardly move the drive point are left out, with a note.
     Raises `ValueError` in a sentence where a scale cannot be had: no sensor at the force, a
     voltage without newtons per volt, a free decay, a negative residue at the drive point (a sensor
