@@ -214,9 +214,10 @@ for row in shares.by_kind():
 show(shares.plot(), "contributions")
 
 # %% [markdown]
-# Are these widths right? Refits to states drawn with replacement (bootstrap) make fewest
-# assumptions, but need many states: with four a level they are rough, by a factor of two. Below
-# stands the 1σ of the curves at some of their knots by both ways.
+# Are these widths right? Refits to states drawn with replacement within their levels (bootstrap)
+# know the noise of the states and how far the states determine their level, but not by how much
+# levels differ: their spread is smaller by that part. Below stands the 1σ of the curves at some of
+# their knots by both ways.
 
 # %%
 drawn = np.nanstd(sj.identify.bootstrap(few, 100), axis=0)

@@ -12,7 +12,7 @@ from .inference.corrected_states import corrected_states
 from .inference.fitted_curves import fitted_values
 from .inference.fitted_response import FittedResponse, fitted_response, predicted_resonance
 from .inference.identification import Anchor, Identification, identify_backbone
-from .inference.located_points import FittedPoint, LocatedStatus
+from .inference.located_points import FittedPoint
 from .inference.optimal_design import (
     AdviceStatus,
     NextMeasurement,
@@ -85,7 +85,6 @@ __all__ = [
     "KnownShape",
     "LevelTrend",
     "LinearModalFit",
-    "LocatedStatus",
     "MeasuredBackbone",
     "NewLevel",
     "NextMeasurement",

@@ -7,7 +7,6 @@ from snrmjax.identify.inference.fitted_curves import as_backbone, values_at_disp
 from snrmjax.identify.inference.forced_motion import banded_curve
 from snrmjax.identify.inference.located_points import (
     FittedPoint,
-    LocatedStatus,
     Place,
     located,
     turns,
@@ -122,8 +121,8 @@ def fitted_response(
         amplitude, frequency, velocity, frequency_std, velocity_std = band
         places = [*(tips if number == 0 else ()), *turns(curve.frequency, curve.amplitude)]
         points = [located(fit, force, place, level) for place in places]
-        good = [one for one in points if one.status == LocatedStatus.LOCATED]
-        missing = tuple(one for one in points if one.status != LocatedStatus.LOCATED)
+        good = [one for one in points if one.located]
+        missing = tuple(one for one in points if not one.located)
         answer.append(
             FittedResponse(
                 force=force,

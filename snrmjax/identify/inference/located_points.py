@@ -1,6 +1,5 @@
 """Resonances and folds of fitted responses, located by Newton's method, with bands."""
 
-from enum import IntEnum
 from typing import Literal, NamedTuple
 
 import jax
@@ -21,13 +20,6 @@ _ITERATIONS = 12
 Kind = Literal["resonance", "fold"]
 
 
-class LocatedStatus(IntEnum):
-    """How the search for a resonance or a fold ended."""
-
-    LOCATED = 0
-    NOT_LOCATED = 1  # Newton's method did not converge near where the drawn curve has it
-
-
 class FittedPoint(Resonance):
     """A resonance or a fold of a fitted response, with 1σ; a fold has no damping ratio (NaN).
 
@@ -37,12 +29,12 @@ class FittedPoint(Resonance):
     frequency_std: float
     velocity_std: float
     kind: Kind
-    status: LocatedStatus
+    located: bool  # False: no root of Newton's method near where the drawn curve has it
 
     def summary(self) -> tuple[str, ...]:
         """See `AbstractResult`."""
         size, std = self.frequency / _HERTZ, self.frequency_std / _HERTZ
-        status = "located" if self.status == LocatedStatus.LOCATED else "not located"
+        status = "located" if self.located else "not located"
         if self.continued:
             status += ", beyond the measured amplitudes"
         return (
@@ -62,7 +54,7 @@ class FittedPoint(Resonance):
 
     def attributes(self) -> dict[str, str | float | int]:
         """See `AbstractResult`."""
-        return {"kind": self.kind, "status": self.status.name.lower()}
+        return {"kind": self.kind, "status": "located" if self.located else "not_located"}
 
 
 class Place(NamedTuple):
@@ -110,7 +102,7 @@ def located(
         frequency_std=float(std[0]),
         velocity_std=float(std[1]),
         kind=place.kind,
-        status=LocatedStatus.NOT_LOCATED if found is None else LocatedStatus.LOCATED,
+        located=found is not None,
     )
 
 
