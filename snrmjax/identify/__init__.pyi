@@ -8,7 +8,6 @@ from .calibrate.calibration import calibrate_model
 from .calibrate.inverse_force import InverseForce, inverse_force
 from .curves.families import FAMILIES
 from .inference.contributions import Contribution, Contributions, contributions
-from .inference.corrected_states import corrected_states
 from .inference.fitted_curves import fitted_values
 from .inference.fitted_response import FittedResponse, fitted_response, predicted_resonance
 from .inference.identification import Anchor, Identification, identify_backbone
@@ -21,7 +20,7 @@ from .inference.optimal_design import (
 )
 from .inference.refits import IntervalEnd, Profile, bootstrap, profile
 from .joint.family_fit import FitStatus
-from .joint.joint_fit import JointFit, fit_jointly
+from .joint.joint_fit import JointFit, corrected_states, fit_jointly
 from .joint.notes import NoiseEstimate
 from .modal.base_motion import BaseResponses, relative_to_base
 from .modal.free_decay import DecayModes, fit_free_decay

@@ -324,6 +324,24 @@ def fit_jointly(
     return dataclasses.replace(fit, notes=notes)
 
 
+def corrected_states(data: SteadyStates, fit: JointFit) -> SteadyStates:
+    """The states with the force and the phase that a joint fit found for their instruments.
+
+    Where only a drive voltage is known, the force in N is that voltage times the fitted gain.
+    """
+    unknowns = fit.unknowns
+    nominal = data.drive if fit.drive_known_only else data.force
+    offset = unknowns.force_offset * jnp.min(fit.data.force)
+    return eqx.tree_at(
+        lambda d: (d.force, d.velocity),
+        data,
+        (
+            nominal * jnp.exp(unknowns.log_force_gain) + offset,
+            data.velocity * jnp.exp(-1j * unknowns.instrument_phase),
+        ),
+    )
+
+
 def _notes(fit: JointFit, wandering: float, stated: Float[np.ndarray, " error"]) -> tuple[str, ...]:
     """All that a reader of a joint fit should know.
 
