@@ -26,7 +26,6 @@ import optimistix as optx
 from scipy.optimize import least_squares
 
 import snrmjax as sj
-from snrmjax.identify.inference.fitted_curves import values_with_slopes
 from snrmjax.identify.joint.family_fit import MOST_STEPS, SOLVER
 from snrmjax.identify.joint.residuals import corrected_residuals
 from snrmjax.numerics.compiled import compiled
@@ -186,25 +185,18 @@ def speed(data: sj.measure.SteadyStates, model: sj.model.Structure) -> None:
     start = np.zeros(len(vector))
     start[:11] = 5.0  # standard deviations away in every parameter of both curves
     residuals(start)
-    at = np.linspace(0.01, fit.largest[1], 25)
-
-    def derivatives() -> np.ndarray:
-        slopes = values_with_slopes(fit, at)[1]
-        return np.einsum("acp,pse->acse", slopes, sj.identify.sensitivity(fit).by_measurement)
 
     def solve() -> np.ndarray:
         near = jnp.asarray(vector + start * unit)
         return np.asarray(_solve(near, *given, jnp.asarray(100.0 * unit)))
 
-    derivatives()
     found, best = (solve() - vector) / unit, least_squares(residuals, start, x_scale=1.0)
-    times: dict[str, list[float]] = {"fit": [], "solver": [], "scipy": [], "derivatives": []}
+    times: dict[str, list[float]] = {"fit": [], "solver": [], "scipy": []}
     for _ in range(5):
         for name, work in (
             ("fit", fit_once),
             ("solver", solve),
             ("scipy", lambda: least_squares(residuals, start, x_scale=1.0)),
-            ("derivatives", derivatives),
         ):
             begin = time.perf_counter()
             work()

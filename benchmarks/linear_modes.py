@@ -212,7 +212,7 @@ def run_decay(seeds):
     """Free decays."""
     structure = usual([0.01, 0.008, 0.006])
     make = lambda rng: decayed(rng, structure, 3.0, 1024.0, 0.02)  # noqa: E731
-    fit = lambda data: identify.decay_modes(identify.fit_free_decay(data))  # noqa: E731
+    fit = lambda data: identify.scale_modes(identify.fit_free_decay(data), None)  # noqa: E731
     coverage("decay", structure, make, fit, seeds)
 
 
@@ -227,11 +227,9 @@ def run_measured(_):
         stated = sj.read_model(data / beam / "model.toml").modes
         states = sj.read_steady_states(data / beam / f"{table}.csv")
         volts = beam == "suspended_beam"
-        request = identify.ModesRequest(
-            unscaled=volts, drive_point=None if volts else states.sensors[0]
-        )
-        found, notes = identify.find_modes(states, request)
-        modes = identify.scale_of(found, request)
+        scale = None if volts else identify.DrivePoint(states.sensors[0])
+        found, notes = identify.find_modes(states)
+        modes = identify.scale_modes(found, scale)
         print(
             json.dumps(
                 {

@@ -7,42 +7,28 @@ from .calibrate.calibrated_model import CalibratedModel
 from .calibrate.calibration import calibrate_model
 from .calibrate.inverse_force import InverseForce, inverse_force
 from .curves.families import FAMILIES
-from .inference.corrected_states import corrected_states
+from .inference.contributions import Contribution, Contributions, contributions
 from .inference.fitted_curves import fitted_values
 from .inference.fitted_response import FittedResponse, fitted_response, predicted_resonance
 from .inference.identification import Anchor, Identification, identify_backbone
-from .inference.located_points import FittedPoint, LocatedStatus
+from .inference.located_points import FittedPoint
 from .inference.optimal_design import (
     AdviceStatus,
     NextMeasurement,
     NextMeasurements,
     next_measurements,
 )
-from .inference.profiles import IntervalEnd, Profile, profile
-from .inference.resampling import (
-    ComparedBand,
-    ComparedBands,
-    bootstrap,
-    compare_bands,
-    inference_data,
-    sample_posterior,
-)
-from .inference.sensitivity import (
-    Contribution,
-    Contributions,
-    Sensitivity,
-    contributions,
-    sensitivity,
-)
+from .inference.refits import IntervalEnd, Profile, bootstrap, profile
 from .joint.family_fit import FitStatus
-from .joint.joint_fit import JointFit, NoiseEstimate, fit_jointly
+from .joint.joint_fit import JointFit, corrected_states, fit_jointly
+from .joint.notes import NoiseEstimate
 from .modal.base_motion import BaseResponses, relative_to_base
 from .modal.free_decay import DecayModes, fit_free_decay
 from .modal.linear_fit import fit_linear_modes
 from .modal.modal_fit import LinearModalFit
+from .modal.modes_of_tests import find_modes
 from .modal.response_data import joined_responses
 from .modal.state_responses import (
-    AmplitudeDependence,
     StateResponses,
     amplitude_dependence,
     levels_by_velocity,
@@ -53,12 +39,11 @@ from .pointwise.backbone_points import identify_points
 from .pointwise.inversion import closed_form, invert_amplitude_phase, invert_phasor
 from .pointwise.inversion_result import PointStatus, SnrmPoints
 from .pointwise.points_result import BackbonePoints
-from .pointwise.prediction import predict_response, resonance_by_fixed_point, resonances
+from .pointwise.prediction import predict_response, resonances
 from .pointwise.prediction_result import PredictedResponse, Resonance
 from .pointwise.snrm import nonlinear_mode_velocity, reference_sensor, snrm_velocity
 from .prediction.new_level import ON_THE_CURVES, DayToDay, LevelTrend, NewLevel, new_level
 from .prediction.resonance_distribution import ResonanceDistribution
-from .scaling.request import ModesRequest, find_modes, scale_of
 from .scaling.scale import (
     AddedMassTest,
     Calibration,
@@ -66,7 +51,6 @@ from .scaling.scale import (
     Free,
     KnownShape,
     SensorMasses,
-    decay_modes,
     scale_modes,
 )
 from .scaling.scaled_modes import ScaledModes
@@ -76,7 +60,6 @@ __all__ = [
     "ON_THE_CURVES",
     "AddedMassTest",
     "AdviceStatus",
-    "AmplitudeDependence",
     "Anchor",
     "Backbone",
     "BackboneCalibration",
@@ -85,8 +68,6 @@ __all__ = [
     "BaseResponses",
     "CalibratedModel",
     "Calibration",
-    "ComparedBand",
-    "ComparedBands",
     "Contribution",
     "Contributions",
     "DayToDay",
@@ -103,9 +84,7 @@ __all__ = [
     "KnownShape",
     "LevelTrend",
     "LinearModalFit",
-    "LocatedStatus",
     "MeasuredBackbone",
-    "ModesRequest",
     "NewLevel",
     "NextMeasurement",
     "NextMeasurements",
@@ -116,7 +95,6 @@ __all__ = [
     "Resonance",
     "ResonanceDistribution",
     "ScaledModes",
-    "Sensitivity",
     "SensorMasses",
     "SnrmPoints",
     "StateResponses",
@@ -125,10 +103,8 @@ __all__ = [
     "calibrate_model",
     "calibrate_to_backbone",
     "closed_form",
-    "compare_bands",
     "contributions",
     "corrected_states",
-    "decay_modes",
     "find_modes",
     "fit_free_decay",
     "fit_jointly",
@@ -137,7 +113,6 @@ __all__ = [
     "fitted_values",
     "identify_backbone",
     "identify_points",
-    "inference_data",
     "inverse_force",
     "invert_amplitude_phase",
     "invert_phasor",
@@ -151,12 +126,8 @@ __all__ = [
     "profile",
     "reference_sensor",
     "relative_to_base",
-    "resonance_by_fixed_point",
     "resonances",
     "responses_of_states",
-    "sample_posterior",
     "scale_modes",
-    "scale_of",
-    "sensitivity",
     "snrm_velocity",
 ]

@@ -10,11 +10,11 @@ import numpy as np
 
 from snrmjax.identify.curves.families import FAMILIES
 from snrmjax.identify.curves.family_base import AbstractFamily
+from snrmjax.identify.inference.contributions import Contribution
 from snrmjax.identify.inference.fitted_curves import values_to_the_largest
 from snrmjax.identify.inference.fitted_response import FittedResponse
 from snrmjax.identify.inference.located_points import FittedPoint
 from snrmjax.identify.inference.optimal_design import NextMeasurement, NextMeasurements
-from snrmjax.identify.inference.sensitivity import Contribution
 from snrmjax.identify.joint.family_fit import FitStatus
 from snrmjax.identify.joint.force_balance import (
     BalanceData,
@@ -22,7 +22,8 @@ from snrmjax.identify.joint.force_balance import (
     PriorStd,
     Unknowns,
 )
-from snrmjax.identify.joint.joint_fit import JointFit, NoiseEstimate
+from snrmjax.identify.joint.joint_fit import JointFit
+from snrmjax.identify.joint.notes import NoiseEstimate
 from snrmjax.identify.test_model.states import LEVEL_ERRORS
 from snrmjax.io.files import FilePath, read_text, write_atomically
 from snrmjax.io.results import write_values

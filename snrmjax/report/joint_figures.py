@@ -8,10 +8,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
+from snrmjax.identify.inference.contributions import Contribution, Contributions
 from snrmjax.identify.inference.fitted_response import FittedResponse
 from snrmjax.identify.inference.optimal_design import NextMeasurement
-from snrmjax.identify.inference.profiles import Profile
-from snrmjax.identify.inference.sensitivity import Contribution, Contributions
+from snrmjax.identify.inference.refits import Profile
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.pointwise.backbone_points import BackbonePoints
 from snrmjax.io.units import DEGREE, HERTZ

@@ -6,9 +6,9 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
+from snrmjax.identify.inference.contributions import Contribution, contributions
 from snrmjax.identify.inference.fitted_response import FittedResponse, fitted_response
 from snrmjax.identify.inference.optimal_design import NextMeasurement
-from snrmjax.identify.inference.sensitivity import Contribution, contributions
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.joint.notes import in_words
 from snrmjax.identify.pointwise.backbone_points import BackbonePoints

@@ -12,11 +12,11 @@ from snrmjax.condense.scale_study import LoadScaleStudy
 from snrmjax.diagnose.diagnosis_result import Diagnosis
 from snrmjax.identify.calibrate.calibrated_model import CalibratedModel
 from snrmjax.identify.calibrate.inverse_force import InverseForce
+from snrmjax.identify.inference.contributions import Contributions
 from snrmjax.identify.inference.fitted_response import FittedResponse
 from snrmjax.identify.inference.identification import Identification
 from snrmjax.identify.inference.optimal_design import NextMeasurements
-from snrmjax.identify.inference.profiles import Profile
-from snrmjax.identify.inference.sensitivity import Contributions
+from snrmjax.identify.inference.refits import Profile
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.modal.free_decay import DecayModes
 from snrmjax.identify.modal.modal_fit import LinearModalFit

@@ -10,7 +10,6 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from snrmjax.doctor.doubts import doubt, linear_damping_note, with_doubt
-from snrmjax.identify.inference.corrected_states import corrected_states
 from snrmjax.identify.inference.fitted_curves import fitted_values
 from snrmjax.identify.inference.identification import (
     Identification,
@@ -22,7 +21,7 @@ from snrmjax.identify.inference.optimal_design import (
     NextMeasurements,
     next_measurements,
 )
-from snrmjax.identify.joint.joint_fit import fit_jointly
+from snrmjax.identify.joint.joint_fit import corrected_states, fit_jointly
 from snrmjax.identify.pointwise.backbone import BackboneValues
 from snrmjax.identify.pointwise.backbone_points import AmplitudeArgument, AmplitudeMeasure
 from snrmjax.identify.pointwise.prediction_result import PredictedResponse, Resonance

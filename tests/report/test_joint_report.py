@@ -10,7 +10,7 @@ from truths.joint_fits import exact_fit, noisy_fit
 from truths.printed_page import unreadable
 
 import snrmjax as sj
-from snrmjax.identify.inference.sensitivity import Contribution
+from snrmjax.identify.inference.contributions import Contribution
 from snrmjax.io.joint_results import read_joint_fit, write_joint_fit
 from snrmjax.io.units import DEGREE, HERTZ
 from snrmjax.report import joint_figures as joint_plot

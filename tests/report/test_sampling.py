@@ -18,7 +18,7 @@ FREQUENCY = np.array([10.0, 20.0, 30.0, 40.0, 50.0])
 def predicted():
     at = np.zeros(5, dtype=bool)
     return sj.identify.PredictedResponse(
-        2.0, FREQUENCY, 1j * SHAPE, SHAPE, ~at, ("lead",) * 5, at, False
+        2.0, FREQUENCY, 1j * SHAPE, SHAPE, ~at, ("lead",) * 5, at, False, ""
     )
 
 

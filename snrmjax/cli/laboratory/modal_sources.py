@@ -1,9 +1,18 @@
 """What linear modes are found from: responses, steady states or records, by the files' content."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from snrmjax.identify.modal.free_decay import DecayModes
+from snrmjax.identify.modal.modal_fit import LinearModalFit
 from snrmjax.identify.modal.response_data import joined_responses
+from snrmjax.identify.scaling.scale import (
+    AddedMassTest,
+    DrivePoint,
+    KnownShape,
+    Scale,
+    SensorMasses,
+)
 from snrmjax.io.files import file_name, read_text
 from snrmjax.io.laboratory.reading import read_laboratory_file
 from snrmjax.io.tables import read_steady_states
@@ -83,3 +92,39 @@ def sensor_values(option: str, words: Sequence[str]) -> dict[str, float]:
             raise ValueError(f"{option} names the sensor {name} twice.")
         found[name] = number
     return found
+
+
+def asked_scale(
+    drive: DrivePoint,
+    *,
+    unscaled: bool = False,
+    added_mass: float | None = None,
+    mass_at: str | None = None,
+    with_mass: LinearModalFit | DecayModes | None = None,
+    sensor_mass: Mapping[str, float] = {},
+    fixture_mass: float | None = None,
+    known_shape: Mapping[str, float] = {},
+) -> Scale | None:
+    """The one way to scale shapes that was asked for; without one, the drive point.
+
+    Raises `ValueError` where two ways were asked for, or an added mass lacks a part.
+    """
+    ways: dict[str, Scale | None] = {}
+    if unscaled:
+        ways["unscaled shapes"] = None
+    if drive.sensor is not None:
+        ways["a drive point"] = drive
+    if added_mass is not None or with_mass is not None:
+        if added_mass is None or mass_at is None or not isinstance(with_mass, LinearModalFit):
+            raise ValueError(
+                "an added mass needs its kilograms, the sensor where it is, and frequency "
+                "responses of a second test with it."
+            )
+        ways["an added mass"] = AddedMassTest(with_mass, mass_at, added_mass)
+    if sensor_mass or fixture_mass is not None:
+        ways["sensor masses"] = SensorMasses(sensor_mass, fixture_mass)
+    for name, value in known_shape.items():
+        ways["a known shape"] = KnownShape(name, value)
+    if len(ways) > 1:
+        raise ValueError(f"one scale of the shapes is wanted, but there are {' and '.join(ways)}.")
+    return next(iter(ways.values()), drive)

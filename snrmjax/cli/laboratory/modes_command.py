@@ -1,12 +1,12 @@
 """The command `modes`: linear modes from frequency responses, low levels and decays."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from snrmjax.cli.console import say, staged, warn
-from snrmjax.cli.laboratory.modal_sources import read_modal_sources, sensor_values
+from snrmjax.cli.laboratory.modal_sources import asked_scale, read_modal_sources, sensor_values
 from snrmjax.cli.options import FILES
 from snrmjax.io.units import HERTZ
 
@@ -179,43 +179,50 @@ def modes(
 
     Writes the model (TOML), modes.csv and report.html.
     """
-    from snrmjax.identify.scaling.request import ModesRequest, find_modes, scale_of
+    from snrmjax.identify.modal.modes_of_tests import find_modes
+    from snrmjax.identify.scaling.scale import (
+        Calibration,
+        DrivePoint,
+        Free,
+        scale_modes,
+    )
     from snrmjax.report.modal.modal_report import modes_sentence, write_linear_modes
 
     if out.suffix.lower() != ".toml":
         raise ValueError(f"--out must be a model to write (.toml), but is {out.name!r}.")
     if out.is_dir():
         raise ValueError(f"--out {out} is a folder, but a file to write is expected.")
-    request = ModesRequest(
-        reference=reference,
-        level=level,
-        from_frequency=None if from_hz is None else from_hz * HERTZ,
-        to_frequency=None if to_hz is None else to_hz * HERTZ,
-        poles=_poles(poles),
-        order=order,
-        highest_order=highest_order,
-        residual_terms=residuals,
-        window=window,
-        instrument_phase=instrument_phase,
-        base=base,
-        unscaled=unscaled,
-        drive_point=drive_point,
-        turned=turned,
-        added_mass=added_mass,
-        mass_at=mass_at,
-        sensor_mass=sensor_values("--sensor-mass", sensor_mass or ()),
-        fixture_mass=fixture_mass,
-        known_shape=sensor_values("--known-shape", () if known_shape is None else (known_shape,)),
-        newtons_per_volt=newtons_per_volt,
-        newtons_per_volt_std=newtons_per_volt_std,
-        calibration_std=calibration_std,
-        free=free or mass is not None,
-        mass=mass,
-    )
+    settings: dict[str, Any] = {
+        "level": level,
+        "base": base,
+        "reference": reference,
+        "from_frequency": None if from_hz is None else from_hz * HERTZ,
+        "to_frequency": None if to_hz is None else to_hz * HERTZ,
+        "poles": _poles(poles),
+        "order": order,
+        "highest_order": highest_order,
+        "residual_terms": residuals,
+        "window": window,
+        "instrument_phase": instrument_phase,
+    }
+    calibration = Calibration(newtons_per_volt, newtons_per_volt_std, calibration_std)
     with staged(out.parent) as folder:
-        found, notes = find_modes(read_modal_sources(data), request)
-        second = find_modes(read_modal_sources(with_mass), request)[0] if with_mass else None
-        scaled = scale_of(found, request, second)
+        found, notes = find_modes(read_modal_sources(data), **settings)
+        second = find_modes(read_modal_sources(with_mass), **settings)[0] if with_mass else None
+        scale = asked_scale(
+            DrivePoint(drive_point, turned),
+            unscaled=unscaled,
+            added_mass=added_mass,
+            mass_at=mass_at,
+            with_mass=second,
+            sensor_mass=sensor_values("--sensor-mass", sensor_mass or ()),
+            fixture_mass=fixture_mass,
+            known_shape=sensor_values(
+                "--known-shape", () if known_shape is None else (known_shape,)
+            ),
+        )
+        body = Free(mass) if free or mass is not None else None
+        scaled = scale_modes(found, scale, calibration=calibration, free=body)
         write_linear_modes(
             folder, out.name, scaled, found, interest=interest - 1, further_notes=notes
         )

@@ -1,21 +1,21 @@
 """Numbers of a structure fitted to points of its backbone: dimensions, moduli, supports."""
 
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
+from snrmjax.identify.calibrate.calibrated_model import AbstractCalibration
 from snrmjax.identify.pointwise.inversion_result import PointStatus
 from snrmjax.identify.pointwise.points_result import BackbonePoints
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.least_squares import inverse_of
 from snrmjax.numerics.levenberg_marquardt import MinimisationStatus, StepRule, minimise
-from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.result import Variable
 from snrmjax.simulate.balance.labelled import HERTZ
 from snrmjax.simulate.solutions.mode_at_velocities import normal_mode_at_velocities
 
@@ -36,71 +36,33 @@ class MeasuredBackbone(NamedTuple):
     velocity_std: Float[np.ndarray, " point"] | None = None  # m/s; None: known exactly
 
 
-class BackboneCalibration(AbstractResult):
-    """Numbers of a structure with which it has a measured backbone, and how well they are known.
+class BackboneCalibration(AbstractCalibration):
+    """Numbers of a structure with which it has a measured backbone; see `calibrate_to_backbone`.
 
-    `residuals` are (measured − fitted frequency) over 1σ. `covariance` and `std` are widened by the
-    residuals' size where no error of frequency is stated, or where the residuals contradict it.
-    `fitted_std` is 1σ of the fitted backbone that follows from `covariance`.
+    `residuals` are (measured − fitted frequency) over 1σ. `fitted_std` is 1σ of the fitted backbone
+    that follows from `covariance`.
     """
 
-    coordinates: ClassVar[tuple[str, ...]] = ("parameter",)
-
-    model: Structure  # with the fitted values
-    values: Float[np.ndarray, " parameter"]  # SI units
-    covariance: Float[np.ndarray, "parameter parameter"]
     measured: MeasuredBackbone
     fitted: Float[np.ndarray, " point"]  # rad/s, at the measured velocities
     fitted_std: Float[np.ndarray, " point"]  # rad/s
     residuals: Float[np.ndarray, " point"]
-    reduced_chi_square: float
-    names: tuple[str, ...] = eqx.field(static=True)
-    status: MinimisationStatus = eqx.field(static=True)
-    notes: tuple[str, ...] = eqx.field(static=True)
 
-    @property
-    def std(self) -> Float[np.ndarray, " parameter"]:
-        """1σ of the values."""
-        return np.sqrt(np.diag(self.covariance))
-
-    @property
-    def converged(self) -> bool:
-        """Whether the fit ended at a minimum."""
-        return self.status.found_minimum
-
-    def summary(self) -> tuple[str, ...]:
-        """Every number with its 1σ, how well the points are met, and what is wrong."""
-        each = zip(self.names, self.values, self.std, strict=True)
-        stated = "stated" if self.measured.frequency_std is not None else "assumed"
-        return (
-            f"BackboneCalibration: {len(self.names)} parameters from {len(self.fitted)} points of "
-            f"a backbone ({self.status})",
-            *(f"{name} = {value:.6g} ± {std:.2g} (1σ)" for name, value, std in each),
-            f"residuals {np.sqrt(self.reduced_chi_square):.3g} times the {stated} errors",
-            *(f"note: {note}" for note in self.notes),
-        )
+    def data_in_words(self) -> str:
+        """See `AbstractCalibration`."""
+        return f"{len(self.fitted)} points of a backbone"
 
     def variables(self) -> dict[str, Variable]:
-        """Values with 1σ and covariance in SI units, and the backbone, measured and fitted."""
-        across, at = ("parameter", "other_parameter"), ("point",)
-        hertz = "Hz"
+        """The parameters, and the backbone, measured and fitted."""
+        at, told = ("point",), self.measured.frequency / HERTZ
         return {
-            "parameter": Variable(("parameter",), np.array(self.names), "", "parameter"),
-            "value": Variable(("parameter",), self.values, "SI", "fitted value"),
-            "std": Variable(("parameter",), self.std, "SI", "1σ"),
-            "covariance": Variable(across, self.covariance, "SI", "covariance of the values"),
+            **super().variables(),
             "velocity_m_s": Variable(at, self.measured.velocity, "m/s", "velocity amplitude"),
-            "natural_frequency_hz": Variable(
-                at, self.measured.frequency / HERTZ, hertz, "measured natural frequency"
-            ),
-            "fitted_frequency_hz": Variable(at, self.fitted / HERTZ, hertz, "fitted"),
-            "fitted_frequency_std_hz": Variable(at, self.fitted_std / HERTZ, hertz, "its 1σ"),
+            "natural_frequency_hz": Variable(at, told, "Hz", "measured natural frequency"),
+            "fitted_frequency_hz": Variable(at, self.fitted / HERTZ, "Hz", "fitted"),
+            "fitted_frequency_std_hz": Variable(at, self.fitted_std / HERTZ, "Hz", "its 1σ"),
             "residual": Variable(at, self.residuals, "1", "residual in units of 1σ"),
         }
-
-    def attributes(self) -> dict[str, str | float | int]:
-        """See `AbstractResult`."""
-        return {"status": str(self.status), "notes": "\n".join(self.notes)}
 
 
 class _Linear(NamedTuple):
@@ -290,6 +252,7 @@ def _outcome(
         residuals=-linear.residuals[:n],
         reduced_chi_square=float(reduced),
         names=names,
+        noise_stated=points.frequency_std is not None,
         status=end.status,
         notes=tuple(notes),
     )

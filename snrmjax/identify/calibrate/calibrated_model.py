@@ -1,5 +1,6 @@
 """What a calibration finds: a model with fitted parameters, and how well they are known."""
 
+from abc import abstractmethod
 from typing import ClassVar
 
 import equinox as eqx
@@ -11,25 +12,18 @@ from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
 from snrmjax.numerics.result import AbstractResult, Variable
 
 
-class CalibratedModel(AbstractResult):
+class AbstractCalibration(AbstractResult):
     """A model with fitted parameters, and how well they are known.
 
-    `residuals` are whitened: of unit variance if noise and model are right; NaN where nothing was
-    measured or the state has no weight. A state's columns are real and imaginary parts of the
-    force, of the other sensors' fundamentals and of the harmonics. `covariance` and `std` are
-    widened by `noise_scale` where no noise is stated or where the residuals contradict it. What a
-    level shares is by how much its velocities were found to be too large and to lead.
+    `covariance` and `std` are widened by the residuals' size where no noise is stated, or where the
+    residuals contradict it.
     """
 
     coordinates: ClassVar[tuple[str, ...]] = ("parameter",)
 
-    model: Structure  # with the fitted values, and their 1σ where it has a place for them
-    values: Float[np.ndarray, " parameter"]
+    model: Structure  # with the fitted values
+    values: Float[np.ndarray, " parameter"]  # SI units, rad/s for frequencies
     covariance: Float[np.ndarray, "parameter parameter"]
-    residuals: Float[np.ndarray, "state column"]
-    state_converged: Bool[np.ndarray, " state"]
-    level_gain: Float[np.ndarray, " level"]  # relative
-    level_phase: Float[np.ndarray, " level"]  # rad
     reduced_chi_square: float
     names: tuple[str, ...] = eqx.field(static=True)
     noise_stated: bool = eqx.field(static=True)
@@ -51,12 +45,15 @@ class CalibratedModel(AbstractResult):
         """Whether the fit ended at a minimum."""
         return self.status.found_minimum
 
+    @abstractmethod
+    def data_in_words(self) -> str:
+        """How many data of what kind were used."""
+
     def summary(self) -> tuple[str, ...]:
         """See `AbstractResult`."""
-        n, used = len(self.state_converged), int(np.sum(self.state_converged))
         values = zip(self.names, self.values, self.std, strict=True)
         return (
-            f"CalibratedModel: {len(self.names)} parameters from {used} of {n} steady states "
+            f"{type(self).__name__}: {len(self.names)} parameters from {self.data_in_words()} "
             f"({self.status})",
             *(f"{name} = {value:.6g} ± {std:.2g} (1σ)" for name, value, std in values),
             f"residuals {self.noise_scale:.3g} times the "
@@ -65,20 +62,13 @@ class CalibratedModel(AbstractResult):
         )
 
     def variables(self) -> dict[str, Variable]:
-        """See `AbstractResult`; values in the SI units of each parameter, rad/s for frequencies."""
-        across, states = ("parameter", "other_parameter"), ("state", "column")
-        unit = "SI"
+        """See `AbstractResult`."""
+        per, across = ("parameter",), ("parameter", "other_parameter")
         return {
-            "parameter": Variable(("parameter",), np.array(self.names), "", "parameter"),
-            "value": Variable(("parameter",), self.values, unit, "fitted value"),
-            "std": Variable(("parameter",), self.std, unit, "1σ"),
-            "covariance": Variable(across, self.covariance, unit, "covariance of the values"),
-            "residual": Variable(states, self.residuals, "1", "residual in units of 1σ"),
-            "state_converged": Variable(("state",), self.state_converged, "1", "has weight"),
-            "level_gain": Variable(("level",), self.level_gain, "1", "velocities too large by"),
-            "level_phase_deg": Variable(
-                ("level",), np.degrees(self.level_phase), "deg", "velocities lead by"
-            ),
+            "parameter": Variable(per, np.array(self.names), "", "parameter"),
+            "value": Variable(per, self.values, "SI", "fitted value"),
+            "std": Variable(per, self.std, "SI", "1σ"),
+            "covariance": Variable(across, self.covariance, "SI", "covariance of the values"),
         }
 
     def attributes(self) -> dict[str, str | float | int]:
@@ -87,4 +77,35 @@ class CalibratedModel(AbstractResult):
             "status": str(self.status),
             "reduced_chi_square": self.reduced_chi_square,
             "notes": "\n".join(self.notes),
+        }
+
+
+class CalibratedModel(AbstractCalibration):
+    """A model with parameters fitted to steady states; see `calibrate_model`.
+
+    `residuals` are whitened: of unit variance if noise and model are right; NaN where nothing was
+    measured or the state has no weight. A state's columns are real and imaginary parts of the
+    force, of the other sensors' fundamentals and of the harmonics. What a level shares is by how
+    much its velocities were found to be too large and to lead.
+    """
+
+    residuals: Float[np.ndarray, "state column"]
+    state_converged: Bool[np.ndarray, " state"]
+    level_gain: Float[np.ndarray, " level"]  # relative
+    level_phase: Float[np.ndarray, " level"]  # rad
+
+    def data_in_words(self) -> str:
+        """See `AbstractCalibration`."""
+        return f"{int(np.sum(self.state_converged))} of {len(self.state_converged)} steady states"
+
+    def variables(self) -> dict[str, Variable]:
+        """See `AbstractResult`."""
+        states, level = ("state", "column"), ("level",)
+        lead = np.degrees(self.level_phase)
+        return {
+            **super().variables(),
+            "residual": Variable(states, self.residuals, "1", "residual in units of 1σ"),
+            "state_converged": Variable(("state",), self.state_converged, "1", "has weight"),
+            "level_gain": Variable(level, self.level_gain, "1", "velocities too large by"),
+            "level_phase_deg": Variable(level, lead, "deg", "velocities lead by"),
         }

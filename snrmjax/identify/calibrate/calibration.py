@@ -36,6 +36,7 @@ from snrmjax.model.parameters import (
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import mapped
 from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.least_squares import inverse_of
 from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
 
 
@@ -298,7 +299,7 @@ def _fitted(model: Structure, states: CalibrationStates, settings: _Settings, ai
             slopes = _slopes(*subject, aim, unknowns, again)
         whiten = state_whitener(states, slopes.by_error, jnp.asarray(harmonic_error))
         # Every unknown in its own unit: the solver's damping then treats them alike.
-        size = np.linalg.norm(_jacobian(whiten, slopes, aim, unknowns), axis=0)
+        size = np.linalg.norm(_jacobian(whiten, slopes, aim), axis=0)
         unit = jnp.asarray(_LIGHT / np.where(size > 0, size, 1.0))
         hold = jnp.asarray(np.append(relative / step, np.zeros(len(unknowns) - len(relative))))
         unknowns, near, ended = _fit(
@@ -311,21 +312,19 @@ def _fitted(model: Structure, states: CalibrationStates, settings: _Settings, ai
     return _Fitted(
         unknowns=np.asarray(unknowns),
         residuals=whitened_columns(*map(np.asarray, (whiten, slopes.columns))),
-        jacobian=_jacobian(whiten, slopes, aim, unknowns),
+        jacobian=_jacobian(whiten, slopes, aim),
         usable=np.any(np.asarray(whiten) != 0, axis=(1, 2)),
         status=status,
     )
 
 
-def _jacobian(whiten: Array, slopes: _Slopes, aim: _Aim, unknowns: Array) -> np.ndarray:
+def _jacobian(whiten: Array, slopes: _Slopes, aim: _Aim) -> np.ndarray:
     own, by_unknown = np.asarray(whiten), np.asarray(slopes.by_unknown)
-    of_states = whitened_columns(own, by_unknown).reshape(-1, unknowns.shape[0])
-    return np.concatenate([of_states, np.asarray(_own_slopes(aim, unknowns))])
-
-
-@compiled
-def _own_slopes(aim: _Aim, unknowns: Array) -> Float[Array, "unknown unknown"]:
-    return jax.jacfwd(aim.misses)(unknowns)
+    of_states = whitened_columns(own, by_unknown).reshape(-1, by_unknown.shape[-1])
+    values, weight = np.asarray(aim.values), np.asarray(aim.weight)
+    of_parameters = np.where(values != 0, values, 1.0) * weight
+    shared = np.ones(by_unknown.shape[-1] - len(values))
+    return np.concatenate([of_states, np.diag(np.append(of_parameters, shared))])
 
 
 def _result(
@@ -399,11 +398,8 @@ def _notes(
 
 
 def _inverse_of_square(jacobian: np.ndarray) -> np.ndarray:
-    """(JᵀJ)⁻¹ by singular values of the scaled columns; infinite for what has no influence."""
-    size = np.linalg.norm(jacobian, axis=0)
-    seen = np.flatnonzero(size > 0)
-    _, values, rows = np.linalg.svd(jacobian[:, seen] / size[seen], full_matrices=False)
-    root = (rows.T / values) / size[seen, None]
-    inverse = np.diag(np.where(size > 0, 0.0, np.inf))
-    inverse[np.ix_(seen, seen)] = root @ root.T
+    """(JᵀJ)⁻¹; infinite for what has no influence."""
+    seen = np.any(jacobian != 0, axis=0)
+    inverse = np.diag(np.where(seen, 0.0, np.inf))
+    inverse[np.ix_(seen, seen)] = inverse_of(jacobian[:, seen])
     return inverse

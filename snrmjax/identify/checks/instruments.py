@@ -1,10 +1,8 @@
 """Whether data determine the errors of the instruments that a fit was asked to find."""
 
-import dataclasses
-import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from enum import StrEnum
-from typing import Any, NamedTuple, ParamSpec, Protocol, TypeVar, cast
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -88,25 +86,11 @@ def _wide(std: float) -> str:
     return f"its 1σ is a factor of {np.exp(std):.2g}, and damping is proportional to it"
 
 
-class _InstrumentFit(Protocol):
-    """What a fit says of the instruments, and of the states it used."""
-
-    @property
-    def free(self) -> tuple[str, ...]: ...
-    @property
-    def covariance(self) -> np.ndarray: ...
-    @property
-    def noise(self) -> Any: ...
-    @property
-    def notes(self) -> tuple[str, ...]: ...
-    def names(self) -> tuple[str, ...]: ...
-    def motion(self) -> Any: ...
-
-
-def notes_on_instruments(fit: _InstrumentFit, level_errors: Sequence[str]) -> tuple[str, ...]:
+def notes_on_instruments(fit: Any, level_errors: Sequence[str]) -> tuple[str, ...]:
     """What data hardly determine of the unknowns that a fit freed.
 
-    Arguments: `level_errors` are the names of what the states of a level may share.
+    Arguments: `fit` a `JointFit`; `level_errors` are the names of what the states of a level may
+    share.
     Raises `ValueError` where one is not determined at all, so that the answer would mean nothing,
     or where beside a free gain the levels' gains had to be as large as a fit allows.
     """
@@ -146,29 +130,3 @@ def _undetermined(name: str, std: float, bounds: _Bounds) -> str:
     of = "" if name == "instrument_phase" else " of the smallest force"
     verb = "hardly determine" if std < bounds.refused else "cannot determine"
     return f"these data {verb} `{name}` (1σ {size}{of}). {bounds.remedy}, or do not free it."
-
-
-Arguments = ParamSpec("Arguments")
-Found = TypeVar("Found")
-
-
-def saying_what_is_undetermined(
-    level_errors: Sequence[str],
-) -> Callable[[Callable[Arguments, Found]], Callable[Arguments, Found]]:
-    """For a verb that fits the errors of instruments: it says which of them data hardly determine.
-
-    In the `notes` of what it returns, or in a `ValueError` (`notes_on_instruments`).
-    """
-
-    def saying(verb: Callable[Arguments, Found]) -> Callable[Arguments, Found]:
-        @functools.wraps(verb)
-        def checked(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Found:
-            found: Any = verb(*args, **kwargs)
-            notes = notes_on_instruments(found, level_errors)
-            if notes:
-                found = dataclasses.replace(found, notes=(*notes, *found.notes))
-            return cast(Found, found)
-
-        return checked
-
-    return saying

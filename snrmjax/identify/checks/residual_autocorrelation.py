@@ -46,24 +46,20 @@ def residual_autocorrelation(
     return np.array(found)
 
 
-def independent_share(correlation: Float[np.ndarray, " part"]) -> float:
-    """Share of the states that tell something of their own, by the mean of both parts.
-
-    n values of a first-order process with correlation ρ tell its mean as well as n(1 − ρ)/(1 + ρ)
-    independent ones.
-    """
-    return float(np.mean((1 - correlation) / (1 + correlation)))
-
-
 def share_told_by(
     residuals: Float[np.ndarray, "state part"],
     level: Int[np.ndarray, " state"],
     frequency: Float[np.ndarray, " state"],
 ) -> float:
-    """`independent_share` by what a fit leaves of states, whatever its size is."""
+    """Share of the states that tell something of their own, by what a fit leaves of them.
+
+    n values of a first-order process with correlation ρ tell its mean as well as n(1 − ρ)/(1 + ρ)
+    independent ones; the mean of both parts counts, whatever the size of the residuals is.
+    """
     size = np.sqrt(np.mean(residuals**2, axis=0))
     levels = along_resonance(level, frequency)
-    return independent_share(residual_autocorrelation(residuals / size, levels))
+    correlation = residual_autocorrelation(residuals / size, levels)
+    return float(np.mean((1 - correlation) / (1 + correlation)))
 
 
 def _correlation(

@@ -1,9 +1,7 @@
 """Families of smooth curves of amplitude with a few parameters, for the joint fit."""
 
-from abc import abstractmethod
 from typing import ClassVar, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,27 +9,23 @@ from jaxtyping import Array, Float
 from scipy.special import expit
 
 from snrmjax.identify.curves.family_base import (
-    AbstractCurve,
     AbstractFamily,
     Argument,
     Coefficient,
     linear_start,
 )
-from snrmjax.identify.curves.splines import SmoothingSpline, Spline, spline_columns
+from snrmjax.identify.curves.splines import SmoothingSpline, Spline
 
 
 class SumOfPowers(AbstractFamily):
     """Σ p_k (amplitude/scale)^power_k: linear in its parameters."""
 
-    @classmethod
-    @abstractmethod
-    def powers(cls, order: int) -> tuple[float, ...]:
-        """Powers of the terms."""
+    named: ClassVar[dict[str, float]]  # the terms and their powers, where their number is fixed
 
     @classmethod
-    @abstractmethod
-    def names(cls, order: int) -> tuple[str, ...]:
-        """Names of the terms."""
+    def terms(cls, order: int) -> dict[str, float]:
+        """Names of the terms and their powers."""
+        return cls.named
 
     @property
     def order(self) -> int:
@@ -43,14 +37,27 @@ class SumOfPowers(AbstractFamily):
         x = jnp.asarray(amplitude) / self.scale
         terms = [
             p * _power(x, power)
-            for p, power in zip(self.parameters, self.powers(self.order), strict=True)
+            for p, power in zip(self.parameters, self.terms(self.order).values(), strict=True)
         ]
         return sum(terms[1:], terms[0])
 
     def coefficients(self) -> tuple[Coefficient, ...]:
         """See `AbstractFamily`."""
-        pairs = zip(self.names(self.order), self.powers(self.order), strict=True)
+        pairs = self.terms(self.order).items()
         return tuple(Coefficient(name, power, True) for name, power in pairs)
+
+    def values_and_slopes(
+        self, amplitude: Float[np.ndarray, " point"]
+    ) -> tuple[Float[np.ndarray, " point"], Float[np.ndarray, "point parameter"]]:
+        """See `AbstractCurve`."""
+        x, parameters = amplitude / float(self.scale), np.asarray(self.parameters)
+        powers = np.array([*self.terms(self.order).values()])
+        some = np.where(x > 0, x, 1.0)[:, None] ** powers
+        columns = np.where(x[:, None] > 0, some, powers == 0)
+        values = columns @ parameters
+        # Dry friction: its equivalent damping grows without bound towards rest.
+        dry = float(np.sum(parameters[powers < 0]))
+        return np.where((x > 0) | (dry == 0), values, np.copysign(np.inf, dry)), columns
 
     @classmethod
     def starts(
@@ -63,7 +70,7 @@ class SumOfPowers(AbstractFamily):
     ) -> list[AbstractFamily]:
         """See `AbstractFamily`."""
         scale = float(np.max(amplitude))
-        columns = np.stack([(amplitude / scale) ** p for p in cls.powers(order)], axis=1)
+        columns = np.stack([(amplitude / scale) ** p for p in cls.terms(order).values()], axis=1)
         start = linear_start(columns, values, weight)
         return [cls(jnp.asarray(start), jnp.asarray(scale, dtype=jnp.float64), argument)]
 
@@ -89,14 +96,9 @@ class Polynomial(SumOfPowers):
         return self.order
 
     @classmethod
-    def powers(cls, order: int) -> tuple[float, ...]:
+    def terms(cls, order: int) -> dict[str, float]:
         """See `SumOfPowers`."""
-        return tuple(2.0 * k for k in range(order + 1))
-
-    @classmethod
-    def names(cls, order: int) -> tuple[str, ...]:
-        """See `SumOfPowers`."""
-        return ("at_zero", *(f"power_{2 * k}" for k in range(1, order + 1)))
+        return {"at_zero": 0.0} | {f"power_{2 * k}": 2.0 * k for k in range(1, order + 1)}
 
 
 class Constant(SumOfPowers):
@@ -104,16 +106,7 @@ class Constant(SumOfPowers):
 
     kind: ClassVar[str] = "constant"
     orders: ClassVar[tuple[int, ...]] = (0,)
-
-    @classmethod
-    def powers(cls, order: int) -> tuple[float, ...]:
-        """See `SumOfPowers`."""
-        return (0.0,)
-
-    @classmethod
-    def names(cls, order: int) -> tuple[str, ...]:
-        """See `SumOfPowers`."""
-        return ("constant",)
+    named: ClassVar[dict[str, float]] = {"constant": 0.0}
 
 
 class ViscousQuadratic(SumOfPowers):
@@ -121,16 +114,7 @@ class ViscousQuadratic(SumOfPowers):
 
     kind: ClassVar[str] = "viscous_quadratic"
     orders: ClassVar[tuple[int, ...]] = (1,)
-
-    @classmethod
-    def powers(cls, order: int) -> tuple[float, ...]:
-        """See `SumOfPowers`."""
-        return (0.0, 1.0)
-
-    @classmethod
-    def names(cls, order: int) -> tuple[str, ...]:
-        """See `SumOfPowers`."""
-        return ("viscous", "quadratic")
+    named: ClassVar[dict[str, float]] = {"viscous": 0.0, "quadratic": 1.0}
 
 
 class ViscousCoulomb(SumOfPowers):
@@ -138,16 +122,7 @@ class ViscousCoulomb(SumOfPowers):
 
     kind: ClassVar[str] = "viscous_coulomb"
     orders: ClassVar[tuple[int, ...]] = (1,)
-
-    @classmethod
-    def powers(cls, order: int) -> tuple[float, ...]:
-        """See `SumOfPowers`."""
-        return (0.0, -1.0)
-
-    @classmethod
-    def names(cls, order: int) -> tuple[str, ...]:
-        """See `SumOfPowers`."""
-        return ("viscous", "coulomb")
+    named: ClassVar[dict[str, float]] = {"viscous": 0.0, "coulomb": -1.0}
 
 
 class PowerLaw(AbstractFamily):
@@ -169,6 +144,17 @@ class PowerLaw(AbstractFamily):
         known = x > 0
         power = jnp.exp(self.exponent * jnp.log(jnp.where(known, x, 1.0)))
         return self.parameters[0] + self.parameters[1] * jnp.where(known, power, 0.0)
+
+    def values_and_slopes(
+        self, amplitude: Float[np.ndarray, " point"]
+    ) -> tuple[Float[np.ndarray, " point"], Float[np.ndarray, "point parameter"]]:
+        """See `AbstractCurve`."""
+        x, parameters = amplitude / float(self.scale), np.asarray(self.parameters)
+        exponent = float(self.largest_exponent * expit(parameters[2]))
+        term, share = x**exponent, exponent / self.largest_exponent
+        by_logit = exponent * (1 - share) * parameters[1] * term * np.log(np.where(x > 0, x, 1.0))
+        values = parameters[0] + parameters[1] * term
+        return values, np.stack([np.ones_like(x), term, by_logit], axis=1)
 
     def prior_residuals(self) -> Float[Array, " row"]:
         """See `AbstractCurve`."""
@@ -268,40 +254,3 @@ def parse_family(text: str) -> Choice:
     if argument not in known:
         raise ValueError(f'the amplitude must be "displacement" or "velocity", not {argument!r}.')
     return Choice(kind, int(size) if size else None, known[argument])
-
-
-def values_and_slopes(
-    family: AbstractCurve, amplitude: Float[np.ndarray, " point"]
-) -> tuple[Float[np.ndarray, " point"], Float[np.ndarray, "point parameter"]]:
-    """Values of a curve and their derivatives by its parameters, on the host.
-
-    What `jax.jacfwd` says, for the many families that a selection tries once each: their programs
-    would take longer to compile than all of the selection takes.
-    """
-    x, parameters = amplitude / float(family.scale), np.asarray(family.parameters)
-    if isinstance(family, SumOfPowers):
-        powers = np.array(family.powers(family.order))
-        some = np.where(x > 0, x, 1.0)[:, None] ** powers
-        columns = np.where(x[:, None] > 0, some, powers == 0)
-        # Dry friction: its equivalent damping grows without bound towards rest.
-        dry = float(np.sum(parameters[powers < 0]))
-        if dry != 0:
-            values = columns @ parameters
-            return np.where(x > 0, values, np.sign(dry) * np.inf), columns
-    elif isinstance(family, Spline):
-        columns = spline_columns(family, amplitude)
-    elif isinstance(family, PowerLaw):
-        exponent = float(family.largest_exponent * expit(parameters[2]))
-        term, share = x**exponent, exponent / family.largest_exponent
-        by_logit = exponent * (1 - share) * parameters[1] * term * np.log(np.where(x > 0, x, 1.0))
-        values = parameters[0] + parameters[1] * term
-        return values, np.stack([np.ones_like(x), term, by_logit], axis=1)
-    else:
-        at, direct = jnp.asarray(amplitude), _called_with
-        columns = np.asarray(jax.jacfwd(lambda p: direct(family, p, at))(family.parameters))
-        return np.asarray(family(at)), columns
-    return columns @ parameters, columns
-
-
-def _called_with(family: AbstractCurve, parameters: Array, amplitude: Array) -> Array:
-    return eqx.tree_at(lambda f: f.parameters, family, parameters)(amplitude)

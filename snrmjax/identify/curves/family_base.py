@@ -5,10 +5,10 @@ terms contribute at the largest measured amplitude, so that all have the unit of
 """
 
 from abc import abstractmethod
-from collections.abc import Sequence
 from typing import ClassVar, Literal, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -24,22 +24,6 @@ _KIND_WORDS = {
     "viscous_coulomb": "viscous and Coulomb damping",
     "viscous_microslip": "viscous and microslip damping",
 }
-
-
-def family_in_words(kind: str, size: int | None, arguments: Sequence[str]) -> str:
-    """A family of curves for readers: "smoothing spline of velocity, 9 knots".
-
-    Arguments: `arguments` the amplitudes that it is a function of, one or both.
-    """
-    name = _KIND_WORDS.get(kind, kind)
-    if kind == "constant" or (kind == "polynomial" and size == 0):
-        return "constant"
-    sized = ""
-    if size is not None and "spline" in kind:
-        sized = f", {size} knots"
-    elif size is not None and kind == "polynomial":
-        sized = f", {size} {'term' if size == 1 else 'terms'} beside the constant"
-    return f"{name} of {' and of '.join(arguments)}{sized}"
 
 
 class Coefficient(NamedTuple):
@@ -59,6 +43,21 @@ class AbstractCurve(eqx.Module):
     @abstractmethod
     def __call__(self, amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
         """Value at the amplitude that is its own, exact in the limit of zero."""
+
+    def values_and_slopes(
+        self, amplitude: Float[np.ndarray, " point"]
+    ) -> tuple[Float[np.ndarray, " point"], Float[np.ndarray, "point parameter"]]:
+        """Values and their derivatives by the parameters, on the host.
+
+        What `jax.jacfwd` says, which is taken where a curve has nothing of its own: programs of
+        many curves that are drawn once each would take longer to compile than all else.
+        """
+        at = jnp.asarray(amplitude)
+
+        def of(parameters: Array) -> Array:
+            return eqx.tree_at(lambda f: f.parameters, self, parameters)(at)
+
+        return np.asarray(self(at)), np.asarray(jax.jacfwd(of)(self.parameters))
 
     def prior_residuals(self) -> Float[Array, " row"]:
         """What is expected to be near zero of a curve, in its own 1σ; of most curves nothing."""
@@ -85,7 +84,14 @@ class AbstractFamily(AbstractCurve):
     @property
     def words(self) -> str:
         """Family, size and amplitude in words: "power law of velocity"."""
-        return family_in_words(self.kind, self.size, (self.argument,))
+        if self.kind == "constant" or (self.kind == "polynomial" and self.size == 0):
+            return "constant"
+        sized = ""
+        if "spline" in self.kind:
+            sized = f", {self.size} knots"
+        elif self.kind == "polynomial":
+            sized = f", {self.size} {'term' if self.size == 1 else 'terms'} beside the constant"
+        return f"{_KIND_WORDS.get(self.kind, self.kind)} of {self.argument}{sized}"
 
     @property
     def size(self) -> int | None:
@@ -95,11 +101,6 @@ class AbstractFamily(AbstractCurve):
     def amplitude(self, displacement: Array, velocity: Array) -> Array:
         """See `AbstractCurve`."""
         return displacement if self.argument == "displacement" else velocity
-
-    @classmethod
-    def sizes(cls, n_states: int, n_levels: int) -> tuple[int, ...]:
-        """What a selection by data tries, simplest first."""
-        return cls.orders
 
     @abstractmethod
     def coefficients(self) -> tuple[Coefficient, ...]:

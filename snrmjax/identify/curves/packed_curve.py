@@ -117,7 +117,7 @@ def packed(family: AbstractFamily, room: int = 0) -> AbstractCurve:
     if isinstance(family, SmoothingSpline):
         prior[: n - 2, :n] = np.asarray(family.bends) / np.asarray(family.bend_std)[..., None]
     if isinstance(family, SumOfPowers):
-        exponents[:n] = family.powers(family.order)
+        exponents[:n] = [*family.terms(family.order).values()]
         mix[:n, :n] = np.eye(n)
     elif isinstance(family, PowerLaw):
         free[1], largest, prior[0, 2] = True, family.largest_exponent, 1 / family.odds_std

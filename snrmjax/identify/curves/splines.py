@@ -11,8 +11,6 @@ from jaxtyping import Array, Float
 
 from snrmjax.identify.curves.family_base import AbstractFamily, Argument, Coefficient, linear_start
 
-_NEAREST = 1.05  # ratio of two knots' amplitudes
-
 
 class Spline(AbstractFamily):
     """A natural cubic spline in amplitude², through values at knots; the first knot is at zero.
@@ -41,6 +39,14 @@ class Spline(AbstractFamily):
         n = self.parameters.shape[0]
         return tuple(Coefficient(f"knot_{k}", 0.0, True) for k in range(n))
 
+    def values_and_slopes(
+        self, amplitude: Float[np.ndarray, " point"]
+    ) -> tuple[Float[np.ndarray, " point"], Float[np.ndarray, "point knot"]]:
+        """See `AbstractCurve`."""
+        u = (amplitude / float(self.scale)) ** 2
+        columns = spline_terms(u, np.asarray(self.knots)) @ np.asarray(self.mix)
+        return columns @ np.asarray(self.parameters), columns
+
     @classmethod
     def starts(
         cls,
@@ -59,8 +65,7 @@ class Spline(AbstractFamily):
             knots = np.linspace(0.0, 1.0, order) ** 2
         unit = jax.device_put(scale)
         blank = cls.through(knots, np.zeros(order), unit, argument)
-        columns = spline_columns(blank, amplitude)
-        start = linear_start(columns, values, weight)
+        start = linear_start(blank.values_and_slopes(amplitude)[1], values, weight)
         return [eqx.tree_at(lambda f: f.parameters, blank, jax.device_put(start))]
 
     @classmethod
@@ -107,7 +112,6 @@ class SmoothingSpline(Spline):
 
     kind: ClassVar[str] = "smoothing_spline"
     orders: ClassVar[tuple[int, ...]] = (12,)
-    largest_size: ClassVar[int] = 24
     bends: Float[Array, "bend knot"]  # from values at the knots
     bend_std: Float[Array, "*bend"]  # 1σ of the bends, one for all or each its own
 
@@ -116,47 +120,18 @@ class SmoothingSpline(Spline):
         return self.bends @ self.parameters / self.bend_std
 
     @classmethod
-    def sizes(cls, n_states: int, n_levels: int) -> tuple[int, ...]:
-        """See `AbstractFamily`: one for three states at most; bends of a size make it smooth."""
-        return (int(np.clip(n_states // 3, 2, cls.largest_size - 1)) + 1,)
-
-    @classmethod
-    def starts(
-        cls,
-        order: int,
-        argument: Argument,
-        amplitude: np.ndarray,
-        values: np.ndarray,
-        weight: np.ndarray,
-    ) -> list[AbstractFamily]:
-        """See `AbstractFamily`; knots at rest and at amplitudes of states.
-
-        Amplitudes that almost coincide count once: of a level that passes its resonance most
-        states are far below it, and the few at resonance need knots too.
-        """
-        scale = float(np.max(amplitude))
-        knots = np.append(0.0, amplitudes_apart(amplitude / scale, order - 1, _NEAREST) ** 2)
-        unit = jax.device_put(scale)
-        blank = cls.through(knots, np.zeros(len(knots)), unit, argument)
-        start = linear_start(spline_columns(blank, amplitude), values, weight)
-        size = jax.device_put(max(float(np.std(values)), 1e-3 * float(np.max(np.abs(values)))))
-        return [
-            eqx.tree_at(lambda f: (f.parameters, f.bend_std), blank, (jax.device_put(start), size))
-        ]
-
-    @classmethod
     def through(
         cls,
         knots: Float[np.ndarray, " knot"],
         values: Float[np.ndarray, " knot"],
         scale: Float[Array, ""],
         argument: Argument,
+        bend_std: Float[np.ndarray, " bend"] | float = np.inf,
     ) -> "SmoothingSpline":
-        """See `Spline`; bends of all sizes are alike likely until `bend_std` says otherwise."""
-        mix = jax.device_put(np.linalg.inv(spline_terms(knots, knots)))
-        bends = jax.device_put(bends_of(knots))
-        fixed = (scale, argument, jax.device_put(knots), mix, bends, jax.device_put(np.inf))
-        return cls(jax.device_put(values), *fixed)
+        """See `Spline`; bends of all sizes are alike likely unless `bend_std` says otherwise."""
+        mix = np.linalg.inv(spline_terms(knots, knots))
+        arrays = jax.device_put((values, knots, mix, bends_of(knots), bend_std))
+        return cls(arrays[0], scale, argument, *arrays[1:])
 
 
 def amplitudes_apart(
@@ -172,14 +147,6 @@ def amplitudes_apart(
             apart.append(float(one))
     pick = np.linspace(0, len(apart) - 1, min(most, len(apart)))
     return np.array(apart)[np.round(pick).astype(int)][::-1]
-
-
-def spline_columns(
-    curve: Spline, amplitude: Float[np.ndarray, " point"]
-) -> Float[np.ndarray, "point knot"]:
-    """Derivatives of a spline by its values at the knots, on the host."""
-    u = (amplitude / float(curve.scale)) ** 2
-    return spline_terms(u, np.asarray(curve.knots)) @ np.asarray(curve.mix)
 
 
 def bends_of(knots: Float[np.ndarray, " knot"]) -> Float[np.ndarray, "bend knot"]:

@@ -6,12 +6,10 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from snrmjax.identify.curves.families import values_and_slopes
 from snrmjax.identify.curves.family_base import AbstractFamily
 from snrmjax.identify.curves.splines import SmoothingSpline, Spline
-from snrmjax.identify.joint.force_balance import Unknowns
 from snrmjax.identify.joint.joint_fit import JointFit
-from snrmjax.identify.pointwise.backbone import Backbone, BackboneValues
+from snrmjax.identify.pointwise.backbone import Backbone, BackboneValues, banded_values
 from snrmjax.identify.pointwise.points_result import AmplitudeArgument
 
 _SCAN = 256  # displacements of the backbone, on which a velocity is looked for
@@ -38,30 +36,16 @@ def fitted_values(
     if (velocity is None) == (displacement is None):
         raise ValueError("give either `velocity` or `displacement`.")
     if velocity is not None:
-        at = np.asarray(velocity, dtype=np.float64)
-        values, slopes = values_with_slopes(fit, at)
+        found = values_at_velocity(fit, np.asarray(velocity, np.float64))
     else:
-        given = np.asarray(displacement, np.float64)
-        values, slopes, at = values_at_displacement(fit, given)
-    covariance = np.einsum("ocp,pq,odq->ocd", slopes, fit.covariance, slopes)
-    squared, damping = values.T
+        found = values_at_displacement(fit, np.asarray(displacement, np.float64))
+    covariance = np.einsum("ocp,pq,odq->ocd", found.slopes, fit.covariance, found.slopes)
+    squared, damping = found.values.T
     if of_a_new_level:
         stiffness, dissipation = np.asarray(fit.prior.level)[2:]
         covariance[:, 0, 0] += (squared * stiffness) ** 2
         covariance[:, 1, 1] += (damping * dissipation) ** 2
-    omega, zeta = np.sqrt(squared), damping / (2 * np.sqrt(squared))
-    # ζ̃ = δ/(2√s): dζ̃ = dδ/(2ω̃) − ζ̃ ds/(2s).
-    slope = np.stack([-zeta / (2 * squared), 1 / (2 * omega)], axis=1)
-    zeta_std = np.sqrt(np.einsum("oc,ocd,od->o", slope, covariance, slope))
-    return BackboneValues(
-        velocity=jax.device_put(at),
-        natural_frequency=jax.device_put(omega),
-        natural_frequency_std=jax.device_put(np.sqrt(covariance[:, 0, 0]) / (2 * omega)),
-        damping_ratio=jax.device_put(zeta),
-        damping_ratio_std=jax.device_put(zeta_std),
-        modal_damping=jax.device_put(damping),
-        modal_damping_std=jax.device_put(np.sqrt(covariance[:, 1, 1])),
-    )
+    return banded_values(found.velocity, squared, damping, covariance)
 
 
 def values_to_the_largest(fit: JointFit, n_points: int) -> BackboneValues:
@@ -86,36 +70,8 @@ def as_backbone(
     velocity is then taken where it lies on the backbone. Against velocity the knots are where the
     backbone has them.
     """
-    largest = fit.largest[argument == "velocity"]
-    squared, damping = fit.unknowns.squared_frequency, fit.unknowns.modal_damping
-    smooth = all(
-        isinstance(one, SmoothingSpline) and one.argument == "displacement"
-        for one in (squared, damping)
-    )
-    own = smooth and argument == "displacement"
-    if own:
-        n = squared.parameters.shape[0] + damping.parameters.shape[0]
-        covariance = fit.covariance[:n, :n]
-    else:
-        displacement = reach * fit.largest[0] * np.linspace(0.0, 1.0, _KNOTS)
-        if smooth and isinstance(squared, Spline):
-            displacement = float(squared.scale) * np.sqrt(np.asarray(squared.knots))
-        with np.errstate(invalid="ignore"):
-            positive = values_at_displacement(fit, displacement)[0][:, 0] > 0
-        # A polynomial may fall below zero beyond the data: there is no motion there.
-        displacement = displacement[: np.append(positive, False).argmin()]
-        values, slopes, at = values_at_displacement(fit, displacement)
-        if argument == "velocity":
-            values, slopes = values_with_slopes(fit, at)
-        at = displacement if argument == "displacement" else at
-        # Dry friction has no finite damping at rest: there the next knot's value stands.
-        values[0] = np.where(np.isfinite(values[0]), values[0], values[1])
-        squared, damping = (
-            Spline.through((at / at[-1]) ** 2, values[:, k], jax.device_put(at[-1]), argument)
-            for k in range(2)
-        )
-        rows = np.concatenate([slopes[:, 0], slopes[:, 1]])
-        covariance = rows @ fit.covariance @ rows.T
+    own = argument == "displacement" and _are_smooth(fit)
+    squared, damping, covariance = _own_curves(fit) if own else _redrawn(fit, argument, reach)
     motion = fit.motion()
     measured = np.abs(motion.velocity) if argument == "velocity" else motion.displacement
     return Backbone(
@@ -124,30 +80,91 @@ def as_backbone(
         covariance=jax.device_put(covariance),
         modal_constant=fit.problem.constant_of(fit.unknowns),
         smallest=jax.device_put(np.min(measured)),
-        largest=jax.device_put(largest),
+        largest=jax.device_put(fit.largest[argument == "velocity"]),
         argument=argument,
         sensor=fit.modes.sensors[fit.data.sensor],
     )
 
 
-class _OnBackbone(NamedTuple):
-    """Both curves at points on the backbone, where Ω = ω̃."""
+def _are_smooth(fit: JointFit) -> bool:
+    """Whether both curves are smooth ones of the displacement, through the same knots."""
+    pair = fit.unknowns.squared_frequency, fit.unknowns.modal_damping
+    return all(isinstance(one, SmoothingSpline) and one.argument == "displacement" for one in pair)
+
+
+def _own_curves(fit: JointFit) -> tuple[AbstractFamily, AbstractFamily, np.ndarray]:
+    squared, damping = fit.unknowns.squared_frequency, fit.unknowns.modal_damping
+    n = squared.parameters.shape[0] + damping.parameters.shape[0]
+    return squared, damping, fit.covariance[:n, :n]
+
+
+def _redrawn(
+    fit: JointFit, argument: AmplitudeArgument, reach: float
+) -> tuple[AbstractFamily, AbstractFamily, np.ndarray]:
+    """Splines through values of both curves, and the covariance of these values."""
+    squared = fit.unknowns.squared_frequency
+    displacement = reach * fit.largest[0] * np.linspace(0.0, 1.0, _KNOTS)
+    if isinstance(squared, Spline) and _are_smooth(fit):
+        displacement = float(squared.scale) * np.sqrt(np.asarray(squared.knots))
+    with np.errstate(invalid="ignore"):
+        positive = values_at_displacement(fit, displacement).values[:, 0] > 0
+    # A polynomial may fall below zero beyond the data: there is no motion there.
+    displacement = displacement[: np.append(positive, False).argmin()]
+    found = values_at_displacement(fit, displacement)
+    if argument == "velocity":
+        found = values_at_velocity(fit, found.velocity)
+    at, values = getattr(found, argument), found.values
+    # Dry friction has no finite damping at rest: there the next knot's value stands.
+    values[0] = np.where(np.isfinite(values[0]), values[0], values[1])
+    pair = (
+        Spline.through((at / at[-1]) ** 2, values[:, k], jax.device_put(at[-1]), argument)
+        for k in range(2)
+    )
+    rows = np.concatenate([found.slopes[:, 0], found.slopes[:, 1]])
+    return *pair, rows @ fit.covariance @ rows.T
+
+
+class OnBackbone(NamedTuple):
+    """Both curves, ω̃² and 2ζ̃ω̃, at points on the backbone, where Ω = ω̃."""
 
     values: Float[np.ndarray, "point curve"]
-    slopes: Float[np.ndarray, "point curve parameter"]  # by parameters of one, then of the other
+    slopes: Float[np.ndarray, "point curve unknown"]  # by the free unknowns
     displacement: Float[np.ndarray, " point"]
     velocity: Float[np.ndarray, " point"]
 
 
-def on_backbone(
-    unknowns: Unknowns, at: Float[np.ndarray, " point"], near: Float[np.ndarray, " point"] | None
-) -> _OnBackbone:
+def values_at_velocity(fit: JointFit, velocity: Float[np.ndarray, " point"]) -> OnBackbone:
+    """Both curves, with their derivatives by the free unknowns at those velocities.
+
+    Raises `ValueError` where the backbone has a velocity at several displacements, or at none.
+    """
+    found = _near(fit, float(np.max(velocity)))
+    if found.turns_back_at is not None:
+        raise ValueError(
+            f"the backbone turns back at {found.turns_back_at:.4g} m/s: there velocities belong to "
+            "several displacements; ask for values at displacements."
+        )
+    if np.max(velocity) > found.speed[-1]:
+        raise ValueError(f"the backbone does not reach {np.max(velocity):.4g} m/s.")
+    near = np.interp(velocity, found.speed, found.displacement)
+    return _on_backbone(fit, velocity, near)
+
+
+def values_at_displacement(fit: JointFit, displacement: Float[np.ndarray, " point"]) -> OnBackbone:
+    """Both curves, with their derivatives by the free unknowns at those displacements."""
+    return _on_backbone(fit, displacement, None)
+
+
+def _on_backbone(
+    fit: JointFit, at: Float[np.ndarray, " point"], near: Float[np.ndarray, " point"] | None
+) -> OnBackbone:
     """ω̃² and 2ζ̃ω̃ and their derivatives, by the host.
 
     Arguments: `at` displacements, at which derivatives are taken, or, where displacements `near`
     them are given, velocities. Where a curve is a function of the other amplitude this is the one
     that belongs to it, and moves with the curves' parameters.
     """
+    unknowns = fit.unknowns
     curves = unknowns.squared_frequency, unknowns.modal_damping
     n = curves[0].parameters.shape[0]
     of_velocity = [one.argument == "velocity" for one in curves]
@@ -175,71 +192,26 @@ def on_backbone(
     damping, by_damping, steep = _linearised(
         curves[1], velocity if of_velocity[1] else displacement
     )
-    slopes = np.zeros((len(at), 2, n + by_damping.shape[1]))
-    slopes[:, 0, :n], slopes[:, 1, n:] = by_own, by_damping
+    # The unknowns after those of the curves move nothing here.
+    slopes = np.zeros((len(at), 2, len(fit.covariance)))
+    slopes[:, 0, :n], slopes[:, 1, n : n + by_damping.shape[1]] = by_own, by_damping
     if of_velocity[1] != given_velocity:
         slopes[:, 1, :n] = steep[:, None] * moves
-    return _OnBackbone(np.stack([squared, damping], axis=1), slopes, displacement, velocity)
+    return OnBackbone(np.stack([squared, damping], axis=1), slopes, displacement, velocity)
 
 
 def _linearised(
     curve: AbstractFamily, amplitude: Float[np.ndarray, " point"]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Values, derivatives by the parameters, and by the amplitude by central differences."""
-    values, slopes = values_and_slopes(curve, amplitude)
+    values, slopes = curve.values_and_slopes(amplitude)
     step = _STEP * np.maximum(amplitude, 1e-3 * float(curve.scale))
     (above, _), (below, _) = (
-        values_and_slopes(curve, np.maximum(amplitude + sign * step, 0.0)) for sign in (1, -1)
+        curve.values_and_slopes(np.maximum(amplitude + sign * step, 0.0)) for sign in (1, -1)
     )
     width = amplitude + step - np.maximum(amplitude - step, 0.0)
     with np.errstate(invalid="ignore"):
         return values, slopes, (above - below) / width
-
-
-def values_with_slopes(
-    fit: JointFit, velocity: Float[np.ndarray, " point"]
-) -> tuple[Float[np.ndarray, "point curve"], Float[np.ndarray, "point curve unknown"]]:
-    """ω̃² and 2ζ̃ω̃ at velocities, and their derivatives by the free unknowns at that velocity.
-
-    Raises `ValueError` where the backbone has a velocity at several displacements.
-    """
-    found = on_backbone(fit.unknowns, velocity, displacement_near(fit, velocity))
-    return found.values, _of_all(fit, found.slopes)
-
-
-def values_at_displacement(
-    fit: JointFit, displacement: Float[np.ndarray, " point"]
-) -> tuple[
-    Float[np.ndarray, "point curve"],
-    Float[np.ndarray, "point curve unknown"],
-    Float[np.ndarray, " point"],
-]:
-    """ω̃² and 2ζ̃ω̃, their derivatives by the free unknowns, and the velocity, at displacements."""
-    found = on_backbone(fit.unknowns, displacement, None)
-    return found.values, _of_all(fit, found.slopes), found.velocity
-
-
-def _of_all(fit: JointFit, slopes: np.ndarray) -> Float[np.ndarray, "point curve unknown"]:
-    """With columns of zeros for the unknowns after those of the curves."""
-    return np.pad(slopes, ((0, 0), (0, 0), (0, len(fit.covariance) - slopes.shape[2])))
-
-
-def displacement_near(
-    fit: JointFit, velocity: Float[np.ndarray, " point"]
-) -> Float[np.ndarray, " point"]:
-    """Displacement of the backbone at velocities, to one part in a few hundred.
-
-    Raises `ValueError` where there are several, or none.
-    """
-    found = _near(fit, float(np.max(velocity)))
-    if found.turns_back_at is not None:
-        raise ValueError(
-            f"the backbone turns back at {found.turns_back_at:.4g} m/s: there velocities belong to "
-            "several displacements; ask for values at displacements."
-        )
-    if np.max(velocity) > found.speed[-1]:
-        raise ValueError(f"the backbone does not reach {np.max(velocity):.4g} m/s.")
-    return np.interp(velocity, found.speed, found.displacement)
 
 
 class _Reached(NamedTuple):
@@ -247,20 +219,13 @@ class _Reached(NamedTuple):
     speed: np.ndarray
     turns_back_at: float | None  # m/s, below the velocity that was asked for
 
-    @property
-    def once(self) -> float:
-        """The velocity, below which the backbone has each exactly once."""
-        if self.turns_back_at is None:
-            return float(self.speed[-1])
-        return float(np.min(self.speed[np.argmax(self.speed == self.turns_back_at) :]))
-
 
 def _near(fit: JointFit, velocity: float) -> _Reached:
     """The backbone from rest to beyond the measured displacements and a velocity."""
     reach = fit.largest[0]
     for _ in range(_DOUBLINGS):
         x = np.linspace(0.0, reach, _SCAN)
-        speed = on_backbone(fit.unknowns, x, None).velocity
+        speed = _on_backbone(fit, x, None).velocity
         turns = np.flatnonzero(~(np.diff(speed) > 0))
         if turns.size and np.min(speed[turns[0] :]) < velocity:
             return _Reached(x, speed, float(speed[turns[0]]))

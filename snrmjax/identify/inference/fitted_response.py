@@ -1,13 +1,12 @@
 """Responses of fitted curves under a force, with their resonances and folds, all with bands."""
 
 import numpy as np
-from jaxtyping import Bool, Complex, Float
+from jaxtyping import Float
 
 from snrmjax.identify.inference.fitted_curves import as_backbone, values_at_displacement
 from snrmjax.identify.inference.forced_motion import banded_curve
 from snrmjax.identify.inference.located_points import (
     FittedPoint,
-    LocatedStatus,
     Place,
     located,
     turns,
@@ -19,6 +18,7 @@ from snrmjax.identify.pointwise.prediction import (
     predict_response,
     resonances,
 )
+from snrmjax.identify.pointwise.prediction_result import PredictedResponse
 from snrmjax.identify.prediction.new_level import NewLevel, new_level
 from snrmjax.identify.prediction.resonance_distribution import (
     KnownCurves,
@@ -28,29 +28,23 @@ from snrmjax.identify.prediction.resonance_distribution import (
     other_modes,
     resonance_distribution,
 )
-from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.result import Variable
 
 _HERTZ = 2 * np.pi  # rad/s
 
 
-class FittedResponse(AbstractResult):
-    """A response curve along rising and falling amplitude, with 1σ at fixed frequency.
+class FittedResponse(PredictedResponse):
+    """A response curve along rising and falling amplitude, with 1σ.
 
     `resonances` and `folds` are those that were located; `not_located` are the others, at the
     place where the drawn curve has them, without a band.
     """
 
-    force: float  # N
-    frequency: Float[np.ndarray, " point"]  # rad/s
-    frequency_std: Float[np.ndarray, " point"]  # at fixed amplitude
-    velocity: Complex[np.ndarray, " point"]  # m/s
+    frequency_std: Float[np.ndarray, " point"]  # rad/s, at fixed amplitude
     velocity_std: Float[np.ndarray, " point"]  # of the magnitude at fixed frequency; large at folds
-    stable: Bool[np.ndarray, " point"]
-    continued: Bool[np.ndarray, " point"]
     resonances: tuple[FittedPoint, ...]
     folds: tuple[FittedPoint, ...]
     not_located: tuple[FittedPoint, ...]
-    note: str  # where the curve extrapolates the fit, what was not located; empty if neither
     sensor: str
 
     def summary(self) -> tuple[str, ...]:
@@ -71,26 +65,20 @@ class FittedResponse(AbstractResult):
 
     def variables(self) -> dict[str, Variable]:
         """See `AbstractResult`."""
-        per = ("point",)
-        std = self.frequency_std / _HERTZ
+        per, std = ("point",), self.frequency_std / _HERTZ
         return {
-            "frequency_hz": Variable(per, self.frequency / _HERTZ, "Hz", "frequency"),
+            **super().variables(),
             "frequency_std_hz": Variable(per, std, "Hz", "1σ at fixed amplitude"),
-            "velocity_re_m_s": Variable(per, self.velocity.real, "m/s", "velocity, real part"),
-            "velocity_im_m_s": Variable(per, self.velocity.imag, "m/s", "velocity, imaginary part"),
             "velocity_std_m_s": Variable(per, self.velocity_std, "m/s", "1σ at fixed frequency"),
-            "stable": Variable(per, self.stable, "1", "stable"),
-            "continued": Variable(per, self.continued, "1", "beyond the measured amplitudes"),
         }
 
     def attributes(self) -> dict[str, str | float | int]:
         """See `AbstractResult`."""
-        return {
-            "force_n": self.force,
+        own: dict[str, str | float | int] = {
             "sensor": self.sensor,
             "n_not_located": len(self.not_located),
-            "note": self.note,
         }
+        return super().attributes() | own
 
 
 def fitted_response(
@@ -130,23 +118,27 @@ def fitted_response(
     answer = []
     for number, curve in enumerate(curves):
         band = banded_curve(fit, force, curve.amplitude, curve.frequency, level)
+        amplitude, frequency, velocity, frequency_std, velocity_std = band
         places = [*(tips if number == 0 else ()), *turns(curve.frequency, curve.amplitude)]
         points = [located(fit, force, place, level) for place in places]
-        good = [one for one in points if one.status == LocatedStatus.LOCATED]
-        missing = tuple(one for one in points if one.status != LocatedStatus.LOCATED)
+        good = [one for one in points if one.located]
+        missing = tuple(one for one in points if not one.located)
         answer.append(
             FittedResponse(
                 force=force,
-                frequency=band.frequency,
-                frequency_std=band.frequency_std,
-                velocity=band.velocity,
-                velocity_std=band.velocity_std,
+                frequency=frequency,
+                velocity=velocity,
+                amplitude=amplitude,
                 stable=curve.stable,
+                branch=curve.branch,
                 continued=curve.continued,
+                isolated=curve.isolated,
+                note=" ".join(filter(None, [curve.note, _note_on(missing, force)])),
+                frequency_std=frequency_std,
+                velocity_std=velocity_std,
                 resonances=tuple(one for one in good if one.kind == "resonance"),
                 folds=tuple(one for one in good if one.kind == "fold"),
                 not_located=missing,
-                note=" ".join(filter(None, [curve.note, _note_on(missing, force)])),
                 sensor=fit.modes.sensors[fit.data.sensor],
             )
         )
@@ -183,7 +175,7 @@ def predicted_resonance(
     new = new_level(fit, force) if of is None else of
     amplitude = amplitudes_to(fit.largest[0], largest_amplitude_ratio)
 
-    values, slopes, _ = values_at_displacement(fit, amplitude)
+    values, slopes, *_ = values_at_displacement(fit, amplitude)
     root = covariance_root(fit.covariance)
     load, names = force, fit.names()
     by_load = -float(fit.prior.linear[-1]) * root[-1]

@@ -1,7 +1,5 @@
 """The fitted mode under one force: its response curve with bands, by implicit derivatives."""
 
-from typing import NamedTuple
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -110,37 +108,30 @@ class ForcedMotion(eqx.Module):
         return (own + rest[..., self.sensor]) * jnp.exp((1 - self.gain_of_force) * level[0])
 
 
-class BandedCurve(NamedTuple):
-    """Points of a response curve, each with 1σ."""
-
-    frequency: Float[np.ndarray, " point"]  # rad/s
-    frequency_std: Float[np.ndarray, " point"]  # at fixed amplitude
-    velocity: Complex[np.ndarray, " point"]  # m/s
-    velocity_std: Float[np.ndarray, " point"]  # of the magnitude at fixed frequency
-
-
 def banded_curve(
     fit: JointFit, force: float, amplitude: np.ndarray, frequency: np.ndarray, new: NewLevel
-) -> BandedCurve:
-    """The points of a response curve that are nearest to some, with bands."""
+) -> tuple[np.ndarray, ...]:
+    """The points of a response curve that are nearest to some, with bands.
 
+    Returns displacement (m), frequency (rad/s) and velocity (m/s) of every point, 1σ of the
+    frequency at fixed amplitude and of the velocity's magnitude at fixed frequency.
+    """
     program, motion = fit.packed(), ForcedMotion.of(fit, force, new)
     own, level = program.padded_covariance(fit.covariance), np.diag(new.std**2)
     covariance = jnp.asarray(block_diag(own, level))
     count, vector = np.array(_ONTO_THE_CURVE), motion.with_level(program.vector)
     # The points come from curves drawn anew through knots: steps put them on the fit's own.
-    found = by_blocks(
+    return by_blocks(
         lambda x, omega: _bands(motion, vector, covariance, x, omega, count),
         *(_BLOCK, np.asarray(amplitude), np.asarray(frequency)),
     )
-    return BandedCurve(*found)
 
 
 @compiled
 def _bands(
     motion: ForcedMotion, vector: Array, covariance: Array, x: Array, omega: Array, steps: Array
 ) -> tuple[Array, ...]:
-    """The fields of `BandedCurve`, after so many steps onto the curve."""
+    """What `banded_curve` returns, after so many steps onto the curve."""
     ones, excess = jnp.ones_like(x), motion.excess
 
     def by(position: int, x: Array, omega: Array) -> Array:
@@ -167,4 +158,4 @@ def _bands(
     frequency_std = jnp.sqrt(jnp.einsum("op,pq,oq->o", by_vector, covariance, by_vector))
     velocity_std = jnp.sqrt(jnp.einsum("op,pq,oq->o", moved, covariance, moved))
     velocity = motion.velocity(vector, x, omega)
-    return omega, frequency_std / jnp.abs(by_omega), velocity, velocity_std
+    return x, omega, velocity, frequency_std / jnp.abs(by_omega), velocity_std

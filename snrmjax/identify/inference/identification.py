@@ -7,7 +7,6 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from snrmjax.identify.curves.families import values_and_slopes
 from snrmjax.identify.inference.fitted_curves import as_backbone
 from snrmjax.identify.joint.joint_fit import JointFit, fit_jointly
 from snrmjax.identify.pointwise.backbone import Backbone
@@ -344,7 +343,7 @@ def notes_on_phases(points: BackbonePoints, curves: Backbone, advice: str) -> li
     level = points.level[use]
     sign = np.sign(float(curves.modal_constant))  # negative: the mode moves against force
     sine = sign * np.sin(np.angle(np.asarray(points.mode_velocity)))[use]
-    curve, _ = values_and_slopes(curves.modal_damping, np.asarray(points.amplitude)[use])
+    curve, _ = curves.modal_damping.values_and_slopes(np.asarray(points.amplitude)[use])
     excess = np.asarray(points.modal_damping)[use] / curve - 1
     _, member = np.unique(level, return_inverse=True)
     count = np.bincount(member)

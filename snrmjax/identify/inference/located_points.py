@@ -1,6 +1,5 @@
 """Resonances and folds of fitted responses, located by Newton's method, with bands."""
 
-from enum import IntEnum
 from typing import Literal, NamedTuple
 
 import jax
@@ -10,9 +9,10 @@ from jaxtyping import Array, Float
 
 from snrmjax.identify.inference.forced_motion import ForcedMotion
 from snrmjax.identify.joint.joint_fit import JointFit
+from snrmjax.identify.pointwise.prediction_result import Resonance
 from snrmjax.identify.prediction.new_level import ON_THE_CURVES, NewLevel
 from snrmjax.numerics.compiled import compiled
-from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.result import Variable
 
 _HERTZ = 2 * np.pi  # rad/s
 _ITERATIONS = 12
@@ -20,32 +20,21 @@ _ITERATIONS = 12
 Kind = Literal["resonance", "fold"]
 
 
-class LocatedStatus(IntEnum):
-    """How the search for a resonance or a fold ended."""
-
-    LOCATED = 0
-    NOT_LOCATED = 1  # Newton's method did not converge near where the drawn curve has it
-
-
-class FittedPoint(AbstractResult):
-    """A resonance or a fold of a fitted response, with 1σ.
+class FittedPoint(Resonance):
+    """A resonance or a fold of a fitted response, with 1σ; a fold has no damping ratio (NaN).
 
     One that was not located has the place that the drawn curve has, and NaN for 1σ.
     """
 
-    force: float  # N
-    frequency: float  # rad/s
     frequency_std: float
-    velocity: float  # m/s at the fit's sensor, residual modes included
     velocity_std: float
-    continued: bool  # beyond the measured amplitudes
-    kind: str = "resonance"  # or "fold"
-    status: LocatedStatus = LocatedStatus.LOCATED
+    kind: Kind
+    located: bool  # False: no root of Newton's method near where the drawn curve has it
 
     def summary(self) -> tuple[str, ...]:
         """See `AbstractResult`."""
         size, std = self.frequency / _HERTZ, self.frequency_std / _HERTZ
-        status = "located" if self.status == LocatedStatus.LOCATED else "not located"
+        status = "located" if self.located else "not located"
         if self.continued:
             status += ", beyond the measured amplitudes"
         return (
@@ -56,21 +45,16 @@ class FittedPoint(AbstractResult):
 
     def variables(self) -> dict[str, Variable]:
         """See `AbstractResult`."""
-
-        def number(value: float, unit: str, meaning: str) -> Variable:
-            return Variable((), value, unit, meaning)
-
+        std = self.frequency_std / _HERTZ
         return {
-            "force_n": number(self.force, "N", "force"),
-            "frequency_hz": number(self.frequency / _HERTZ, "Hz", "frequency"),
-            "frequency_std_hz": number(self.frequency_std / _HERTZ, "Hz", "1σ of the frequency"),
-            "velocity_m_s": number(self.velocity, "m/s", "velocity"),
-            "velocity_std_m_s": number(self.velocity_std, "m/s", "1σ of the velocity"),
+            **super().variables(),
+            "frequency_std_hz": Variable((), std, "Hz", "1σ of the frequency"),
+            "velocity_std_m_s": Variable((), self.velocity_std, "m/s", "1σ of the velocity"),
         }
 
     def attributes(self) -> dict[str, str | float | int]:
         """See `AbstractResult`."""
-        return {"kind": self.kind, "status": self.status.name.lower()}
+        return {"kind": self.kind, "status": "located" if self.located else "not_located"}
 
 
 class Place(NamedTuple):
@@ -94,31 +78,31 @@ class _Solved(NamedTuple):
 def located(
     fit: JointFit, force: float, place: Place, new: NewLevel = ON_THE_CURVES
 ) -> FittedPoint:
-    """The resonance or fold near a place."""
-    largest = fit.largest[0] * (1 + 1e-9)
+    """The resonance or fold near a place.
+
+    At a phase resonance the mode moves in phase with the force: 2ζ̃ω̃ = |A|F/v.
+    """
     found = _solved(fit, force, place, new)
-    if found is None:
-        return FittedPoint(
-            force=force,
-            frequency=place.frequency,
-            frequency_std=float("nan"),
-            velocity=place.frequency * place.amplitude,
-            velocity_std=float("nan"),
-            continued=place.amplitude > largest,
-            kind=place.kind,
-            status=LocatedStatus.NOT_LOCATED,
-        )
-    values, variance = found.values, found.variance(fit)
-    widened = variance + found.by_level**2 @ new.std**2
-    (omega, speed, x), std = values, np.sqrt(widened)
+    (_, x, omega), nan = place, float("nan")
+    values, std, ratio = np.array([omega, omega * x, x]), np.full(3, nan), nan
+    if found is not None:
+        values = found.values
+        std = np.sqrt(found.variance(fit) + found.by_level**2 @ new.std**2)
+    omega, speed, x = map(float, values)
+    if found is not None and place.kind == "resonance":
+        load = abs(float(fit.problem.constant_of(fit.unknowns))) * force
+        ratio = load / (2 * omega**2 * x)
     return FittedPoint(
         force=force,
-        frequency=float(omega),
+        amplitude=x,
+        frequency=omega,
+        damping_ratio=ratio,
+        velocity=speed,
+        continued=x > fit.largest[0] * (1 + 1e-9),
         frequency_std=float(std[0]),
-        velocity=float(speed),
         velocity_std=float(std[1]),
-        continued=bool(x > largest),
         kind=place.kind,
+        located=found is not None,
     )
 
 

@@ -279,7 +279,7 @@ def _target(
     if target in ("curves", "frequency", "damping"):
         measured = np.asarray(fit.motion().displacement)
         at = np.linspace(measured.min(), measured.max(), _TARGETS)
-        values, slopes, _ = values_at_displacement(fit, at)
+        values, slopes, *_ = values_at_displacement(fit, at)
         parts = {"frequency": [0], "damping": [1]}.get(target, [0, 1])
         each = [slopes[:, k] / (2.0 if k == 0 else 1.0) for k in parts]
         return np.concatenate(each), np.concatenate([values[:, k] for k in parts])

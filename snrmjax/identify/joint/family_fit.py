@@ -1,5 +1,6 @@
 """Families of curves by name, fitted to the exact force balance by Levenberg–Marquardt."""
 
+import dataclasses
 from enum import IntEnum
 from typing import NamedTuple
 
@@ -13,7 +14,7 @@ from jaxtyping import Array, Float
 from snrmjax.identify.checks.residual_autocorrelation import share_told_by
 from snrmjax.identify.joint.force_balance import BalanceProblem, Unknowns, nearest_errors
 from snrmjax.identify.joint.free_unknowns import Unravel, packed_unknowns, padded_problem
-from snrmjax.identify.joint.notes import NoiseAndLevels
+from snrmjax.identify.joint.notes import NoiseEstimate
 from snrmjax.identify.joint.posterior_view import LEAST_LEFT
 from snrmjax.identify.joint.residuals import corrected_residuals
 from snrmjax.numerics.compiled import compiled
@@ -57,7 +58,7 @@ class FamilyFit(NamedTuple):
     unknowns: Unknowns
     covariance: Float[np.ndarray, "unknown unknown"]
     problem: BalanceProblem  # with the corrections and the noise of the last round
-    noise: NoiseAndLevels
+    noise: NoiseEstimate
     residuals: Float[np.ndarray, "state part"]  # of unit variance where the noise is as found
     status: FitStatus
 
@@ -66,7 +67,7 @@ def fit_families(
     start: Unknowns,
     problem: BalanceProblem,
     free: tuple[str, ...],
-    noise: NoiseAndLevels,
+    noise: NoiseEstimate,
     stated: Float[np.ndarray, "state input"],
     *,
     believed: bool,
@@ -76,12 +77,12 @@ def fit_families(
     The families may leave more than the smooth curves do, from which the unknowns start: then
     noise is larger, and states whose neighbours miss the curves alike count as fewer.
 
-    Arguments: `stated` 1σ of the states' errors, of whose size only `noise.noise` is known unless
+    Arguments: `stated` 1σ of the states' errors, of whose size only `noise.scale` is known unless
     they are `believed`.
     Raises `ValueError` where residuals are not finite.
     """
     program, n = packed_unknowns(start, free, padded_problem(problem).data.n_levels), len(stated)
-    size, status = 1.0 if believed else noise.noise, FitStatus.NOT_SETTLED
+    size, status = 1.0 if believed else noise.scale, FitStatus.NOT_SETTLED
     share = 1.0
     for _ in range(_ROUNDS):
         problem = problem.with_data(std=jnp.asarray(stated * size / np.sqrt(share)))
@@ -101,8 +102,9 @@ def fit_families(
         rows = told * residuals.size
         left = max(rows - degrees_spent(jacobian, answer.residuals.size), LEAST_LEFT * rows)
         found = size * float(np.sqrt(told * np.sum(residuals**2) / left))
-        noise = noise._replace(noise=found, noise_std=found / float(np.sqrt(2 * left)))
-        wanted = 1.0 if believed and not noise.contradicts_upward else max(found, 1e-12)
+        std = found / float(np.sqrt(2 * left))
+        noise = dataclasses.replace(noise, scale=found, scale_std=std)
+        wanted = 1.0 if believed and not noise.exceeded else max(found, 1e-12)
         change = np.hypot(np.log(wanted / size), np.log(told / share))
         size, share = (size, share) if change < _SETTLED else (wanted, told)
         if change < _SETTLED:

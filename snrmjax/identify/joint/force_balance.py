@@ -6,14 +6,14 @@ curve, however the response folds.
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Float, Int
+from jaxtyping import Array, Complex, Float, Int
 
 from snrmjax.identify.curves.family_base import AbstractCurve, AbstractFamily
 from snrmjax.identify.pointwise.backbone_points import modal_filter, off_resonance_error_factor
@@ -93,17 +93,13 @@ class BalanceProblem(eqx.Module):
         r, j = self.data.sensor, self.modes.mode_of_interest
         return self.modes.mode_shape[r, j] * self.modes.participation[j]
 
-    def log_modal_mass(self, unknowns: Unknowns) -> Float[Array, ""]:
-        """By how much the fit's modal mass exceeds the model's: the logarithm of their ratio."""
-        return log_modal_mass(unknowns, self.prior.linear)
-
     def modal_mass_of(self, unknowns: Unknowns) -> Float[Array, ""]:
         """The modal mass in kg, seen from force and sensor, that the fit found."""
         return 1 / jnp.abs(self.constant_of(unknowns))
 
     def constant_of(self, unknowns: Unknowns) -> Float[Array, ""]:
         """`modal_constant` with the modal mass that the fit found."""
-        return self.modal_constant * jnp.exp(-self.log_modal_mass(unknowns))
+        return self.modal_constant * jnp.exp(-log_modal_mass(unknowns, self.prior.linear))
 
 
 def log_modal_mass(unknowns: Unknowns, linear_std: Float[Array, " deviation"]) -> Float[Array, ""]:
@@ -147,8 +143,10 @@ def stated_prior(
     return PriorStd(jnp.asarray(level_std), jnp.asarray(np.concatenate(linear)), of_force)
 
 
-def balance_data(data: SteadyStates, modes: LinearModes) -> tuple[BalanceData, bool]:
-    """The states with a measured velocity, and whether their noise is stated.
+def balance_data(
+    data: SteadyStates, modes: LinearModes
+) -> tuple[BalanceData, bool, tuple[int, ...]]:
+    """The states with a measured velocity, whether their noise is stated, their levels' numbers.
 
     Where nobody stated any noise, force, amplitude and phase get the same relative error, larger
     off resonance (`off_resonance_error_factor`); the fit then finds its size. Without an error of
@@ -159,8 +157,13 @@ def balance_data(data: SteadyStates, modes: LinearModes) -> tuple[BalanceData, b
     """
     check_phases(data, "a joint fit")
     r = reference_sensor(modes)
-    velocity, share, errors = _filtered(data, modes)
-    force, keep = _measured(data, velocity)
+    relative = relative_errors(jax.tree.map(np.asarray, data))
+    filtered = _one_sensor(data, modes, r, data.velocity, relative)
+    velocity, share, errors, _ = map(np.asarray, filtered)
+    # The force in N, or the drive in V where only that is known.
+    driven = not np.any(np.isfinite(np.asarray(data.force)))
+    force = np.asarray(data.drive if driven else data.force)
+    keep = np.isfinite(np.abs(velocity)) & (np.abs(velocity) > 0) & np.isfinite(force) & (force > 0)
     known = bool(np.all(np.isfinite(errors[keep]))) and bool(np.all(errors[keep][:, 1:3] > 0))
     if not known:
         far = off_resonance_error_factor(velocity)
@@ -182,36 +185,11 @@ def balance_data(data: SteadyStates, modes: LinearModes) -> tuple[BalanceData, b
             sensor=r,
         ),
         known,
+        tuple(levels.tolist()),
     )
-
-
-def level_numbers(data: SteadyStates, modes: LinearModes) -> tuple[int, ...]:
-    """The numbers that the data's own record gives the levels of `balance_data`, in its order."""
-    velocity, *_ = _filtered(data, modes)
-    keep = _measured(data, velocity)[1]
-    return tuple(int(one) for one in np.unique(np.asarray(data.level)[keep]))
-
-
-def _filtered(data: SteadyStates, modes: LinearModes) -> tuple[np.ndarray, ...]:
-    """What the sensors together say of one of them: velocity, shares, relative errors."""
-    errors = relative_errors(jax.tree.map(np.asarray, data))
-    given = (reference_sensor(modes), data.velocity, errors)
-    velocity, share, std, _ = _one_sensor(data, modes, *given)
-    return np.asarray(velocity), np.asarray(share), np.asarray(std)
 
 
 _one_sensor = compiled(modal_filter)
-
-
-def _measured(
-    data: SteadyStates, velocity: Complex[np.ndarray, " state"]
-) -> tuple[Float[np.ndarray, " state"], Bool[np.ndarray, " state"]]:
-    """The force in N, or the drive in V where only that is known; the states that have all."""
-    driven = not np.any(np.isfinite(np.asarray(data.force)))
-    force = np.asarray(data.drive if driven else data.force)
-    return force, np.isfinite(np.abs(velocity)) & (np.abs(velocity) > 0) & np.isfinite(force) & (
-        force > 0
-    )
 
 
 def with_deviations(modes: LinearModes, deviation: Array, spread: Array) -> LinearModes:
@@ -334,18 +312,6 @@ def no_errors(n_states: int) -> Float[Array, "state input"]:
     return jnp.asarray(np.zeros((n_states, len(STATE_ERRORS))))
 
 
-def error_slopes(
-    balance: Callable[[Array], Array], at: Float[Array, "state input"]
-) -> Float[Array, "state part input"]:
-    """Derivatives of the balance with respect to `STATE_ERRORS`, `at` some.
-
-    Every state has its own: one push forward for each input gives them all.
-    """
-    n_states, kinds = at.shape
-    directions = jnp.broadcast_to(jnp.eye(kinds)[:, None, :], (kinds, n_states, kinds))
-    return jnp.moveaxis(mapped(jax.linearize(balance, at)[1], directions), 0, 2)
-
-
 class Weighting(NamedTuple):
     """What turns a balance into independent residuals of unit variance, state by state."""
 
@@ -404,8 +370,15 @@ def nearest_errors(
 def slopes_by_error(
     unknowns: Unknowns, problem: BalanceProblem
 ) -> Float[Array, "state part input"]:
-    """Derivatives of the balance by the states' errors, at the corrected states."""
-    return error_slopes(lambda e: force_balance(unknowns, problem, e), problem.data.correction)
+    """Derivatives of the balance by the states' errors (`STATE_ERRORS`), at the corrected states.
+
+    Every state has its own: one push forward for each kind of error gives them all.
+    """
+    at = problem.data.correction
+    n_states, kinds = at.shape
+    directions = jnp.broadcast_to(jnp.eye(kinds)[:, None, :], (kinds, n_states, kinds))
+    along = jax.linearize(lambda error: force_balance(unknowns, problem, error), at)[1]
+    return jnp.moveaxis(mapped(along, directions), 0, 2)
 
 
 def whitener(

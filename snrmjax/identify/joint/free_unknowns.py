@@ -55,12 +55,6 @@ class Unravel(eqx.Module):
         ]
         return eqx.combine(jax.tree.unflatten(structure, parts), fixed)
 
-    @property
-    def level_places(self) -> Int[np.ndarray, "level error"]:
-        """Where in the vector the deviations of levels are."""
-        level, end = self.unknowns.level, self.vector().size - self.unknowns.linear.size
-        return end - level.size + np.arange(level.size).reshape(level.shape)
-
 
 class PackedUnknowns(NamedTuple):
     """The free unknowns as compiled programs take them: with curves of one form and size.
@@ -85,7 +79,10 @@ def packed_unknowns(
     unknowns: Unknowns, free: tuple[str, ...], n_levels: int | None = None
 ) -> PackedUnknowns:
     """Unknowns for a program that serves every family, and so many levels."""
-    whole, present = with_packed_curves(unknowns), len(unknowns.level)
+    curves, present = (unknowns.squared_frequency, unknowns.modal_damping), len(unknowns.level)
+    most = max(curve.parameters.shape[0] for curve in curves)
+    pair = tuple(packed(curve, most) for curve in curves)
+    whole = eqx.tree_at(lambda u: (u.squared_frequency, u.modal_damping), unknowns, pair)
     if n_levels is not None:
         whole = eqx.tree_at(lambda u: u.level, whole, filled(unknowns.level, n_levels, 0.0))
     vector = Unravel(whole, free).vector()
@@ -162,11 +159,3 @@ def named_unknowns(
         *((f"linear_{k}", "std") for k in range(unknowns.linear.shape[0] - 1)),
         ("modal_mass", "std"),
     )
-
-
-def with_packed_curves(unknowns: Unknowns) -> Unknowns:
-    """The same unknowns with both curves as compiled programs take them, in arrays of one size."""
-    curves = (unknowns.squared_frequency, unknowns.modal_damping)
-    most = max(curve.parameters.shape[0] for curve in curves)
-    pair = tuple(packed(curve, most) for curve in curves)
-    return eqx.tree_at(lambda u: (u.squared_frequency, u.modal_damping), unknowns, pair)

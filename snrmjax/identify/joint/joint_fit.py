@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from snrmjax.identify.checks.instruments import saying_what_is_undetermined
+from snrmjax.identify.checks.instruments import notes_on_instruments
 from snrmjax.identify.checks.residual_autocorrelation import (
     along_resonance,
     residual_autocorrelation,
@@ -23,7 +23,6 @@ from snrmjax.identify.joint.force_balance import (
     PriorStd,
     Unknowns,
     balance_data,
-    level_numbers,
     recorded_motion,
     stated_level_std,
     stated_prior,
@@ -37,7 +36,7 @@ from snrmjax.identify.joint.free_unknowns import (
     padded_levels,
 )
 from snrmjax.identify.joint.notes import (
-    NoiseAndLevels,
+    NoiseEstimate,
     notes_on_autocorrelation,
     notes_on_level_errors,
     notes_on_modal_mass,
@@ -61,16 +60,6 @@ from snrmjax.numerics.result import AbstractResult, Variable
 
 _HERTZ = 2 * np.pi  # rad/s
 _MOVED = 2.0  # standard deviations of a level's error, from which on the fit says so
-
-
-class NoiseEstimate(eqx.Module):
-    """The random errors of the states and the errors that the states of a level share."""
-
-    scale: float  # by which residuals exceed the stated noise; the noise where none is stated
-    scale_std: float
-    level_std: Float[np.ndarray, " error"]  # gain, phase (rad), relative stiffness and damping
-    autocorrelation: Float[np.ndarray, " part"]  # of successive residuals, 0 if it may be chance
-    stated: bool = eqx.field(static=True)
 
 
 class JointFit(AbstractResult):
@@ -132,7 +121,7 @@ class JointFit(AbstractResult):
 
         Its 1σ, where one was stated, is then the fit's.
         """
-        share = jnp.exp(-self.problem.log_modal_mass(self.unknowns))
+        share = self.problem.constant_of(self.unknowns) / self.problem.modal_constant
         j, modes = self.modes.mode_of_interest, self.modes
         found = eqx.tree_at(
             lambda m: m.participation, modes, modes.participation.at[j].multiply(share)
@@ -238,7 +227,6 @@ class JointFit(AbstractResult):
 
 @on_one_core
 @naming_wrong_phases
-@saying_what_is_undetermined(LEVEL_ERRORS)
 def fit_jointly(
     data: SteadyStates,
     modes: LinearModes | Structure,
@@ -288,7 +276,7 @@ def fit_jointly(
             f"`data` has the sensors {list(data.sensors)}, but `modes` has {list(modes.sensors)}."
         )
     choices = parse_family(backbone), parse_family(damping)
-    measured, stated = balance_data(data, modes)
+    measured, stated, numbers = balance_data(data, modes)
     n = len(measured.level)
     if n < 3:
         raise ValueError(f"a joint fit needs at least 3 steady states, but only {n} are usable.")
@@ -308,7 +296,7 @@ def fit_jointly(
         FitStatus.CONVERGED if found.settled else FitStatus.NOT_SETTLED,
     )
     if not all(one.kind in SMOOTH and one.argument != "velocity" for one in choices):
-        wander = np.full(n, view.wandering / (1.0 if view.believed else view.noise.noise))
+        wander = np.full(n, view.wandering / (1.0 if view.believed else view.noise.scale))
         errors = np.column_stack([np.asarray(measured.std)[:, :3], wander])
         best = fit_families(
             *(unknowns, view.problem, released, view.noise, errors), believed=view.believed
@@ -318,28 +306,43 @@ def fit_jointly(
     # What levels differ by is said where the data ask for it or the fit made use of it, and stays
     # possible elsewhere.
     differ = np.array(found.differing) | _moved(best)
-    told = np.where(level_std > 0, level_std, np.where(differ, best.noise.level, 0.0))
+    told = np.where(level_std > 0, level_std, np.where(differ, best.noise.level_std, 0.0))
     fit = JointFit(
         unknowns=best.unknowns,
         covariance=best.covariance,
         problem=best.problem,
-        noise=NoiseEstimate(
-            *(best.noise.noise, best.noise.noise_std, told, autocorrelation), stated=stated
-        ),
+        noise=dataclasses.replace(best.noise, level_std=told, autocorrelation=autocorrelation),
         residuals=best.residuals,
         drive_known_only=driven,
         free=released,
         notes=(),
         status=best.status,
-        level_numbers=level_numbers(data, modes),
+        level_numbers=numbers,
     )
-    said = best.noise._replace(level=tuple(told.tolist()))
-    return dataclasses.replace(fit, notes=_notes(fit, said, 0.5 * view.wandering, level_std))
+    notes = notes_on_instruments(fit, LEVEL_ERRORS)
+    notes += _notes(fit, 0.5 * view.wandering, level_std)
+    return dataclasses.replace(fit, notes=notes)
 
 
-def _notes(
-    fit: JointFit, noise: NoiseAndLevels, wandering: float, stated: Float[np.ndarray, " error"]
-) -> tuple[str, ...]:
+def corrected_states(data: SteadyStates, fit: JointFit) -> SteadyStates:
+    """The states with the force and the phase that a joint fit found for their instruments.
+
+    Where only a drive voltage is known, the force in N is that voltage times the fitted gain.
+    """
+    unknowns = fit.unknowns
+    nominal = data.drive if fit.drive_known_only else data.force
+    offset = unknowns.force_offset * jnp.min(fit.data.force)
+    return eqx.tree_at(
+        lambda d: (d.force, d.velocity),
+        data,
+        (
+            nominal * jnp.exp(unknowns.log_force_gain) + offset,
+            data.velocity * jnp.exp(-1j * unknowns.instrument_phase),
+        ),
+    )
+
+
+def _notes(fit: JointFit, wandering: float, stated: Float[np.ndarray, " error"]) -> tuple[str, ...]:
     """All that a reader of a joint fit should know.
 
     Arguments: `wandering` 1σ of the natural frequency from state to state, relative; `stated` 1σ
@@ -349,8 +352,8 @@ def _notes(
     if not fit.converged:
         notes = (f"the fit has {FIT_MESSAGE[fit.status]}; try a simpler family.",)
     level, n_levels = np.asarray(fit.data.level), fit.data.n_levels
-    notes += notes_on_noise(noise, wandering, stated, n_levels, stated=fit.noise.stated)
-    if np.any((stated == 0) & (np.array(noise.level) > 0)):
+    notes += notes_on_noise(fit.noise, wandering, stated, n_levels)
+    if np.any((stated == 0) & (fit.noise.level_std > 0)):
         shifts = np.asarray(fit.unknowns.level) * np.asarray(fit.prior.level)
         force = [np.median(np.asarray(fit.data.force)[level == k]) for k in range(n_levels)]
         of_force = bool(fit.prior.gain_of_force > 0)

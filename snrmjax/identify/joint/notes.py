@@ -1,8 +1,8 @@
 """What a joint fit says in words of its data: families, noise, levels, and where the states lie."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 from scipy.special import chdtri, ndtri
@@ -30,31 +30,29 @@ _COMMON = {
 """What an error that all levels share may be."""
 
 
-class NoiseAndLevels(NamedTuple):
-    """1σ of the noise and of the errors that the states of a level share."""
+class NoiseEstimate(eqx.Module):
+    """The random errors of the states and the errors that the states of a level share."""
 
-    noise: float  # by which the residuals exceed the stated noise
-    noise_std: float
-    level: tuple[float, ...]  # of every kind of error that a level shares, stated or found
-
-    @property
-    def contradicts_upward(self) -> bool:
-        """Whether the residuals are too large for the stated noise."""
-        return self.noise - 3 * self.noise_std > 1
+    scale: float  # by which residuals exceed the stated noise; the noise where none is stated
+    scale_std: float
+    level_std: Float[np.ndarray, " error"]  # of `LEVEL_ERRORS`, stated or found
+    stated: bool = eqx.field(static=True)
+    # Of successive residuals, 0 if it may be chance.
+    autocorrelation: Float[np.ndarray, " part"] = eqx.field(default_factory=lambda: np.zeros(2))
 
     @property
-    def contradicts_downward(self) -> bool:
+    def exceeded(self) -> bool:
+        """Whether the residuals are too large for a stated noise."""
+        return self.stated and self.scale - 3 * self.scale_std > 1
+
+    @property
+    def overstated(self) -> bool:
         """Whether they are too small for it."""
-        return self.noise + 3 * self.noise_std < 1
+        return self.stated and self.scale + 3 * self.scale_std < 1
 
 
 def notes_on_noise(
-    components: NoiseAndLevels,
-    wandering: float,
-    given: Float[np.ndarray, " error"],
-    n_levels: int,
-    *,
-    stated: bool,
+    noise: NoiseEstimate, wandering: float, given: Float[np.ndarray, " error"], n_levels: int
 ) -> tuple[str, ...]:
     """Where the noise and the level-to-level variance are not as stated.
 
@@ -62,21 +60,21 @@ def notes_on_noise(
     stated 1σ of levels' errors.
     """
     notes = []
-    size = f"{components.noise:.2g} ± {components.noise_std:.1g}"
-    if stated and components.contradicts_upward:
+    size = f"{noise.scale:.2g} ± {noise.scale_std:.1g}"
+    if noise.exceeded:
         notes.append(
             f"the fit misses the data by {size} times the stated noise: either that noise is too "
-            f"small or the model is wrong; the bands are {components.noise:.2g} times wider for it."
+            f"small or the model is wrong; the bands are {noise.scale:.2g} times wider for it."
         )
-    if stated and components.contradicts_downward:
+    if noise.overstated:
         notes.append(
             f"states scatter about the curves by only {size} times the stated noise, errors of "
             "whole levels apart: it is overstated."
         )
-    found_only = np.where(given > 0, 0.0, components.level)
+    found_only = np.where(given > 0, 0.0, noise.level_std)
     if wandering > 0:
         more = "which the stated noise does not explain"
-        if not stated:
+        if not noise.stated:
             more = "more than random noise of force and velocity explains (no noise is stated)"
         notes.append(
             f"the natural frequency varies by {100 * wandering:.2g} % from state to state (1σ), "
@@ -86,7 +84,7 @@ def notes_on_noise(
     if shared:
         notes.append(
             f"levels differ from one another by {shared} (1σ, estimated)"
-            + (", which no stated error explains" if stated or np.any(given > 0) else "")
+            + (", which no stated error explains" if noise.stated or np.any(given > 0) else "")
             + "; the bands include this level-to-level variance."
         )
     if n_levels == 1:

@@ -4,15 +4,14 @@ import dataclasses
 import functools
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Complex, Float
 from scipy.optimize import minimize
 
-from snrmjax.identify.curves.families import ARGUMENTS, FAMILIES, Choice, values_and_slopes
+from snrmjax.identify.curves.families import ARGUMENTS, FAMILIES, Choice
 from snrmjax.identify.curves.family_base import AbstractFamily, Argument
-from snrmjax.identify.curves.splines import SmoothingSpline, bends_of
+from snrmjax.identify.curves.splines import SmoothingSpline
 from snrmjax.identify.joint.force_balance import (
     STATE_ERRORS,
     BalanceProblem,
@@ -20,7 +19,7 @@ from snrmjax.identify.joint.force_balance import (
     velocity_of_others,
     with_deviations,
 )
-from snrmjax.identify.joint.notes import NoiseAndLevels
+from snrmjax.identify.joint.notes import NoiseEstimate
 from snrmjax.identify.test_model.curve_basis import MOST_KNOTS
 from snrmjax.identify.test_model.hyper import MASS, OFFSET, PHASE
 from snrmjax.identify.test_model.posterior import TestPosterior, few_levels_factor, fit_test
@@ -46,9 +45,13 @@ class View(NamedTuple):
     problem: BalanceProblem  # with the noise, levels and corrections that the posterior has
     gain: complex  # of the force, and phase of the velocity, as guessed beforehand
     free: tuple[str, ...]
-    noise: NoiseAndLevels
+    noise: NoiseEstimate
     wandering: float  # 1σ of relative stiffness from state to state
-    believed: bool  # whether the noise is stated, and not contradicted by the states
+
+    @property
+    def believed(self) -> bool:
+        """Whether the noise is stated, and not contradicted by the states."""
+        return self.noise.stated and not self.noise.exceeded
 
 
 def view_of(
@@ -82,23 +85,22 @@ def view_of(
         problem = dataclasses.replace(problem, prior=known)
         states = states._replace(mass_std=0.0)
         found = fit(states, compare_levels=False, rounds=rounds._replace(start=found))
-    wandering = wandering_stiffness(found)
+    wandering = _wandering_stiffness(found)
     if wandering > 0:
         own = np.full(len(states.level), wandering / found.hyper.noise)
         states = states._replace(errors=np.column_stack([states.errors, own]))
     found = fit(states, over_sizes=True, rounds=rounds._replace(start=found))
     if "force_gain" in free:
         found = _with_common_gain_in_the_force(found)
-    noise = noise_and_levels(found)
+    noise = _noise_of(found, stated)
     # What a stated noise lets the posterior have may be less than the states show.
-    believed = stated and not noise.contradicts_upward
-    wider = max(noise.noise / found.hyper.noise, 1.0) if stated and not believed else 1.0
+    wider = max(noise.scale / found.hyper.noise, 1.0) if noise.exceeded else 1.0
     size = wider * found.hyper.noise / np.sqrt(found.share)
     errors = np.zeros((len(states.level), len(STATE_ERRORS)))
     corrections = np.zeros_like(errors)
     n_inputs = found.corrections.shape[1]
     errors[:, :n_inputs], corrections[:, :n_inputs] = size * found.states.errors, found.corrections
-    unstated = few_levels_factor(found.states.n_levels) * np.array(noise.level)
+    unstated = few_levels_factor(found.states.n_levels) * noise.level_std
     level = np.where(np.asarray(problem.prior.level) > 0, problem.prior.level, unstated)
     problem = dataclasses.replace(
         problem.with_data(
@@ -109,7 +111,7 @@ def view_of(
         prior=dataclasses.replace(problem.prior, level=jax.device_put(level)),
     )
     found = found._replace(covariance=wider**2 * found.covariance)
-    return View(found, problem, guess, free, noise, wandering, believed)
+    return View(found, problem, guess, free, noise, wandering)
 
 
 def _with_common_gain_in_the_force(found: TestPosterior) -> TestPosterior:
@@ -229,15 +231,16 @@ def viewed_covariance(view: View) -> Float[np.ndarray, "unknown unknown"]:
     return covariance
 
 
-def noise_and_levels(found: TestPosterior) -> NoiseAndLevels:
+def _noise_of(found: TestPosterior, stated: bool) -> NoiseEstimate:
     """The noise as the residuals have it, and 1σ of what levels share as the posterior has them."""
     rows = found.residuals.size
     left = max(rows - found.effective_unknowns, LEAST_LEFT * rows)
     noise = found.hyper.noise * float(np.sqrt(np.sum(found.residuals**2) / left))
-    return NoiseAndLevels(noise, noise / np.sqrt(2 * found.share * left), found.hyper.level_std)
+    std = noise / np.sqrt(2 * found.share * left)
+    return NoiseEstimate(noise, std, np.array(found.hyper.level_std), stated)
 
 
-def wandering_stiffness(found: TestPosterior) -> float:
+def _wandering_stiffness(found: TestPosterior) -> float:
     """1σ of relative stiffness from state to state, zero unless the residuals ask for it.
 
     Errors of force and phase move the balance alike along a response; a natural frequency that
@@ -269,7 +272,7 @@ def _curve(found: TestPosterior, choice: Choice, which: int) -> AbstractFamily:
     values = (curves.squared_frequency, curves.modal_damping)[which]
     std = np.sqrt(curves.covariance[:, which, which])
     family, n = FAMILIES[choice.kind], len(x)
-    sizes = family.sizes(n, found.states.n_levels) if choice.size is None else (choice.size,)
+    sizes = family.orders if choice.size is None else (choice.size,)
     tried: list[tuple[float, int, AbstractFamily]] = []
     for size in sizes:
         for argument in (choice.argument,) if choice.argument else ARGUMENTS:
@@ -280,7 +283,7 @@ def _curve(found: TestPosterior, choice: Choice, which: int) -> AbstractFamily:
                         f"{choice.kind}:{size} has {one.parameters.shape[0]} parameters, but "
                         f"there are {n} states only: choose a smaller family."
                     )
-                off = np.sqrt(np.mean(((values_and_slopes(one, at)[0] - values) / std) ** 2))
+                off = np.sqrt(np.mean(((one.values_and_slopes(at)[0] - values) / std) ** 2))
                 tried.append((float(off), one.parameters.shape[0], one))
     # The simplest that lies in the band of the smooth curve, or else the nearest to it.
     inside = [row for row in tried if row[0] < 1.0]
@@ -299,14 +302,9 @@ def _smooth(found: TestPosterior, argument: Argument, which: int) -> SmoothingSp
     if argument == "velocity":
         speed = displacement * np.sqrt(curves.squared_frequency)
         knots, scale = (speed / speed[-1]) ** 2, float(speed[-1])
-    blank = SmoothingSpline.through(knots, values, jax.device_put(scale), argument)
     size = found.units[which] * found.hyper.bends[which] / found.modal_mass[0]
     std = size * np.exp(basis.directions @ found.hyper.along)
-    return eqx.tree_at(
-        lambda one: (one.bends, one.bend_std),
-        blank,
-        (jax.device_put(bends_of(knots)), jax.device_put(std)),
-    )
+    return SmoothingSpline.through(knots, values, jax.device_put(scale), argument, std)
 
 
 def _complex_gain(problem: BalanceProblem) -> complex:

@@ -6,13 +6,13 @@ Reference: Juang & Pappa, J. Guid. Control Dyn. 8 (1985) 620, doi:10.2514/3.2003
 """
 
 from collections.abc import Sequence
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float
 from scipy.signal import decimate
 
+from snrmjax.identify.modal.modal_fit import AbstractModalFit, phase_collinearity
 from snrmjax.identify.modal.pole_orders import PoleOrders, clusters, gathered
 from snrmjax.identify.modal.separable_fit import (
     ChannelRows,
@@ -22,8 +22,7 @@ from snrmjax.identify.modal.separable_fit import (
 )
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.time_recording import TimeRecording
-from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
-from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.result import Variable
 
 _HERTZ = 2 * np.pi
 _MOTIONS = ("displacement", "velocity", "acceleration")
@@ -45,74 +44,28 @@ class DecayCurves(NamedTuple):
     fitted: Float[np.ndarray, "channel sample"]
 
 
-class DecayModes(AbstractResult):
+class DecayModes(AbstractModalFit):
     """Linear modes from free decays; see `fit_free_decay`.
 
     `amplitude` is the complex amplitude at the first sample used, in the unit of its channel, of
     the first decay; shapes are its ratios.
     """
 
-    coordinates: ClassVar[tuple[str, ...]] = ("mode", "sensor")
-
-    natural_frequency: Float[np.ndarray, " mode"]  # rad/s
-    damping_ratio: Float[np.ndarray, " mode"]
-    covariance: Float[np.ndarray, "mode 2 2"]  # of both
     shape: Float[np.ndarray, "sensor mode"]  # one at the largest sensor
     shape_std: Float[np.ndarray, "sensor mode"]
     amplitude: Complex[np.ndarray, "sensor mode"]
-    collinearity: Float[np.ndarray, " mode"]  # modal phase collinearity; NaN: one sensor
     curves: DecayCurves
-    orders: PoleOrders
-    sensors: tuple[Channel, ...] = eqx.field(static=True)
-    status: MinimisationStatus = eqx.field(static=True)
-    notes: tuple[str, ...] = eqx.field(static=True, default=())
 
-    @property
-    def n_modes(self) -> int:
-        """Number of modes."""
-        return len(self.natural_frequency)
-
-    @property
-    def natural_frequency_std(self) -> Float[np.ndarray, " mode"]:
-        """1σ, rad/s."""
-        return np.sqrt(self.covariance[:, 0, 0])
-
-    @property
-    def damping_ratio_std(self) -> Float[np.ndarray, " mode"]:
-        """1σ."""
-        return np.sqrt(self.covariance[:, 1, 1])
-
-    @property
-    def sensor_names(self) -> tuple[str, ...]:
-        """Names of the channels."""
-        return tuple(one.name for one in self.sensors)
-
-    def summary(self) -> tuple[str, ...]:
-        """See `AbstractResult`; 95 % bands."""
-        return (
-            f"DecayModes: {self.n_modes} modes at {', '.join(self.sensor_names)} from "
-            f"{self.curves.time[-1] - self.curves.time[0]:.4g} s, {self.status.value}",
-            *(
-                f"mode {k + 1}: {self.natural_frequency[k] / _HERTZ:.7g} ± "
-                f"{1.96 * self.natural_frequency_std[k] / _HERTZ:.2g} Hz, damping "
-                f"{100 * self.damping_ratio[k]:.4g} ± {196 * self.damping_ratio_std[k]:.2g} %"
-                for k in range(self.n_modes)
-            ),
-            *(f"note: {note}" for note in self.notes),
-        )
+    def source_in_words(self) -> str:
+        """See `AbstractModalFit`."""
+        duration = self.curves.time[-1] - self.curves.time[0]
+        return f"at {', '.join(self.sensor_names)} from {duration:.4g} s"
 
     def variables(self) -> dict[str, Variable]:
         """See `AbstractResult`."""
-        mode, both = ("mode",), ("sensor", "mode")
-        omega, std = self.natural_frequency / _HERTZ, self.natural_frequency_std / _HERTZ
+        both = ("sensor", "mode")
         return {
-            "mode": Variable(mode, np.arange(1, self.n_modes + 1), "1", "mode"),
-            "sensor": Variable(("sensor",), np.array(self.sensor_names), "", "sensor"),
-            "natural_frequency_hz": Variable(mode, omega, "Hz", "natural frequency"),
-            "natural_frequency_std_hz": Variable(mode, std, "Hz", "its 1σ"),
-            "damping_ratio": Variable(mode, self.damping_ratio, "1", "damping ratio"),
-            "damping_ratio_std": Variable(mode, self.damping_ratio_std, "1", "its 1σ"),
-            "phase_collinearity": Variable(mode, self.collinearity, "1", "collinearity"),
+            **super().variables(),
             "shape": Variable(both, self.shape, "1", "shape, one at its largest sensor"),
             "shape_std": Variable(both, self.shape_std, "1", "its 1σ"),
         }
@@ -258,7 +211,8 @@ def _start(
                 f"are {', '.join(f'{one / _HERTZ:.6g}' for one in wanted) or 'none'}."
             )
         return np.array([damped[np.argmin(np.abs(np.abs(damped) - one))] for one in wanted])
-    found = clusters(orders, (0.0, top)).damped.pole
+    found = clusters(orders, (0.0, top))
+    found = found[found.real < 0]
     if not found.size:
         raise ValueError(
             "no pole is stable over the model orders of the decay: choose the part that decays, "
@@ -309,10 +263,7 @@ def _fitted(
             free = values.shape[1] - 2 * n - 1 - 2 * n / len(values)
             rms = np.sqrt(np.sum(fit.residuals**2, axis=1) / max(free, 1.0))
             scale = scale * np.maximum(rms, 1e-9 * max(float(rms.max()), 1e-300))
-        size = float(np.mean(rms**2))
-        fit = fit._replace(
-            covariance=fit.covariance * size, own=fit.own * size, mixed=fit.mixed * size
-        )
+        fit = fit.with_variance(float(np.mean(rms**2)))
         amplitude = fit.coefficients[:, :n] + 1j * fit.coefficients[:, n : 2 * n]
         variance = np.stack(
             [
@@ -352,11 +303,7 @@ def _result(
     ratio = amplitude / largest
     shape_std = np.hypot(spread, np.abs(ratio) * spread[top, np.arange(n)]) / np.abs(largest)
     shape_std[top, np.arange(n)] = 0.0
-    a, b = ratio.real, ratio.imag
-    xx, yy, xy = np.sum(a * a, axis=0), np.sum(b * b, axis=0), np.sum(a * b, axis=0)
-    collinearity = ((xx - yy) ** 2 + 4 * xy**2) / (xx + yy) ** 2
-    if own < 2:
-        collinearity = np.full(n, np.nan)
+    collinearity, _ = phase_collinearity(ratio)
     notes = [
         f"mode {k + 1} is complex: modal phase collinearity {value:.2f}"
         for k, value in enumerate(collinearity)
@@ -370,16 +317,16 @@ def _result(
             "that is not linear): errors are widened for it"
         )
     return DecayModes(
-        unknowns[:n][rank],
-        unknowns[n:][rank],
-        covariance,
-        ratio.real,
-        shape_std,
-        amplitude,
-        collinearity,
-        DecayCurves(time, values[:own], fitted[:own]),
-        orders,
-        channels,
-        fit.status,
-        tuple(notes),
+        natural_frequency=unknowns[:n][rank],
+        damping_ratio=unknowns[n:][rank],
+        mode_covariance=covariance,
+        collinearity=collinearity,
+        orders=orders,
+        sensors=channels,
+        status=fit.status,
+        notes=tuple(notes),
+        shape=ratio.real,
+        shape_std=shape_std,
+        amplitude=amplitude,
+        curves=DecayCurves(time, values[:own], fitted[:own]),
     )

@@ -1,5 +1,6 @@
 """Linear modes from frequency responses over one reference, with their errors."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Literal, NamedTuple, get_args
 
@@ -18,13 +19,9 @@ from snrmjax.identify.modal.modal_notes import (
     fit_notes,
     lines_in_half_power,
 )
-from snrmjax.identify.modal.noise_model import (
-    coherence_of,
-    fitted_coherence_std,
-    std_from_residuals,
-)
+from snrmjax.identify.modal.noise_model import std_from_residuals
 from snrmjax.identify.modal.pole_orders import PoleOrders, clusters, poles_of_responses
-from snrmjax.identify.modal.response_data import ResponseData, response_data
+from snrmjax.identify.modal.response_data import ResponseData, coherence_std, response_data
 from snrmjax.identify.modal.separable_fit import (
     ChannelRows,
     SeparableFit,
@@ -190,15 +187,14 @@ def _start(
         if not mine.size:
             raise ValueError(f"model order {order} has no lightly damped pole in the band.")
         return mine[np.argsort(np.abs(mine))]
-    every = clusters(orders, band)
-    found = every.damped.pole
-    if found.size:
-        return found
+    found = clusters(orders, band)
+    damped, growing = found[found.real < 0], found[found.real > 0]
+    if damped.size:
+        return damped
     where = f"between {band[0] / _HERTZ:.6g} and {band[1] / _HERTZ:.6g} Hz"
-    if every.growing.pole.size:
+    if growing.size:
         listed = ", ".join(
-            f"{100 * -p.real / abs(p):.3g} % at {abs(p) / _HERTZ:.6g} Hz"
-            for p in every.growing.pole[:3]
+            f"{100 * -p.real / abs(p):.3g} % at {abs(p) / _HERTZ:.6g} Hz" for p in growing[:3]
         )
         raise ValueError(
             f"all modes {where} have negative damping ({listed}): the responses seem to be "
@@ -287,8 +283,7 @@ def _weighted(
 ) -> tuple[SeparableFit, _Spread]:
     good = np.isfinite(data.receptance)
     values = real_and_imaginary(_filled(data))
-    powers = tuple(dict.fromkeys(data.powers)) if settings.window_time is not None else (0,)
-    groups = np.array([powers.index(p) if len(powers) > 1 else 0 for p in data.powers])
+    powers, groups = data.bases(windowed=settings.window_time is not None)
     n = (len(unknowns) - settings.phase) // 2
     low = np.concatenate([np.full(n, 0.5 * data.omega[0]), np.full(n, -_MOST_DAMPED)])
     high = np.concatenate([np.full(n, 2 * data.omega[-1]), np.full(n, _MOST_DAMPED)])
@@ -298,7 +293,7 @@ def _weighted(
     def basis_at(point: np.ndarray) -> list[TermColumns]:
         return receptance_bases(data.omega, point, settings, powers)
 
-    coherence = coherence_of(data) if data.source == "coherence" else None
+    coherence = data.coherence if data.source == "coherence" else None
     scale = np.ones(len(values))
     for turn in range(rounds):
         weights = np.where(good, 1 / (std * scale[:, None]), 0.0)
@@ -314,14 +309,15 @@ def _weighted(
         if data.source == "residuals":
             std, scale = std_from_residuals(data, residuals, fitted), np.ones(len(values))
         elif coherence is not None:
-            std = fitted_coherence_std(data, coherence, fitted)
+            # Weights that use the measured size prefer lines that are too small by chance.
+            std = coherence_std(np.abs(fitted), coherence, data.averages)
         # The size of each channel's errors is what its residuals show.
         rms = _rms(residuals / std, fit, good)
         scale = np.maximum(rms, 1e-12 * rms.max()) if rms.max() > 0 else np.ones(len(rms))
     misfit = _rms(residuals / std, fit, good)
-    return _scaled(fit, _rms(residuals / (std * scale[:, None]), fit, good)), _Spread(
-        std * scale[:, None], misfit
-    )
+    # Covariances for the mean size that the last residuals have, close to one.
+    last = _rms(residuals / (std * scale[:, None]), fit, good)
+    return fit.with_variance(float(np.mean(last**2))), _Spread(std * scale[:, None], misfit)
 
 
 def _rms(residuals: np.ndarray, fit: SeparableFit, good: np.ndarray) -> np.ndarray:
@@ -329,14 +325,6 @@ def _rms(residuals: np.ndarray, fit: SeparableFit, good: np.ndarray) -> np.ndarr
     shared = len(fit.unknowns) / len(residuals)
     free = np.maximum(2 * good.sum(axis=1) - fit.coefficients.shape[1] - shared, 1.0)
     return np.sqrt(np.nansum(np.abs(residuals) ** 2, axis=1) / free)
-
-
-def _scaled(fit: SeparableFit, rms: np.ndarray) -> SeparableFit:
-    """Covariances for the mean size that the last residuals have, close to one."""
-    size = float(np.mean(rms**2))
-    return fit._replace(
-        covariance=fit.covariance * size, own=fit.own * size, mixed=fit.mixed * size
-    )
 
 
 def _least_certain(fit: SeparableFit, settings: BasisSettings, data: ResponseData) -> int | None:
@@ -398,35 +386,40 @@ def _result(
     for place, k in enumerate(terms):
         residual[k] = fit.coefficients[:, n + place]
         residual_std[k] = np.sqrt(np.diag(fit.term_covariance(n + place)))
-    powers = tuple(dict.fromkeys(data.powers)) if settings.window_time is not None else (0,)
+    powers, groups = data.bases(windowed=settings.window_time is not None)
     bases = receptance_bases(data.omega, fit.unknowns, settings, powers)
     lines = len(data.omega)
-    columns = np.stack(
-        [bases[powers.index(p) if len(powers) > 1 else 0].columns for p in data.powers]
-    )
+    columns = np.stack([bases[group].columns for group in groups])
     fitted = np.einsum("srt,st->sr", columns, fit.coefficients)
     curves = ResponseCurves(
         data.omega, data.receptance, fitted[:, :lines] + 1j * fitted[:, lines:], spread.std
     )
-    found = LinearModalFit(
-        natural[rank],
-        ratio[rank],
-        fit.coefficients[:, rank],
-        covariance,
-        residual[0],
-        residual_std[0],
-        residual[1],
-        residual_std[1],
-        angle,
-        float(np.sqrt(fit.covariance[-1, -1])) if settings.phase else 0.0,
-        *complex_residues(data, settings, fit, spread.std, rank),
-        lines_in_half_power(data.omega, natural[rank], ratio[rank]),
-        spread.misfit if data.source != "residuals" else np.full(sensors, np.nan),
-        curves,
-        orders,
-        data.channels,
-        data.reference,
-        data.source,
-        fit.status,
+    collinearity, mean_phase, mean_phase_std = complex_residues(
+        data, settings, fit, spread.std, rank
     )
-    return found.with_notes((*data.notes, *fit_notes(found, data, settings, fit, rank)))
+    found = LinearModalFit(
+        natural_frequency=natural[rank],
+        damping_ratio=ratio[rank],
+        mode_covariance=covariance,
+        collinearity=collinearity,
+        orders=orders,
+        sensors=data.channels,
+        status=fit.status,
+        notes=(),
+        residue=fit.coefficients[:, rank],
+        lower=residual[0],
+        lower_std=residual_std[0],
+        upper=residual[1],
+        upper_std=residual_std[1],
+        phase=angle,
+        phase_std=float(np.sqrt(fit.covariance[-1, -1])) if settings.phase else 0.0,
+        mean_phase=mean_phase,
+        mean_phase_std=mean_phase_std,
+        lines_in_band=lines_in_half_power(data.omega, natural[rank], ratio[rank]),
+        misfit=spread.misfit if data.source != "residuals" else np.full(sensors, np.nan),
+        curves=curves,
+        reference=data.reference,
+        source=data.source,
+    )
+    notes = (*data.notes, *fit_notes(found, data, settings, fit, rank))
+    return dataclasses.replace(found, notes=notes)

@@ -1,6 +1,6 @@
 """What a fit of linear modes found: poles, residues and residual terms with their errors."""
 
-import dataclasses
+from abc import abstractmethod
 from typing import ClassVar, NamedTuple
 
 import equinox as eqx
@@ -26,38 +26,22 @@ class ResponseCurves(NamedTuple):
     std: Float[np.ndarray, "sensor line"]  # 1σ of real and of imaginary part that weighted them
 
 
-class LinearModalFit(AbstractResult):
-    """Linear modes from frequency responses over one reference; see `fit_linear_modes`.
+class AbstractModalFit(AbstractResult):
+    """Linear modes by frequency as a fit found them, with their errors.
 
-    H = e^{iψ} [Σ residue/(ω² − Ω² + 2iζωΩ) + lower/Ω² + upper] is a displacement over the
-    reference. Over a force in N a residue is φ_sensor φ_driven in 1/kg. `mode_covariance` is that
-    of natural frequency (rad/s), damping ratio and all residues of one mode.
+    `mode_covariance` of a mode begins with natural frequency (rad/s) and damping ratio.
     """
 
     coordinates: ClassVar[tuple[str, ...]] = ("mode", "sensor")
 
     natural_frequency: Float[np.ndarray, " mode"]  # rad/s
     damping_ratio: Float[np.ndarray, " mode"]
-    residue: Float[np.ndarray, "sensor mode"]  # displacement over reference, times s^-2
     mode_covariance: Float[np.ndarray, "mode entry entry"]
-    lower: Float[np.ndarray, " sensor"]  # of 1/Ω²; 0 where it was not fitted
-    lower_std: Float[np.ndarray, " sensor"]
-    upper: Float[np.ndarray, " sensor"]  # constant
-    upper_std: Float[np.ndarray, " sensor"]
-    phase: float  # rad, ψ of the instrument; 0 where it was not fitted
-    phase_std: float
     collinearity: Float[np.ndarray, " mode"]  # modal phase collinearity, 1 = real; NaN: one sensor
-    mean_phase: Float[np.ndarray, " mode"]  # rad, of complex residues, away from real
-    mean_phase_std: Float[np.ndarray, " mode"]
-    lines_in_band: Float[np.ndarray, " mode"]  # spectral lines in the half-power band
-    misfit: Float[np.ndarray, " sensor"]  # rms residual over stated 1σ; NaN where none is stated
-    curves: ResponseCurves
-    orders: PoleOrders | None
+    orders: PoleOrders
     sensors: tuple[Channel, ...] = eqx.field(static=True)
-    reference: Channel = eqx.field(static=True)
-    source: ErrorSource = eqx.field(static=True)
     status: MinimisationStatus = eqx.field(static=True)
-    notes: tuple[str, ...] = eqx.field(static=True, default=())
+    notes: tuple[str, ...] = eqx.field(static=True)
 
     @property
     def n_modes(self) -> int:
@@ -79,22 +63,9 @@ class LinearModalFit(AbstractResult):
         """1σ."""
         return np.sqrt(self.mode_covariance[:, 1, 1])
 
-    @property
-    def residue_std(self) -> Float[np.ndarray, "sensor mode"]:
-        """1σ of the residues."""
-        return np.sqrt(np.diagonal(self.mode_covariance, axis1=1, axis2=2)[:, 2:]).T
-
-    def with_notes(self, notes: tuple[str, ...]) -> "LinearModalFit":
-        """The same with other notes."""
-        return dataclasses.replace(self, notes=notes)
-
-    def sensor_number(self, name: str) -> int:
-        """Where a sensor stands. Raises `ValueError` that lists those there are."""
-        if name not in self.sensor_names:
-            raise ValueError(
-                f"there is no sensor {name!r}; there are {', '.join(self.sensor_names)}."
-            )
-        return self.sensor_names.index(name)
+    @abstractmethod
+    def source_in_words(self) -> str:
+        """What the modes are from."""
 
     def summary(self) -> tuple[str, ...]:
         """See `AbstractResult`; 95 % bands."""
@@ -105,10 +76,9 @@ class LinearModalFit(AbstractResult):
             _WIDE * 100 * self.damping_ratio_std,
             strict=True,
         )
-        omega = self.curves.omega / _HERTZ
         return (
-            f"LinearModalFit: {self.n_modes} modes at {len(self.sensors)} sensors over "
-            f"{self.reference.name}, {omega[0]:.6g} to {omega[-1]:.6g} Hz, {self.status.value}",
+            f"{type(self).__name__}: {self.n_modes} modes {self.source_in_words()}, "
+            f"{self.status.value}",
             *(
                 f"mode {k + 1}: {f:.7g} ± {df:.2g} Hz, damping {z:.4g} ± {dz:.2g} %"
                 for k, (f, df, z, dz) in enumerate(rows)
@@ -118,28 +88,95 @@ class LinearModalFit(AbstractResult):
 
     def variables(self) -> dict[str, Variable]:
         """See `AbstractResult`."""
-        mode, both = ("mode",), ("sensor", "mode")
-        unit = "1/kg" if self.reference.quantity == "force" else "SI"
         columns = {
             "natural_frequency_hz": (self.natural_frequency / _HERTZ, "Hz", "natural frequency"),
             "natural_frequency_std_hz": (self.natural_frequency_std / _HERTZ, "Hz", "its 1σ"),
             "damping_ratio": (self.damping_ratio, "1", "damping ratio"),
             "damping_ratio_std": (self.damping_ratio_std, "1", "its 1σ"),
             "phase_collinearity": (self.collinearity, "1", "modal phase collinearity"),
-            "mean_phase_deg": (np.degrees(self.mean_phase), "deg", "phase of complex residues"),
-            "lines_in_half_power_band": (self.lines_in_band, "1", "lines in the half-power band"),
         }
         return {
-            "mode": Variable(mode, np.arange(1, self.n_modes + 1), "1", "mode"),
+            "mode": Variable(("mode",), np.arange(1, self.n_modes + 1), "1", "mode"),
             "sensor": Variable(("sensor",), np.array(self.sensor_names), "", "sensor"),
-            **{name: Variable(mode, *rest) for name, rest in columns.items()},
+            **{name: Variable(("mode",), *rest) for name, rest in columns.items()},
+        }
+
+
+def phase_collinearity(
+    shape: Complex[np.ndarray, "sensor mode"],
+) -> tuple[Float[np.ndarray, " mode"], Float[np.ndarray, " mode"]]:
+    """Modal phase collinearity, NaN for one sensor, and the mean phase (rad) away from real.
+
+    Reference: Pappa, Elliott & Schenk, J. Guid. Control Dyn. 16 (1993) 860, doi:10.2514/3.21092.
+    """
+    a, b = shape.real, shape.imag
+    xx, yy, xy = np.sum(a * a, axis=0), np.sum(b * b, axis=0), np.sum(a * b, axis=0)
+    found = ((xx - yy) ** 2 + 4 * xy**2) / np.maximum(xx + yy, 1e-300) ** 2
+    angle = 0.5 * np.arctan2(2 * xy, xx - yy)
+    return found if len(shape) > 1 else np.full(shape.shape[1], np.nan), angle
+
+
+class LinearModalFit(AbstractModalFit):
+    """Linear modes from frequency responses over one reference; see `fit_linear_modes`.
+
+    H = e^{iψ} [Σ residue/(ω² − Ω² + 2iζωΩ) + lower/Ω² + upper] is a displacement over the
+    reference. Over a force in N a residue is φ_sensor φ_driven in 1/kg. `mode_covariance` goes on
+    with the residues of all sensors.
+    """
+
+    residue: Float[np.ndarray, "sensor mode"]  # displacement over reference, times s^-2
+    lower: Float[np.ndarray, " sensor"]  # of 1/Ω²; 0 where it was not fitted
+    lower_std: Float[np.ndarray, " sensor"]
+    upper: Float[np.ndarray, " sensor"]  # constant
+    upper_std: Float[np.ndarray, " sensor"]
+    phase: float  # rad, ψ of the instrument; 0 where it was not fitted
+    phase_std: float
+    mean_phase: Float[np.ndarray, " mode"]  # rad, of complex residues, away from real
+    mean_phase_std: Float[np.ndarray, " mode"]
+    lines_in_band: Float[np.ndarray, " mode"]  # spectral lines in the half-power band
+    misfit: Float[np.ndarray, " sensor"]  # rms residual over stated 1σ; NaN where none is stated
+    curves: ResponseCurves
+    reference: Channel = eqx.field(static=True)
+    source: ErrorSource = eqx.field(static=True)
+
+    @property
+    def residue_std(self) -> Float[np.ndarray, "sensor mode"]:
+        """1σ of the residues."""
+        return np.sqrt(np.diagonal(self.mode_covariance, axis1=1, axis2=2)[:, 2:]).T
+
+    def sensor_number(self, name: str) -> int:
+        """Where a sensor stands. Raises `ValueError` that lists those there are."""
+        if name not in self.sensor_names:
+            raise ValueError(
+                f"there is no sensor {name!r}; there are {', '.join(self.sensor_names)}."
+            )
+        return self.sensor_names.index(name)
+
+    def source_in_words(self) -> str:
+        """See `AbstractModalFit`."""
+        omega = self.curves.omega / _HERTZ
+        return (
+            f"at {len(self.sensors)} sensors over {self.reference.name}, {omega[0]:.6g} to "
+            f"{omega[-1]:.6g} Hz"
+        )
+
+    def variables(self) -> dict[str, Variable]:
+        """See `AbstractResult`."""
+        mode, both, sensor = ("mode",), ("sensor", "mode"), ("sensor",)
+        unit, phase = "1/kg" if self.reference.quantity == "force" else "SI", self.mean_phase
+        return {
+            **super().variables(),
+            "mean_phase_deg": Variable(mode, np.degrees(phase), "deg", "phase of complex residues"),
+            "lines_in_half_power_band": Variable(
+                mode, self.lines_in_band, "1", "lines in the half-power band"
+            ),
             "residue": Variable(both, self.residue, unit, "residue of the receptance"),
             "residue_std": Variable(both, self.residue_std, unit, "its 1σ"),
-            "lower_residual": Variable(("sensor",), self.lower, unit, "coefficient of 1/Ω²"),
-            "lower_residual_std": Variable(("sensor",), self.lower_std, unit, "its 1σ"),
-            "upper_residual": Variable(("sensor",), self.upper, "SI", "constant receptance"),
-            "upper_residual_std": Variable(("sensor",), self.upper_std, "SI", "its 1σ"),
-            "misfit": Variable(("sensor",), self.misfit, "1", "rms residual over stated 1σ"),
+            "lower_residual": Variable(sensor, self.lower, unit, "coefficient of 1/Ω²"),
+            "lower_residual_std": Variable(sensor, self.lower_std, unit, "its 1σ"),
+            "upper_residual": Variable(sensor, self.upper, "SI", "constant receptance"),
+            "upper_residual_std": Variable(sensor, self.upper_std, "SI", "its 1σ"),
+            "misfit": Variable(sensor, self.misfit, "1", "rms residual over stated 1σ"),
         }
 
     def attributes(self) -> dict[str, str | float | int]:

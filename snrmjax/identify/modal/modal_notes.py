@@ -1,7 +1,5 @@
 """What a reader of a modal fit must know: complex modes, leakage, misfit, doubtful residuals."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -11,11 +9,9 @@ from snrmjax.identify.modal.modal_bases import (
     receptance_bases,
     unpacked,
 )
+from snrmjax.identify.modal.modal_fit import LinearModalFit, phase_collinearity
 from snrmjax.identify.modal.response_data import ResponseData
 from snrmjax.identify.modal.separable_fit import ChannelRows, SeparableFit, fit_separable
-
-if TYPE_CHECKING:
-    from snrmjax.identify.modal.modal_fit import LinearModalFit
 
 _HERTZ = 2 * np.pi
 _FEW_LINES = 8.0  # in the half-power band, below which leakage may count
@@ -36,7 +32,6 @@ def complex_residues(
     """Modal phase collinearity, mean phase (rad) away from real and its 1σ, of every mode.
 
     Of residues A + iB from a linear fit with terms iΩB/ω beside A, at the fitted poles.
-    Reference: Pappa, Elliott & Schenk, J. Guid. Control Dyn. 16 (1993) 860, doi:10.2514/3.21092.
     """
     natural = unpacked(fit.unknowns, settings)[0]
     n, lines = len(natural), len(data.omega)
@@ -56,14 +51,9 @@ def complex_residues(
         found = inverse @ (row * weight)
         residue[k] = found[:n] + 1j * found[-n:]
         spread[k] = np.linalg.norm(inverse[-n:], axis=1)
-    a, b = residue.real, residue.imag
-    xx, yy, xy = np.sum(a * a, axis=0), np.sum(b * b, axis=0), np.sum(a * b, axis=0)
-    whole_size = np.maximum(xx + yy, 1e-300)
-    collinearity = ((xx - yy) ** 2 + 4 * xy**2) / whole_size**2
-    if len(values) < 2:
-        collinearity = np.full(n, np.nan)
-    angle = 0.5 * np.arctan2(2 * xy, xx - yy)
-    angle_std = np.sqrt(np.sum((a * spread) ** 2, axis=0)) / whole_size
+    collinearity, angle = phase_collinearity(residue)
+    size = np.maximum(np.sum(np.abs(residue) ** 2, axis=0), 1e-300)
+    angle_std = np.sqrt(np.sum((residue.real * spread) ** 2, axis=0)) / size
     return collinearity[rank], angle[rank], angle_std[rank]
 
 
@@ -90,8 +80,7 @@ def leakage_bias(
     """
     spacing = float(np.median(np.diff(data.omega)))
     through = settings._replace(window_time=2 * np.pi / spacing)
-    powers = tuple(dict.fromkeys(data.powers))
-    groups = [powers.index(p) for p in data.powers]
+    powers, groups = data.bases(windowed=True)
     bases = receptance_bases(data.omega, fit.unknowns, through, powers)
     values = np.stack(
         [bases[g].columns @ row for g, row in zip(groups, fit.coefficients, strict=True)]
@@ -111,7 +100,7 @@ def leakage_bias(
 
 
 def fit_notes(
-    found: "LinearModalFit",
+    found: LinearModalFit,
     data: ResponseData,
     settings: BasisSettings,
     fit: SeparableFit,
@@ -134,7 +123,7 @@ def fit_notes(
     return tuple(notes)
 
 
-def _leakage(found: "LinearModalFit", bias: np.ndarray) -> list[str]:
+def _leakage(found: LinearModalFit, bias: np.ndarray) -> list[str]:
     return [
         f"the half-power band of mode {k + 1} ({found.natural_frequency[k] / _HERTZ:.6g} Hz) has "
         f"{found.lines_in_band[k]:.1f} lines: if these are averages of random excitation under "
@@ -144,7 +133,7 @@ def _leakage(found: "LinearModalFit", bias: np.ndarray) -> list[str]:
     ]
 
 
-def _complexity(found: "LinearModalFit") -> list[str]:
+def _complexity(found: LinearModalFit) -> list[str]:
     notes = []
     for k in range(found.n_modes):
         where = f"mode {k + 1} ({found.natural_frequency[k] / _HERTZ:.6g} Hz)"
@@ -163,7 +152,7 @@ def _complexity(found: "LinearModalFit") -> list[str]:
     return notes
 
 
-def _misfits(found: "LinearModalFit") -> list[str]:
+def _misfits(found: LinearModalFit) -> list[str]:
     return [
         f"the residuals of {name} are {value:.2g} times what is stated of its errors: the "
         "errors of the modes are scaled by that"

@@ -1,32 +1,14 @@
-"""Errors of each line of a frequency response: from coherence, or from the residuals of a fit."""
+"""Errors of each line of a frequency response from the residuals of a fit."""
 
 import numpy as np
 from jaxtyping import Float
 from scipy.optimize import minimize
 
-from snrmjax.identify.modal.response_data import ResponseData, coherence_std
+from snrmjax.identify.modal.response_data import ResponseData
 
 _FEWEST = 12  # numbers of a channel, below which its errors are one size
 _SPREAD = 1e-4  # of the largest response: where the search for the errors' sizes begins
 _SMALLEST = 1e-12  # of a channel's residuals: errors of responses without any
-
-
-def coherence_of(data: ResponseData) -> Float[np.ndarray, "channel line"]:
-    """The coherence that the 1σ of `data` stand for, at the sizes that were measured."""
-    ratio = 2 * (data.averages or 1) * (data.std / np.abs(data.receptance)) ** 2
-    return 1 / (1 + ratio)
-
-
-def fitted_coherence_std(
-    data: ResponseData,
-    coherence: Float[np.ndarray, "channel line"],
-    fitted: Float[np.ndarray, "channel line"],
-) -> Float[np.ndarray, "channel line"]:
-    """1σ by coherence with the fitted size in place of the measured one.
-
-    Weights that use the measured size prefer lines that are too small by chance.
-    """
-    return coherence_std(np.abs(fitted), coherence, data.averages)
 
 
 def std_from_residuals(

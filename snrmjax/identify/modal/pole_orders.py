@@ -89,30 +89,18 @@ def gathered(found: Sequence[tuple[int, Complex[np.ndarray, " pole"]]], highest:
     return PoleOrders(order, every, np.concatenate(stable), highest)
 
 
-class PoleClusters(NamedTuple):
-    """Means of clusters of stable poles, by frequency."""
+def clusters(
+    orders: PoleOrders, band: tuple[float, float] = (0.0, np.inf)
+) -> Complex[np.ndarray, " cluster"]:
+    """Stable poles that many orders share, each once: lightly damped or growing, in the band.
 
-    pole: Complex[np.ndarray, " cluster"]
-    shared_by: Int[np.ndarray, " cluster"]  # orders that have it
-
-    @property
-    def damped(self) -> "PoleClusters":
-        """Those that decay."""
-        return PoleClusters(*(column[self.pole.real < 0] for column in self))
-
-    @property
-    def growing(self) -> "PoleClusters":
-        """Those of negative damping."""
-        return PoleClusters(*(column[self.pole.real > 0] for column in self))
-
-
-def clusters(orders: PoleOrders, band: tuple[float, float] = (0.0, np.inf)) -> PoleClusters:
-    """Stable poles that many orders share, each once: lightly damped, in the band (rad/s)."""
+    Means of their clusters by frequency, rad/s; the real part says which decay.
+    """
     ratio = np.abs(orders.damping_ratio)
     use = orders.stable & (ratio < _MOST_DAMPED) & (ratio > 0)
     use &= (orders.natural_frequency >= band[0]) & (orders.natural_frequency <= band[1])
     place, pole = orders.order[use], orders.pole[use]
-    means, counts = [], []
+    means: list[complex] = []
     left = np.ones(pole.size, dtype=bool)
     while left.any():
         rest, at = pole[left], place[left]
@@ -127,10 +115,9 @@ def clusters(orders: PoleOrders, band: tuple[float, float] = (0.0, np.inf)) -> P
         if count >= max(_FEWEST_ORDERS, _SHARE * (orders.highest - first + 1)):
             mine = rest[members]
             means.append(complex(np.median(mine.real), np.median(mine.imag)))
-            counts.append(count)
         left[np.flatnonzero(left)[members]] = False
-    rank = np.argsort([mean.imag for mean in means], kind="stable")
-    return PoleClusters(np.array(means, dtype=complex)[rank], np.array(counts, dtype=int)[rank])
+    found = np.array(means, dtype=complex)
+    return found[np.argsort(found.imag, kind="stable")]
 
 
 def _nearest_of_each(order: np.ndarray, distance: np.ndarray, among: np.ndarray) -> np.ndarray:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Complex, Float, Int
 
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
@@ -37,6 +37,18 @@ class ResponseData(NamedTuple):
     def measured_size(self) -> Float[np.ndarray, "channel line"]:
         """|iΩ|^power of each channel: a receptance's factor to what was measured."""
         return self.omega ** np.array(self.powers)[:, None]
+
+    @property
+    def coherence(self) -> Float[np.ndarray, "channel line"]:
+        """The coherence that the 1σ stand for, at the sizes that were measured."""
+        return 1 / (1 + 2 * (self.averages or 1) * (self.std / np.abs(self.receptance)) ** 2)
+
+    def bases(self, *, windowed: bool) -> tuple[tuple[int, ...], Int[np.ndarray, " channel"]]:
+        """Powers of iΩ that need a basis of their own, as under a window, and whose is which."""
+        if not windowed:
+            return (0,), np.zeros(len(self.powers), dtype=int)
+        powers = tuple(dict.fromkeys(self.powers))
+        return powers, np.array([powers.index(one) for one in self.powers])
 
 
 def response_data(

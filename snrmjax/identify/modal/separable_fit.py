@@ -60,6 +60,12 @@ class SeparableFit(NamedTuple):
     correlation: Float[np.ndarray, " lag"]  # of neighbouring residuals, from lag one
     status: MinimisationStatus
 
+    def with_variance(self, size: float) -> "SeparableFit":
+        """The same for errors of another variance."""
+        return self._replace(
+            covariance=self.covariance * size, own=self.own * size, mixed=self.mixed * size
+        )
+
     def term_covariance(self, term: int) -> Float[np.ndarray, "channel channel"]:
         """Covariance of one linear unknown over all channels."""
         k, t = self.slopes[:, term], self.mixed[:, term]
@@ -87,8 +93,7 @@ def fit_separable(
         return [_compressed(basis_at(point), measured) for point in points]
 
     begin = np.clip(start, *bounds)[None]
-    rule = _RULE
-    found = minimise(linearised, begin, linearised(begin), bounds, rule)[0]
+    found = minimise(linearised, begin, linearised(begin), bounds, _RULE)[0]
     return _with_covariance(basis_at(found.point), measured, found.point, found.status)
 
 

@@ -75,25 +75,18 @@ def responses_of_states(data: SteadyStates, level: int) -> StateResponses:
     return StateResponses(found, std if known else None, level, largest)
 
 
-class AmplitudeDependence(NamedTuple):
-    """What two levels say of a fit at the lower one; see `amplitude_dependence`."""
-
-    frequency: Float[np.ndarray, " mode"]  # rad/s, 1σ to add for what may be left
-    damping_ratio: Float[np.ndarray, " mode"]
-    notes: tuple[str, ...]
-
-
 def amplitude_dependence(
     lowest: LinearModalFit,
     next_level: LinearModalFit,
     velocities: tuple[float, float],
-) -> AmplitudeDependence:
+) -> tuple[LinearModalFit, tuple[str, ...]]:
     """Whether modes differ between the two lowest levels by more than their errors.
 
     Where one does, its value at no amplitude may differ from that of the lower level by the change
     times v₁/(v₂ − v₁), as if it grew with the amplitude: that is the error to add.
 
     Arguments: the largest velocity of each level, m/s, the lower first.
+    Returns the fit at the lower level with these errors, and notes.
     """
     low, high = velocities
     rest = low / (high - low) if high > 1.01 * low else 1.0
@@ -123,12 +116,6 @@ def amplitude_dependence(
         notes.append(
             "the two lowest levels agree within their errors: no amplitude dependence shows"
         )
-    return AmplitudeDependence(added[0], added[1], tuple(notes))
-
-
-def widened(fit: LinearModalFit, by: AmplitudeDependence) -> LinearModalFit:
-    """The fit with the errors that an amplitude dependence adds."""
-    covariance = fit.mode_covariance.copy()
-    covariance[:, 0, 0] += by.frequency**2
-    covariance[:, 1, 1] += by.damping_ratio**2
-    return dataclasses.replace(fit, mode_covariance=covariance)
+    covariance = lowest.mode_covariance.copy()
+    covariance[:, (0, 1), (0, 1)] += added.T**2
+    return dataclasses.replace(lowest, mode_covariance=covariance), tuple(notes)

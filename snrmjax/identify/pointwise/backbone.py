@@ -1,6 +1,6 @@
 """A mode's natural frequency and damping as curves of its amplitude, with one band."""
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from snrmjax.identify.curves.families import values_and_slopes
 from snrmjax.identify.curves.family_base import AbstractCurve
 from snrmjax.identify.pointwise.inversion_result import spans
 from snrmjax.identify.pointwise.points_result import AmplitudeArgument
@@ -63,8 +62,8 @@ class Backbone(AbstractResult):
 
     `squared_frequency` is ω̃² (rad²/s²) and `modal_damping` 2ζ̃ω̃ (1/s), against the
     displacement (m) or the velocity (m/s) amplitude, as `argument` says; `covariance` belongs to
-    the parameters of the first, then of the second. All its functions are differentiable by the
-    amplitude and the parameters.
+    the parameters of the first, then of the second. Its curves are differentiable by the amplitude
+    and the parameters.
     """
 
     squared_frequency: AbstractCurve
@@ -121,54 +120,39 @@ class Backbone(AbstractResult):
             return jnp.asarray(amplitude)
         return jnp.asarray(amplitude) * self.natural_frequency(amplitude)
 
-    def values(
-        self, amplitude: Float[Array, " point"] | Float[np.ndarray, " point"]
-    ) -> BackboneValues:
+    def values(self, amplitude: Float[Array | np.ndarray, " point"]) -> BackboneValues:
         """All that the backbone says at some amplitudes, with standard deviations (1σ).
 
-        Differentiable; numbers that nothing is differentiated by are evaluated by the host, where
-        nothing compiles.
+        Evaluated on the host, where nothing compiles; what is to be differentiated are
+        `natural_frequency` and `damping_ratio`.
         """
-        if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((self, amplitude))):
-            return self._values(amplitude)
         at = np.asarray(amplitude, dtype=float)
         curves = self.squared_frequency, self.modal_damping
-        (squared, by_squared), (modal, by_modal) = (values_and_slopes(c, at) for c in curves)
-        found = _banded(np, at, self, (squared, by_squared), (modal, by_modal))
-        return BackboneValues(*jax.device_put(found))
-
-    @compiled
-    def _values(self, amplitude: Float[Array, " point"]) -> BackboneValues:
-        def linearised(curve: AbstractCurve) -> tuple[Array, Array]:
-            def of(parameters: Array) -> Array:
-                return eqx.tree_at(lambda c: c.parameters, curve, parameters)(amplitude)
-
-            return of(curve.parameters), jax.jacfwd(of)(curve.parameters)
-
-        pair = linearised(self.squared_frequency), linearised(self.modal_damping)
-        return BackboneValues(*_banded(jnp, amplitude, self, *pair))
+        (squared, by_squared), (modal, by_modal) = (c.values_and_slopes(at) for c in curves)
+        slopes = np.zeros((len(at), 2, by_squared.shape[1] + by_modal.shape[1]))
+        slopes[:, 0, : by_squared.shape[1]] = by_squared
+        slopes[:, 1, by_squared.shape[1] :] = by_modal
+        covariance = np.einsum("pck,kl,pdl->pcd", slopes, np.asarray(self.covariance), slopes)
+        omega = np.sqrt(np.where(squared > 0, squared, np.nan))
+        speed = at if self.argument == "velocity" else at * omega
+        return banded_values(speed, squared, modal, covariance)
 
 
-def _banded(
-    xp: Any, amplitude: Any, of: Backbone, squared: tuple[Any, Any], modal: tuple[Any, Any]
-) -> tuple[Any, ...]:
-    """The fields of `BackboneValues`, of values and slopes by parameters, with NumPy or JAX.
+def banded_values(
+    velocity: Float[np.ndarray, " point"],
+    squared: Float[np.ndarray, " point"],
+    modal: Float[np.ndarray, " point"],
+    covariance: Float[np.ndarray, "point 2 2"],
+) -> BackboneValues:
+    """Both curves at velocities by ω̃², 2ζ̃ω̃ and the covariance of these two at every point.
 
     ζ̃ = δ/(2√s): dζ̃ = dδ/(2ω̃) − ζ̃ ds/(2s).
     """
-    (stiffness, by_stiffness), (damping, by_damping) = squared, modal
-    n, covariance = by_stiffness.shape[1], xp.asarray(of.covariance)
-    omega = xp.sqrt(xp.where(stiffness > 0, stiffness, xp.nan))
-    zeta = damping / (2 * omega)
-
-    def shared(one: Any, other: Any, block: Any) -> Any:
-        return xp.einsum("pk,kl,pl->p", one, block, other)
-
-    own = shared(by_stiffness, by_stiffness, covariance[:n, :n])
-    of_damping = shared(by_damping, by_damping, covariance[n:, n:])
-    both = shared(by_stiffness, by_damping, covariance[:n, n:])
-    a, b = -zeta / (2 * omega**2), 1 / (2 * omega)
-    of_ratio = a**2 * own + 2 * a * b * both + b**2 * of_damping
-    stds = [xp.sqrt(xp.maximum(one, 0.0)) for one in (own, of_ratio, of_damping)]
-    speed = amplitude if of.argument == "velocity" else amplitude * omega
-    return speed, omega, stds[0] / (2 * omega), zeta, stds[1], damping, stds[2]
+    omega = np.sqrt(np.where(squared > 0, squared, np.nan))
+    zeta = modal / (2 * omega)
+    slope = np.stack([-zeta / (2 * omega**2), 1 / (2 * omega)], axis=1)
+    of_zeta = np.einsum("pc,pcd,pd->p", slope, covariance, slope)
+    variances = np.stack([covariance[:, 0, 0], of_zeta, covariance[:, 1, 1]])
+    std = np.sqrt(np.maximum(variances, 0.0))
+    columns = (velocity, omega, std[0] / (2 * omega), zeta, std[1], modal, std[2])
+    return BackboneValues(*jax.device_put(columns))

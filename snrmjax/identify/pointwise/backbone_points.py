@@ -14,9 +14,6 @@ from snrmjax.identify.pointwise.inversion_result import PointStatus, SnrmPoints
 from snrmjax.identify.pointwise.points_result import (
     AmplitudeArgument,
     BackbonePoints,
-    MeasuredStates,
-    OtherRoot,
-    PointErrors,
 )
 from snrmjax.identify.pointwise.snrm import reference_sensor
 from snrmjax.measure.indicators import appropriation_of
@@ -137,29 +134,24 @@ def _identify(
         (raw.force == 0) & moving & timed, int(PointStatus.ZERO_FORCE), int(PointStatus.NOT_FINITE)
     )
     return BackbonePoints(
-        measured=MeasuredStates(
-            level=data.level,
-            frequency=raw.frequency,
-            force=raw.force,
-            velocity=jnp.where(usable, measured, bare),
-            appropriation=appropriation_of(raw),
-        ),
+        level=data.level,
+        frequency=raw.frequency,
+        force=raw.force,
+        velocity=jnp.where(usable, measured, bare),
+        appropriation=appropriation_of(raw),
         mode_velocity=jnp.where(usable, mode_velocity, bare),
         natural_frequency=natural,
+        natural_frequency_std=natural_std,
         damping_ratio=damping,
+        damping_ratio_std=damping_std,
         amplitude=jnp.where(found, argument, jnp.nan),
         backbone_velocity=jnp.where(found, on_backbone, jnp.nan),
-        other_root=OtherRoot(
-            solved.alternative_natural_frequency, solved.alternative_damping_ratio
-        ),
-        errors=PointErrors(
-            natural_frequency_std=natural_std,
-            damping_ratio_std=damping_std,
-            sensitivity=sensitivity,
-            relative_std=filtered_std,
-            linear_variance=linear_variance,
-            filter_residual=jnp.where(sound, filter_residual, jnp.nan),
-        ),
+        alternative_natural_frequency=solved.alternative_natural_frequency,
+        alternative_damping_ratio=solved.alternative_damping_ratio,
+        sensitivity=sensitivity,
+        relative_std=filtered_std,
+        linear_variance=linear_variance,
+        filter_residual=jnp.where(sound, filter_residual, jnp.nan),
         status=jnp.where(usable, solved.status, status),
         sensor=modes.sensors[r],
         argument=amplitude,

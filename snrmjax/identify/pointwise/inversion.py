@@ -6,7 +6,7 @@ paper's Eq. (17) reads (ω̃² − Ω²) = 2ζ̃ω̃Ω tan φ, and is used multi
 resonance (φ = 0) and at ±90° alike.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -113,35 +113,9 @@ def invert_phasor(
 def _invert_phasor(
     modal_constant: Array, frequency: Array, velocity: Array, residual: Array
 ) -> SnrmPoints:
-    amplitude = _length(velocity)
-    mode_velocity = velocity - residual
-    direction = _direction(mode_velocity)
-    return _invert(
-        modal_constant, frequency, amplitude, *direction, residual, _length(mode_velocity)
-    )
-
-
-def invert_one(
-    modal_constant: Float[Array, ""],
-    frequency: Float[Array, ""],
-    velocity: Complex[Array, ""],
-    residual_velocity: Complex[Array, ""],
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """ω̃ and ζ̃ of a single steady state, bare: for derivatives by `jax.jacfwd` or `jax.grad`.
-
-    The same Newton solve as `invert_phasor`, whose arguments it takes, without statuses and
-    without the other root; NaN where there is no real ω̃.
-    """
-    mode_velocity = velocity - residual_velocity
-    natural, damping, _ = _newton(
-        modal_constant,
-        frequency,
-        jnp.abs(velocity),
-        *_direction(mode_velocity),
-        residual_velocity,
-        jnp.abs(mode_velocity),
-    )
-    return natural, damping
+    own = velocity - residual
+    measured = (modal_constant, frequency, _length(velocity), *_direction(own), residual)
+    return _invert(_Member(*measured, _length(own)))
 
 
 def invert_amplitude_phase(
@@ -167,15 +141,32 @@ def invert_amplitude_phase(
     (Array([500.], dtype=float64), Array([0.01], dtype=float64))
     """
     size, phase = jnp.asarray(amplitude), jnp.asarray(mode_phase)
-    return _invert(
-        jnp.asarray(modal_constant),
-        jnp.asarray(frequency),
-        size,
-        jnp.cos(phase),
-        jnp.sin(phase),
-        jnp.asarray(residual_velocity),
-        jnp.full(size.shape, jnp.nan),
-    )
+    constant, omega, residual = map(jnp.asarray, (modal_constant, frequency, residual_velocity))
+    unknown = jnp.full(size.shape, jnp.nan)
+    direction = jnp.cos(phase), jnp.sin(phase)
+    return _invert(_Member(constant, omega, size, *direction, residual, unknown))
+
+
+class _Member(NamedTuple):
+    """What is known of one steady state, or of a batch of them."""
+
+    constant: Array  # m/s²
+    frequency: Array
+    amplitude: Array  # of the whole velocity
+    cosine: Array  # of the phase of the mode's own velocity
+    sine: Array
+    residual: Array  # m/s
+    length: Array  # of the mode's own velocity; NaN where it is not measured
+
+
+# Stands in for members that cannot be solved, whose answers are masked afterwards.
+_HARMLESS = (1.0, 1.0, 1.0, 1.0, 0.0, 0.0, 1.0)
+
+
+def _kept(members: _Member, wanted: Array) -> _Member:
+    """The members that are wanted, and harmless ones in place of the others."""
+    pairs = zip(members, _HARMLESS, strict=True)
+    return _Member(*(jnp.where(wanted, value, safe) for value, safe in pairs))
 
 
 def _direction(phasor: Complex[Array, "*batch"]) -> tuple[Array, Array]:
@@ -228,16 +219,9 @@ def _equations(unknowns: Array, args: tuple) -> Array:
     return jnp.stack([phase, balance])
 
 
-def _newton(
-    modal_constant: Array,
-    frequency: Array,
-    amplitude: Array,
-    cosine: Array,
-    sine: Array,
-    residual: Array,
-    length: Array,
-) -> tuple[Array, Array, Array]:
+def _newton(member: _Member) -> tuple[Array, Array, Array]:
     """One member: the Newton solve from the closed form at |V_nl| = `length`."""
+    modal_constant, frequency, amplitude, cosine, sine, residual, length = member
     # The unknown is D = scale·((x² − 1) + 2iζ̃x), x = ω̃/Ω, of length one at the closed form: x
     # itself would resolve a lightly damped resonance no finer than rounding of Ω allows.
     # Units belong to the scaling, not to the equations: no derivative goes through them.
@@ -267,61 +251,35 @@ def _newton(
 
 
 @jax.jit
-def _invert(
-    modal_constant: Array,
-    frequency: Array,
-    amplitude: Array,
-    cosine: Array,
-    sine: Array,
-    residual: Array,
-    known_length: Array,
-) -> SnrmPoints:
-    given = (modal_constant, frequency, amplitude, cosine, sine, residual, known_length)
-    shape = jnp.broadcast_shapes(*(jnp.shape(a) for a in given))
-    flat = [jnp.broadcast_to(a, shape).reshape(-1) for a in given]
-    n = flat[0].shape[0]
+def _invert(members: _Member) -> SnrmPoints:
+    shape = jnp.broadcast_shapes(*(jnp.shape(a) for a in members))
+    flat = jax.tree.map(lambda a: jnp.broadcast_to(a, shape).reshape(-1), members)
+    n = flat.constant.shape[0]
     if n <= _CHUNK or jax.default_backend() != "cpu":
-        return jax.tree.map(lambda a: a.reshape(shape), _invert_flat(*flat))
+        return jax.tree.map(lambda a: a.reshape(shape), _invert_flat(flat))
     # A member that needs more steps then delays its own chunk only.
-    padded = [jnp.pad(a, (0, -n % _CHUNK)).reshape(-1, _CHUNK) for a in flat]
-    answers = jax.lax.map(lambda rows: _invert_flat(*rows), padded)
+    padded = jax.tree.map(lambda a: jnp.pad(a, (0, -n % _CHUNK)).reshape(-1, _CHUNK), flat)
+    answers = jax.lax.map(_invert_flat, padded)
     return jax.tree.map(lambda a: a.reshape(-1)[:n].reshape(shape), answers)
 
 
-def _invert_flat(
-    modal_constant: Array,
-    frequency: Array,
-    amplitude: Array,
-    cosine: Array,
-    sine: Array,
-    residual: Array,
-    known_length: Array,
-) -> SnrmPoints:
-    known = jnp.isfinite(known_length)
+def _invert_flat(members: _Member) -> SnrmPoints:
+    known = jnp.isfinite(members.length)
     finite = (
-        jnp.isfinite(modal_constant)
-        & jnp.isfinite(frequency)
-        & jnp.isfinite(amplitude)
-        & jnp.isfinite(cosine + sine)
-        & jnp.isfinite(jnp.abs(residual))
-        & (amplitude > 0)
-        & (frequency > 0)
+        jnp.isfinite(members.constant)
+        & jnp.isfinite(members.frequency)
+        & jnp.isfinite(members.amplitude)
+        & jnp.isfinite(members.cosine + members.sine)
+        & jnp.isfinite(jnp.abs(members.residual))
+        & (members.amplitude > 0)
+        & (members.frequency > 0)
     )
     # What is not finite is kept out of every step: in a derivative `where` does not stop a NaN.
-    modal_constant, frequency, amplitude, cosine, sine, residual, known_length = (
-        jnp.where(finite, value, stand_in)
-        for value, stand_in in (
-            (modal_constant, 1.0),
-            (frequency, 1.0),
-            (amplitude, 1.0),
-            (cosine, 1.0),
-            (sine, 0.0),
-            (residual, 0.0),
-            (jnp.where(known, known_length, 1.0), 1.0),
-        )
-    )
+    members = members._replace(length=jnp.where(known, members.length, 1.0))
+    members = _kept(members, finite)
+    known_length, amplitude, residual = members.length, members.amplitude, members.residual
     # r² + 2br + d = 0 with b = Re(e^{−iφ} W), d = |W|² − v²; the root far from zero first.
-    half = cosine * residual.real + sine * residual.imag
+    half = members.cosine * residual.real + members.sine * residual.imag
     product = (jnp.abs(residual) - amplitude) * (jnp.abs(residual) + amplitude)
     discriminant = half * half - product
     several = discriminant > 0
@@ -335,28 +293,15 @@ def _invert_flat(
     has_root = known | ((discriminant >= 0) & (length > 0))
     has_other = (other > 0) & (jnp.abs(other - length) > 1e-12 * length)
 
-    forced = modal_constant != 0
+    forced = members.constant != 0
     solvable = finite & forced & has_root
 
     def solve(r: Array, wanted: Array) -> tuple[Array, Array, Array, Array]:
-        # Members without a root are solved for a harmless stand-in and masked afterwards.
-        def safe(value: Array, stand_in: float) -> Array:
-            return jnp.where(wanted, value, stand_in)
-
-        r_safe, omega = safe(r, 1.0), safe(frequency, 1.0)
-        squared = omega**2 + omega * safe(modal_constant, 1.0) / r_safe * safe(sine, 0.0)
+        own = _kept(members._replace(length=r), wanted)
+        squared = own.frequency**2 + own.frequency * own.constant / own.length * own.sine
         real = squared > 0
-        wanted = wanted & real
-        natural, damping, good = jax.vmap(_newton)(
-            safe(modal_constant, 1.0),
-            safe(frequency, 1.0),
-            safe(amplitude, 1.0),
-            safe(cosine, 1.0),
-            safe(sine, 0.0),
-            safe(residual, 0.0),
-            safe(r, 1.0),
-        )
-        answer = wanted & good
+        natural, damping, good = jax.vmap(_newton)(own)
+        answer = wanted & real & good
         nan = jnp.nan
         return jnp.where(answer, natural, nan), jnp.where(answer, damping, nan), real, good
 

@@ -1,6 +1,6 @@
 """Points of the backbone and of the damping, one from each steady state."""
 
-from typing import ClassVar, Literal, NamedTuple
+from typing import ClassVar, Literal
 
 import equinox as eqx
 import numpy as np
@@ -19,52 +19,34 @@ AmplitudeArgument = Literal["displacement", "velocity"]
 _HERTZ = 2 * np.pi
 
 
-class MeasuredStates(NamedTuple):
-    """What was measured at each steady state, at the sensor of the points."""
-
-    level: Int[Array, " state"]
-    frequency: Float[Array, " state"]  # rad/s, of the force
-    force: Float[Array, " state"]  # N
-    velocity: Complex[Array, " state"]  # m/s, residual modes included
-    appropriation: Float[Array, " state"]  # Eq. (20)
-
-
-class PointErrors(NamedTuple):
-    """How well each point is known, and where that comes from; NaN where no noise is stated."""
-
-    natural_frequency_std: Float[Array, " state"]  # rad/s
-    damping_ratio_std: Float[Array, " state"]
-    sensitivity: Float[Array, "state output input"]  # of ω̃², 2ζ̃ω̃, log amplitude to `INPUTS`
-    relative_std: Float[Array, "state input"]  # 1σ of `INPUTS`
-    linear_variance: Float[Array, "state output"]  # from the other linear modes' stated errors
-    filter_residual: Float[Array, " state"]  # part of the mode's motion that its shape misses
-
-
-class OtherRoot(NamedTuple):
-    """What amplitude and phase alone would also allow; NaN where there is no other root."""
-
-    natural_frequency: Float[Array, " state"]  # rad/s
-    damping_ratio: Float[Array, " state"]
-
-
 class BackbonePoints(AbstractResult):
     """One natural frequency and damping ratio from every steady state.
 
-    Amplitudes are those of the nonlinear mode at one sensor, `sensor`. What was measured and the
-    errors are in `measured` and `errors`, and under their own names too: `points.frequency`,
-    `points.natural_frequency_std`.
+    Amplitudes are those of the nonlinear mode at one sensor, `sensor`. Standard deviations (1σ)
+    are NaN where no noise is stated. `alternative_…` is what amplitude and phase alone would also
+    allow; NaN where there is no other root.
     """
 
     coordinates: ClassVar[tuple[str, ...]] = ("state", "level")
 
-    measured: MeasuredStates
+    level: Int[Array, " state"]  # of the test
+    frequency: Float[Array, " state"]  # rad/s, of the force
+    force: Float[Array, " state"]  # N
+    velocity: Complex[Array, " state"]  # m/s as measured, residual modes included
+    appropriation: Float[Array, " state"]  # Eq. (20)
     mode_velocity: Complex[Array, " state"]  # m/s, of the nonlinear mode alone
     natural_frequency: Float[Array, " state"]  # rad/s
+    natural_frequency_std: Float[Array, " state"]
     damping_ratio: Float[Array, " state"]
+    damping_ratio_std: Float[Array, " state"]
     amplitude: Float[Array, " state"]  # m or m/s, the argument of the backbone
     backbone_velocity: Float[Array, " state"]  # m/s, where the point lies on the backbone
-    other_root: OtherRoot
-    errors: PointErrors
+    alternative_natural_frequency: Float[Array, " state"]  # rad/s
+    alternative_damping_ratio: Float[Array, " state"]
+    sensitivity: Float[Array, "state output input"]  # of ω̃², 2ζ̃ω̃, log amplitude to `INPUTS`
+    relative_std: Float[Array, "state input"]  # 1σ of `INPUTS`
+    linear_variance: Float[Array, "state output"]  # from the other linear modes' stated errors
+    filter_residual: Float[Array, " state"]  # part of the mode's motion that its shape misses
     status: Int[Array, " state"]  # `PointStatus`
     sensor: str = eqx.field(static=True)
     argument: AmplitudeArgument = eqx.field(static=True)
@@ -72,8 +54,9 @@ class BackbonePoints(AbstractResult):
     def summary(self) -> tuple[str, ...]:
         """See `AbstractResult`."""
         stated = np.isfinite(np.asarray(self.natural_frequency_std))
+        n_levels = len(np.unique(np.asarray(self.level)))
         return (
-            f"BackbonePoints: {len(self.status)} steady states of {self._n_levels} levels at "
+            f"BackbonePoints: {len(self.status)} steady states of {n_levels} levels at "
             f"{self.sensor!r} ({statuses_in_words(self.status)})",
             f"natural frequency {spans(np.asarray(self.natural_frequency) / _HERTZ)} Hz",
             f"damping ratio {spans(100 * np.asarray(self.damping_ratio))} %",
@@ -111,75 +94,6 @@ class BackbonePoints(AbstractResult):
     def attributes(self) -> dict[str, str | float | int]:
         """See `AbstractResult`."""
         return {"sensor": self.sensor, "amplitude": self.argument}
-
-    @property
-    def _n_levels(self) -> int:
-        return len(np.unique(np.asarray(self.level)))
-
-    @property
-    def level(self) -> Int[Array, " state"]:
-        """Level of the test."""
-        return self.measured.level
-
-    @property
-    def frequency(self) -> Float[Array, " state"]:
-        """Frequency of the force in rad/s."""
-        return self.measured.frequency
-
-    @property
-    def force(self) -> Float[Array, " state"]:
-        """Force amplitude in N."""
-        return self.measured.force
-
-    @property
-    def velocity(self) -> Complex[Array, " state"]:
-        """Measured velocity in m/s, residual modes included."""
-        return self.measured.velocity
-
-    @property
-    def appropriation(self) -> Float[Array, " state"]:
-        """Appropriation indicator, Eq. (20)."""
-        return self.measured.appropriation
-
-    @property
-    def natural_frequency_std(self) -> Float[Array, " state"]:
-        """1σ of ω̃ in rad/s, NaN where no noise is stated."""
-        return self.errors.natural_frequency_std
-
-    @property
-    def damping_ratio_std(self) -> Float[Array, " state"]:
-        """1σ of ζ̃, NaN where no noise is stated."""
-        return self.errors.damping_ratio_std
-
-    @property
-    def sensitivity(self) -> Float[Array, "state output input"]:
-        """Derivatives of `OUTPUTS` (ω̃², 2ζ̃ω̃, log of the amplitude) with respect to `INPUTS`."""
-        return self.errors.sensitivity
-
-    @property
-    def relative_std(self) -> Float[Array, "state input"]:
-        """1σ of `INPUTS`, NaN where it is not stated."""
-        return self.errors.relative_std
-
-    @property
-    def linear_variance(self) -> Float[Array, "state output"]:
-        """Variance of ω̃² and 2ζ̃ω̃ from the other linear modes' stated errors."""
-        return self.errors.linear_variance
-
-    @property
-    def filter_residual(self) -> Float[Array, " state"]:
-        """Part of the mode's motion at the sensors that its shape misses."""
-        return self.errors.filter_residual
-
-    @property
-    def alternative_natural_frequency(self) -> Float[Array, " state"]:
-        """ω̃ in rad/s of the root that was not taken, or NaN."""
-        return self.other_root.natural_frequency
-
-    @property
-    def alternative_damping_ratio(self) -> Float[Array, " state"]:
-        """ζ̃ of the root that was not taken, or NaN."""
-        return self.other_root.damping_ratio
 
     @property
     def modal_damping(self) -> Float[Array, " state"]:

@@ -1,13 +1,13 @@
 """Forced responses that an identified backbone predicts: resonances and whole curves."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 from jaxtyping import Array, Bool, Complex, Float
 
 from snrmjax.identify.pointwise.backbone import Backbone
@@ -29,7 +29,7 @@ def resonances(
     *,
     largest_amplitude_ratio: float = LARGEST_AMPLITUDE_RATIO,
 ) -> list[Resonance]:
-    """All phase resonances under a force, by Newton's method from every sign change.
+    """All phase resonances under a force, from every sign change along the backbone.
 
     At resonance Ω = ω̃ and the velocity amplitude of the mode is v = |A|F/(2ζ̃ω̃), both functions
     of amplitude; the total adds the residual modes. Damping that falls with amplitude can give
@@ -46,44 +46,16 @@ def resonances(
     _require_force(force)
     amplitude = _scan(backbone, largest_amplitude_ratio)
     load = abs(float(backbone.modal_constant)) * force
-    excess = _on_backbone(backbone, amplitude).excess(load)
-    at = np.flatnonzero(np.signbit(excess[:-1]) != np.signbit(excess[1:]))
+
+    def too_weak(at: _OnBackbone) -> Bool[np.ndarray, " point"]:
+        return np.signbit(at.excess(load))
+
+    weak = too_weak(_on_backbone(backbone, amplitude))
     found = []
-    for k in at:
-        low, high = amplitude[k], amplitude[k + 1]
-        start = low - excess[k] * (high - low) / (excess[k + 1] - excess[k])
-        root, good = _newton_resonance(
-            backbone, *(jnp.asarray(v) for v in (force, start, low, high))
-        )
-        if bool(good):
-            found.append(_resonance(backbone, modes, force, float(root)))
+    for k in np.flatnonzero(weak[:-1] != weak[1:]):
+        root = np.mean(_change(backbone, too_weak, amplitude[k], amplitude[k + 1]))
+        found.append(_resonance(backbone, modes, force, float(root)))
     return found
-
-
-def resonance_by_fixed_point(
-    backbone: Backbone,
-    modes: LinearModes,
-    force: float,
-    *,
-    start: float | None = None,
-    max_steps: int = 256,
-    largest_amplitude_ratio: float = LARGEST_AMPLITUDE_RATIO,
-) -> Resonance | None:
-    """One phase resonance by the paper's fixed-point iteration v ← |A|F/(2ζ̃ω̃)(v).
-
-    Arguments: `force` in N; `start` the first amplitude (of the backbone's argument), by default
-    the largest measured one. Returns None when the iteration does not converge, which happens
-    where damping changes fast with amplitude (use `resonances`), or ends beyond
-    `largest_amplitude_ratio` times the largest measured amplitude. Not differentiable.
-    Reference: Kwarta & Allen, Eq. (19).
-    """
-    _require_force(force)
-    first = jnp.asarray(float(backbone.largest) if start is None else start)
-    root, good = _picard(backbone, jnp.asarray(force), first, max_steps)
-    largest = float(_scan(backbone, largest_amplitude_ratio)[-1])
-    if not bool(good) or not 0 < float(root) <= largest:
-        return None
-    return _resonance(backbone, modes, force, float(root))
 
 
 def predict_response(
@@ -117,12 +89,19 @@ def predict_response(
     _require_force(force)
     scan = _scan(backbone, largest_amplitude_ratio)
     load = abs(float(backbone.modal_constant)) * force
-    inside = _on_backbone(backbone, scan).frequencies(load)[2] >= 0
+
+    def responds(at: _OnBackbone) -> Bool[np.ndarray, " point"]:
+        return at.frequencies(load)[2] >= 0
+
+    inside = responds(_on_backbone(backbone, scan))
     starts = [scan[0]] if inside[0] else []
     ends: list[float] = []
     for k in np.flatnonzero(np.diff(inside.astype(int))):
-        edge = _edge(backbone, load, scan[k], scan[k + 1], inside[k])
-        (ends if inside[k] else starts).append(edge)
+        low, high = _change(backbone, responds, scan[k], scan[k + 1])
+        if inside[k]:
+            ends.append(low)
+        else:
+            starts.append(high)
     if inside[-1]:
         ends.append(scan[-1])
     curves = []
@@ -219,64 +198,22 @@ def _values_and_slopes(
     return *values, *slopes
 
 
-def _edge(backbone: Backbone, load: float, low: float, high: float, inside: bool) -> float:
-    """Amplitude between two scanned ones where response begins or ends, kept on its inner side."""
+def _change(
+    backbone: Backbone, holds: Callable[[_OnBackbone], np.ndarray], low: float, high: float
+) -> tuple[float, float]:
+    """Neighbouring amplitudes of which a condition holds at one only, to rounding."""
     for _ in range(5):
         fine = low + (high - low) * np.linspace(0.0, 1.0, _SCAN + 1)
-        same = (_on_backbone(backbone, fine).frequencies(load)[2] >= 0) == inside
-        k = max(int(np.argmin(same)), 1)
+        held = holds(_on_backbone(backbone, fine))
+        k = max(int(np.argmin(held == held[0])), 1)
         low, high = fine[k - 1], fine[k]
-    return low if inside else high
-
-
-@eqx.filter_jit
-def _newton_resonance(
-    backbone: Backbone, force: Array, start: Array, low: Array, high: Array
-) -> tuple[Array, Array]:
-    """The root in a bracket, in units of its upper end."""
-    load = jnp.abs(backbone.modal_constant) * force
-
-    def equation(share: Array, _: None) -> Array:
-        amplitude = share * high
-        return backbone.velocity(amplitude) * backbone.modal_damping(amplitude) / load - 1.0
-
-    solution: optx.Solution = optx.root_find(
-        equation,
-        optx.Newton(rtol=1e-12, atol=1e-12),
-        jnp.asarray(start / high),
-        options={"lower": jnp.asarray(low / high), "upper": jnp.asarray(1.0)},
-        max_steps=64,
-        throw=False,
-    )
-    good = (solution.result == optx.RESULTS.successful) & jnp.isfinite(solution.value)
-    return solution.value * high, good
-
-
-@eqx.filter_jit
-def _picard(backbone: Backbone, force: Array, start: Array, max_steps: int) -> tuple[Array, Array]:
-    load = jnp.abs(backbone.modal_constant) * force
-
-    def update(amplitude: Array, _: None) -> Array:
-        velocity = load / backbone.modal_damping(amplitude)
-        if backbone.argument == "velocity":
-            return velocity
-        return velocity / backbone.natural_frequency(amplitude)
-
-    solution: optx.Solution = optx.fixed_point(
-        update,
-        optx.FixedPointIteration(rtol=1e-10, atol=1e-14),
-        start,
-        max_steps=max_steps,
-        throw=False,
-    )
-    good = (solution.result == optx.RESULTS.successful) & jnp.isfinite(solution.value)
-    return solution.value, good
+    return low, high
 
 
 def _resonance(backbone: Backbone, modes: LinearModes, force: float, amplitude: float) -> Resonance:
-    frequency, damping, velocity = _on_resonance(
-        backbone, modes, jnp.asarray(force), jnp.asarray(amplitude)
-    )
+    at, load = jnp.asarray(amplitude), jnp.asarray(force)
+    frequency, damping = backbone.natural_frequency(at), backbone.damping_ratio(at)
+    velocity = _velocity(backbone, modes, load, frequency, frequency, damping)
     return Resonance(
         force=force,
         amplitude=amplitude,
@@ -285,15 +222,6 @@ def _resonance(backbone: Backbone, modes: LinearModes, force: float, amplitude: 
         velocity=float(jnp.abs(velocity)),
         continued=amplitude > float(backbone.largest) * (1 + 1e-9),
     )
-
-
-@eqx.filter_jit
-def _on_resonance(
-    backbone: Backbone, modes: LinearModes, force: Array, amplitude: Array
-) -> tuple[Array, Array, Array]:
-    frequency = backbone.natural_frequency(amplitude)
-    damping = backbone.damping_ratio(amplitude)
-    return frequency, damping, _velocity(backbone, modes, force, frequency, frequency, damping)
 
 
 @eqx.filter_jit

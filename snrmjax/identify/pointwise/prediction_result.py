@@ -54,7 +54,7 @@ class PredictedResponse(AbstractResult):
     branch: tuple[str, ...]  # "lead" (velocity leads the force) or "lag" for every point
     continued: Bool[np.ndarray, " point"]  # beyond the measured amplitudes
     isolated: bool  # a closed curve, apart from the main one
-    note: str = ""  # where the curve extrapolates the backbone; empty where it nowhere does
+    note: str  # where the curve extrapolates the backbone; empty where it nowhere does
 
     def summary(self) -> tuple[str, ...]:
         """See `AbstractResult`."""

@@ -95,7 +95,6 @@ def resonance_distribution(
     *,
     ratio: float = LARGEST_AMPLITUDE_RATIO,
     gain_of_force: bool = False,
-    of_velocity: bool = False,
     self_excited: bool = False,
 ) -> ResonanceDistribution:
     """Draw curves, a further level's errors with them, and look where each has its resonance.
@@ -105,9 +104,9 @@ def resonance_distribution(
     passive structure stays positive: draws that fall below zero before they have a resonance are
     left out; one law in twenty ends with the data, and damping stays as it is there.
 
-    Arguments: `force` in N; `amplitude` up to `ratio` times the largest measured one, velocities if
-    `of_velocity`; `other` is the velocity of the other modes in units of the mode's own direction;
-    with `gain_of_force` a level's gain is that of its recorded force, else of its velocity.
+    Arguments: `force` in N; `amplitude` up to `ratio` times the largest measured one; `other`
+    is the velocity of the other modes in units of the mode's own direction; with `gain_of_force` a
+    level's gain is that of its recorded force, else of its velocity.
     """
     rng, edge = np.random.default_rng(0), int(np.searchsorted(amplitude, amplitude[-1] / ratio))
     gain, phase, stiffness, loss = (new.std * rng.normal(size=(_DRAWS, len(new.std)))).T
@@ -120,7 +119,7 @@ def resonance_distribution(
     with np.errstate(invalid="ignore"):
         natural = np.sqrt(squared)
     omega = natural + 0.5 * damping * np.tan(phase)[:, None]
-    speed = (amplitude / natural if of_velocity else amplitude) * omega
+    speed = amplitude * omega
     root = _Root.of(speed * damping / load[:, None])
     kept = root.found | ~np.any(damping[:, edge:] <= 0, axis=1) | self_excited
     at, own = root.at(omega), root.at(speed, at_rest=0.0)

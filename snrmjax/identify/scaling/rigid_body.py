@@ -1,38 +1,44 @@
 """The rigid-body mode of a free structure, from low residuals or from its mass."""
 
-from typing import TYPE_CHECKING
+from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from snrmjax.identify.modal.modal_fit import LinearModalFit
 
-if TYPE_CHECKING:
-    from snrmjax.identify.scaling.scale import DrivePoint
-
 _CERTAIN = 5.0  # standard errors of a low residual
 _APART = 1.2  # ratio of the residual's mass and the stated one that is worth a note
+
+
+class RigidBodyMode(NamedTuple):
+    """Shape at the sensors and participation, both kg^-1/2; no shape where none is due."""
+
+    shape: Float[np.ndarray, " sensor"] | None
+    participation: float
+    notes: tuple[str, ...]
 
 
 def rigid_body_mode(
     fit: LinearModalFit,
     gain: float,
     free: float | None,
-    drive: "DrivePoint | None",
+    drive: tuple[int, float] | None,
     scaled_by: str,
-) -> tuple[np.ndarray | None, float, tuple[str, ...]]:
-    """Shape at the sensors, participation (both kg^-1/2) and notes; no shape where none is due.
+) -> RigidBodyMode:
+    """What the low residuals, or the stated mass of a free structure, say of its rigid motion.
 
     A rigid-body mode answers −φp/Ω²: the low residual of the drive point is −1/m of the mass that
     the force feels. Modes below the band look alike, so that it is written only where the
     structure is said to be free: `free` is its mass in kg, 0 where it is not known, None where
-    nobody said.
+    nobody said. `drive` is the number of the sensor at the force and its sign against it.
     Raises `ValueError` where a free structure's residual refutes that.
     """
     lower, std = fit.lower / gain, fit.lower_std / abs(gain)
-    at = None if drive is None else fit.sensor_number(str(drive.sensor))
+    at, sign = drive or (0, 1.0)
     own = own_std = np.nan
-    if drive is not None and at is not None and std[at] > 0:
-        own, own_std = (-1.0 if drive.turned else 1.0) * lower[at], std[at]
+    if drive is not None and std[at] > 0:
+        own, own_std = sign * lower[at], std[at]
     shows = own < -_CERTAIN * own_std
     if free is None:
         note = (
@@ -40,13 +46,14 @@ def rigid_body_mode(
             "of modes below the band: it is written as a rigid-body mode where the structure is "
             "said to be free"
         )
-        return None, 0.0, (note,) if shows else ()
+        return RigidBodyMode(None, 0.0, (note,) if shows else ())
     if free < 0 or not np.isfinite(free):
         raise ValueError(f"the mass of a free structure must be positive (kg), but is {free:g}.")
     if free > 0:
         ones = np.full(len(fit.sensors), free**-0.5)
         if not shows:
-            return ones, free**-0.5, ("the rigid-body mode is that of the stated mass alone",)
+            note = "the rigid-body mode is that of the stated mass alone"
+            return RigidBodyMode(ones, free**-0.5, (note,))
         ratio = -1 / own / free
         said = f"the low residual at the drive point is that of {-1 / own:.4g} kg"
         if not 1 / _APART < ratio < _APART:
@@ -54,10 +61,9 @@ def rigid_body_mode(
                 f", {ratio:.2g} times the stated mass: the force acts off the centre of mass, or "
                 "the suspension's modes or missed modes are in it"
             )
-        if drive is not None and at is not None:
-            signs = np.sign(lower) * np.sign(lower[at])
-            ones = ones * np.where(signs == 0, 1.0, signs) * (-1.0 if drive.turned else 1.0)
-        return ones, free**-0.5, (said,)
+        signs = np.sign(lower) * np.sign(lower[at])
+        ones = ones * np.where(signs == 0, 1.0, signs) * sign
+        return RigidBodyMode(ones, free**-0.5, (said,))
     if not shows:
         what = "is not known" if np.isnan(own) else f"is {own:.3g} ± {1.96 * own_std:.2g} 1/kg"
         raise ValueError(
@@ -69,4 +75,4 @@ def rigid_body_mode(
         f"rigid-body mode from the low residuals ({scaled_by}): the force feels {-1 / own:.4g} ± "
         f"{1.96 * own_std / own**2:.2g} kg"
     )
-    return -lower / participation, participation, (note,)
+    return RigidBodyMode(-lower / participation, participation, (note,))

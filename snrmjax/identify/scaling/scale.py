@@ -18,7 +18,24 @@ _NOT_SCALED = (
     "shapes and participations are not mass-normalised: only frequencies, damping ratios and "
     "ratios of a shape hold; the gain of the force must be free in what follows"
 )
+_PER_VOLT = (
+    "participations are per volt: states with `drive_v` and the gain of the force in newtons per "
+    "volt free, or fixed to one, fit this model"
+)
 _DRIVE_NAMES = ("drive_point", "drive point", "driving_point", "driving point")
+
+
+class _Scaled(NamedTuple):
+    """Participations and how they hang on what was fitted."""
+
+    participation: Float[np.ndarray, " mode"]
+    relative_std: Float[np.ndarray, " mode"]  # of it, beside the residues' errors
+    by_residues: Float[np.ndarray, "mode sensor"]  # d ln p / d residue
+    keep: Bool[np.ndarray, " mode"]
+    by: str
+    notes: tuple[str, ...]
+    # An error of response over force enters ln φ with this exponent and ln p with the rest.
+    exponent: float
 
 
 class DrivePoint(NamedTuple):
@@ -31,6 +48,55 @@ class DrivePoint(NamedTuple):
     sensor: str | None = None
     turned: bool = False
 
+    def scaled(self, fit: LinearModalFit, residue: Float[np.ndarray, "sensor mode"]) -> _Scaled:
+        """p = √A of the drive point."""
+        if fit.reference.quantity not in ("force", "voltage"):
+            raise ValueError(
+                f"a drive point needs a force, but the reference {fit.reference.name} is the "
+                f"{fit.reference.quantity} of a base: give sensor masses, an added mass or a known "
+                "shape."
+            )
+        d, sign = self._place(fit)
+        own = sign * residue[d]
+        std = fit.residue_std[d] * np.abs(residue[d] / fit.residue[d])
+        sure = np.abs(own) > _CERTAIN * std
+        hertz = fit.natural_frequency / 2 / np.pi
+        if np.all(own[sure] < 0) and sure.any():
+            raise ValueError(
+                f"the residues at the drive point {fit.sensor_names[d]} are negative "
+                f"({own[sure][0]:.4g} 1/kg at {hertz[sure][0]:.6g} Hz): sensor and force point "
+                "against one another; say that the sensor is turned, or change a sign."
+            )
+        keep = sure & (own > 0)
+        if not keep.any():
+            raise ValueError(
+                f"the residues at the drive point {fit.sensor_names[d]} are within three standard "
+                "errors of zero: it lies at a node of all modes and gives no scale."
+            )
+        notes = tuple(
+            f"mode at {hertz[k]:.6g} Hz left out: its residue at the drive point is {own[k]:.3g} ± "
+            f"{1.96 * std[k]:.2g} 1/kg (95 %), from which no shape follows"
+            for k in np.flatnonzero(~keep)
+        )
+        participation = np.sqrt(np.where(keep, own, 1.0))
+        by = f"scaled by the drive point {fit.sensor_names[d]}"
+        slopes = 0.5 * _by_one(residue, d)
+        return _Scaled(participation, np.zeros(len(own)), slopes, keep, by, notes, 0.5)
+
+    def _place(self, fit: LinearModalFit) -> tuple[int, float]:
+        """The sensor's number, and its sign against the force."""
+        sign = -1.0 if self.turned else 1.0
+        if self.sensor is not None:
+            return fit.sensor_number(self.sensor), sign
+        found = _drive_point_of(fit)
+        if found is None:
+            raise ValueError(
+                "the shapes cannot be mass-normalised: no sensor is at the force "
+                f"{fit.reference.name} (point and axis of {', '.join(fit.sensor_names)} say none), "
+                "and no added mass, sensor masses or known shape was given."
+            )
+        return found[0], sign * found[1]
+
 
 class AddedMassTest(NamedTuple):
     """Scale by a second test of the same structure with a small mass at a sensor."""
@@ -39,6 +105,21 @@ class AddedMassTest(NamedTuple):
     sensor: str
     mass: float  # kg
     mass_std: float = 0.0  # kg
+
+    def scaled(self, fit: LinearModalFit, residue: Float[np.ndarray, "sensor mode"]) -> _Scaled:
+        """p = A/φ with φ from the shift of the frequencies."""
+        place = fit.sensor_number(self.sensor)
+        found = squared_shapes(fit, self.with_mass, self.mass, self.mass_std)
+        shape = np.sqrt(found.squared)
+        return _Scaled(
+            residue[place] / shape,
+            0.5 * found.squared_std / found.squared,
+            _by_one(residue, place),
+            np.ones(len(shape), dtype=bool),
+            f"scaled by an added mass of {self.mass:.4g} kg at {self.sensor}",
+            found.notes,
+            0.0,
+        )
 
 
 class SensorMasses(NamedTuple):
@@ -51,6 +132,54 @@ class SensorMasses(NamedTuple):
     mass: Mapping[str, float]
     fixture_mass: float | None = None
 
+    def scaled(self, fit: LinearModalFit, residue: Float[np.ndarray, "sensor mode"]) -> _Scaled:
+        """p² = −Σ m A, over the fixture's mass where that is forced."""
+        if not self.mass:
+            raise ValueError("a fixture's mass scales only with the masses at the sensors.")
+        mass = np.zeros(len(residue))
+        for name, value in self.mass.items():
+            if not (np.isfinite(value) and value >= 0):
+                raise ValueError(
+                    f"the mass at {name} must not be below zero (kg), but is {value:g}."
+                )
+            mass[fit.sensor_number(name)] = value
+        if not mass.any():
+            raise ValueError("sensor masses must not all be zero.")
+        base = fit.reference.quantity == "acceleration"
+        if not base and self.fixture_mass is None:
+            raise ValueError(
+                "sensor masses scale the response to a base's motion, or with the mass of a free "
+                f"rigid fixture that to a force: the reference {fit.reference.name} is "
+                f"{fit.reference.quantity}, and no fixture mass is stated."
+            )
+        if self.fixture_mass is not None and not self.fixture_mass > 0:
+            raise ValueError(
+                f"a fixture's mass must be positive (kg), but is {self.fixture_mass:g}."
+            )
+        fixture = 1.0 if base else float(self.fixture_mass or 1.0)
+        total = mass @ residue
+        if np.any(total >= 0):
+            k = int(np.argmax(total >= 0))
+            raise ValueError(
+                f"Σ mass × residue must be negative for a structure moved by its base, but is "
+                f"{total[k]:.3g} at {fit.natural_frequency[k] / 2 / np.pi:.6g} Hz: a sensor is "
+                "turned, or the responses are absolute where relative ones were said."
+            )
+        size = np.sqrt(-total / fixture)
+        note = f"the forced fixture of {fixture:.4g} kg moves as the sensors' masses balance it"
+        if base:
+            listed = ", ".join(f"{value:.4g}" for value in -total)
+            note = f"effective masses: {listed} kg by modes, of {mass.sum():.4g} kg at the sensors"
+        return _Scaled(
+            -size if base else size,
+            np.zeros(len(size)),
+            0.5 * mass[None] / total[:, None],
+            np.ones(len(size), dtype=bool),
+            "scaled by the masses at the sensors",
+            (note,),
+            0.5,
+        )
+
 
 class KnownShape(NamedTuple):
     """Scale by a mass-normalised shape that is known, as from finite elements, at one sensor."""
@@ -58,6 +187,25 @@ class KnownShape(NamedTuple):
     sensor: str
     value: float  # kg^-1/2, of every mode
     std: float = 0.0
+
+    def scaled(self, fit: LinearModalFit, residue: Float[np.ndarray, "sensor mode"]) -> _Scaled:
+        """p = A/φ."""
+        place, n = fit.sensor_number(self.sensor), residue.shape[1]
+        if not np.isfinite(self.value) or self.value == 0:
+            raise ValueError(
+                f"the known shape at {self.sensor} must be finite and not zero, but is "
+                f"{self.value:g}."
+            )
+        note = f"the shape {self.value:.6g} at {self.sensor} was taken for every mode"
+        return _Scaled(
+            residue[place] / self.value,
+            np.full(n, abs(self.std / self.value)),
+            _by_one(residue, place),
+            np.ones(n, dtype=bool),
+            f"scaled by the shape stated at {self.sensor}",
+            () if n == 1 else (note,),
+            0.0,
+        )
 
 
 Scale = DrivePoint | AddedMassTest | SensorMasses | KnownShape
@@ -77,42 +225,8 @@ class Calibration(NamedTuple):
     relative_std: float = 0.0  # of response over force, all modes alike
 
 
-def decay_modes(found: DecayModes) -> ScaledModes:
-    """Modes of free decays with relative shapes: nothing gives their scale."""
-    ones, unknown = np.ones(found.n_modes), np.full(found.n_modes, np.nan)
-    return ScaledModes(
-        found.natural_frequency,
-        found.natural_frequency_std,
-        found.damping_ratio,
-        found.damping_ratio_std,
-        found.shape,
-        found.shape_std,
-        ones,
-        unknown,
-        unknown,
-        None,
-        0.0,
-        found.sensor_names,
-        "not scaled",
-        "N",
-        False,
-        (*found.notes, _NOT_SCALED),
-    )
-
-
-class _Scaled(NamedTuple):
-    """Participations and how they hang on what was fitted."""
-
-    participation: Float[np.ndarray, " mode"]
-    relative_std: Float[np.ndarray, " mode"]  # of it, beside the residues' errors
-    by_residues: Float[np.ndarray, "mode sensor"]  # d ln p / d residue
-    keep: Bool[np.ndarray, " mode"]
-    by: str
-    notes: tuple[str, ...] = ()
-
-
 def scale_modes(
-    fit: LinearModalFit,
+    fit: LinearModalFit | DecayModes,
     by: Scale | None,
     *,
     calibration: Calibration = Calibration(),  # noqa: B008
@@ -126,43 +240,121 @@ def scale_modes(
     m_f that is forced: p² = −Σ m A/m_f. A known shape: p = A/φ.
     Signs: a participation is positive, over a base's acceleration negative (the force is −Γa).
 
-    Arguments: `by` None gives relative shapes, one at the largest sensor; `calibration` newtons
-    per volt where the reference is a voltage; `free` adds the rigid-body mode that the low
-    residuals show, or that of a stated mass.
+    Arguments: `by` None gives relative shapes, one at the largest sensor, which is all that free
+    decays tell; `calibration` newtons per volt where the reference is a voltage; `free` adds the
+    rigid-body mode that the low residuals show, or that of a stated mass.
     Returns `ScaledModes`; modes that hardly move the drive point are left out, with a note.
     Raises `ValueError` in a sentence where a scale cannot be had: no sensor at the force, a
-    voltage without newtons per volt, a negative residue at the drive point (a sensor turned), an
-    added mass that does not lower the frequencies, a mass below zero, an unknown sensor.
+    voltage without newtons per volt, a free decay, a negative residue at the drive point (a sensor
+    turned), an added mass that does not lower the frequencies, a mass below zero, an unknown
+    sensor.
     Reference: Ewins, Modal Testing, 2nd ed. (2000), chapters 2 and 5; for the added mass Parloo,
     Verboven, Guillaume & Van Overmeire, MSSP 16 (2002) 757, doi:10.1006/mssp.2001.1461.
     """
+    if isinstance(fit, DecayModes):
+        if by is not None:
+            raise ValueError(
+                "the shapes cannot be mass-normalised: a free decay has no force; take "
+                "frequencies and damping alone (unscaled), or measure frequency responses."
+            )
+        return _unscaled(fit, fit.shape, fit.shape_std, np.ones(fit.n_modes), "N")
     gain, gain_std = _newtons(fit, by, calibration)
-    residue = fit.residue / gain
+    residue, covariance = fit.residue / gain, fit.mode_covariance[:, 2:, 2:] / gain**2
+    top, at = np.argmax(np.abs(residue), axis=0), np.arange(fit.n_modes)
+    largest = residue[top, at]
+    per = _PER.get(fit.reference.quantity, fit.reference.quantity)
     if by is None:
-        return _relative(fit)
-    if isinstance(by, DrivePoint):
-        scaled = _by_drive_point(fit, residue, by)
-    elif isinstance(by, AddedMassTest):
-        scaled = _by_added_mass(fit, residue, by)
-    elif isinstance(by, SensorMasses):
-        scaled = _by_masses(fit, residue, by)
-    else:
-        scaled = _by_shape(fit, residue, by)
-    chain = np.hypot(gain_std, calibration.relative_std)
-    return _assembled(fit, residue, scaled, gain, chain, free)
+        slopes = np.eye(len(residue))[top] / largest[:, None]
+        shape, spread = _shapes(residue, covariance, largest, slopes)
+        return _unscaled(fit, shape, spread, np.sign(largest), per)
+    scaled, chain = by.scaled(fit, residue), np.hypot(gain_std, calibration.relative_std)
+    p, slopes, keep = scaled.participation, scaled.by_residues, scaled.keep
+    shape, spread = _shapes(residue, covariance, p, slopes)
+    shared = np.hypot(scaled.relative_std, chain * scaled.exponent)
+    of_participation = np.einsum("ki,kij,kj->k", slopes, covariance, slopes)
+    relative = of_participation + scaled.relative_std**2 + (chain * (1 - scaled.exponent)) ** 2
+    of_largest = np.sqrt(covariance[at, top, top]) / np.abs(largest)
+    rigid = rigid_body_mode(
+        *(fit, gain, None if free is None else free.mass or 0.0),
+        *(_drive_point_of(fit), scaled.by),
+    )
+    per = "N" if gain != 1.0 else per
+    volts = (_PER_VOLT,) if per == "V" else ()
+    return ScaledModes(
+        natural_frequency=fit.natural_frequency[keep],
+        natural_frequency_std=fit.natural_frequency_std[keep],
+        damping_ratio=fit.damping_ratio[keep],
+        damping_ratio_std=fit.damping_ratio_std[keep],
+        shape=shape[:, keep],
+        shape_std=np.hypot(spread, np.abs(shape) * shared)[:, keep],
+        participation=p[keep],
+        participation_std=(np.abs(p) * np.sqrt(relative))[keep],
+        modal_mass_std=np.hypot(of_largest, chain)[keep],
+        rigid_shape=rigid.shape,
+        rigid_participation=rigid.participation,
+        sensors=fit.sensor_names,
+        scaled_by=scaled.by,
+        per=per,
+        notes=(*fit.notes, *scaled.notes, *rigid.notes, *volts),
+    )
 
 
-def drive_point_of(fit: LinearModalFit) -> DrivePoint | None:
-    """The sensor at the force, by point and axis, or by a name that says so; None without one."""
+def _by_one(residue: np.ndarray, sensor: int) -> Float[np.ndarray, "mode sensor"]:
+    """Slopes of ln p where it goes with one sensor's residue."""
+    slopes = np.zeros(residue.T.shape)
+    slopes[:, sensor] = 1 / residue[sensor]
+    return slopes
+
+
+def _shapes(
+    residue: np.ndarray, covariance: np.ndarray, participation: np.ndarray, slopes: np.ndarray
+) -> tuple[Float[np.ndarray, "sensor mode"], Float[np.ndarray, "sensor mode"]]:
+    """φ = A/p and its 1σ by the residues' errors; `slopes` are those of ln p by the residues."""
+    shape = residue / participation
+    arms = np.eye(len(residue)) / participation[:, None, None]
+    arms = arms - shape.T[:, :, None] * slopes[:, None, :]
+    variance = np.einsum("kij,kjl,kil->ik", arms, covariance, arms)
+    return shape, np.sqrt(np.maximum(variance, 0.0))
+
+
+def _unscaled(
+    found: LinearModalFit | DecayModes,
+    shape: np.ndarray,
+    shape_std: np.ndarray,
+    participation: np.ndarray,
+    per: str,
+) -> ScaledModes:
+    """Modes with relative shapes: nothing gives their scale."""
+    unknown = np.full(found.n_modes, np.nan)
+    return ScaledModes(
+        natural_frequency=found.natural_frequency,
+        natural_frequency_std=found.natural_frequency_std,
+        damping_ratio=found.damping_ratio,
+        damping_ratio_std=found.damping_ratio_std,
+        shape=shape,
+        shape_std=shape_std,
+        participation=participation,
+        participation_std=unknown,
+        modal_mass_std=unknown,
+        rigid_shape=None,
+        rigid_participation=0.0,
+        sensors=found.sensor_names,
+        scaled_by="not scaled",
+        per=per,
+        mass_normalised=False,
+        notes=(*found.notes, _NOT_SCALED),
+    )
+
+
+def _drive_point_of(fit: LinearModalFit) -> tuple[int, float] | None:
+    """The sensor at the force, by point and axis or by a name that says so, and its sign."""
     point, way = fit.reference.point, fit.reference.direction
-    for one in fit.sensors:
+    for k, one in enumerate(fit.sensors):
         same_axis = one.direction.lstrip("+-") == way.lstrip("+-")
         if point and one.point == point and same_axis:
-            return DrivePoint(one.name, one.direction.startswith("-") != way.startswith("-"))
-    for one in fit.sensors:
-        if one.name.lower() in _DRIVE_NAMES:
-            return DrivePoint(one.name)
-    return None
+            return k, 1.0 if one.direction.startswith("-") == way.startswith("-") else -1.0
+    named = [k for k, name in enumerate(fit.sensor_names) if name.lower() in _DRIVE_NAMES]
+    return (named[0], 1.0) if named else None
 
 
 def _newtons(
@@ -187,229 +379,3 @@ def _newtons(
             f"{fit.reference.quantity}."
         )
     return 1.0, 0.0
-
-
-def _relative(fit: LinearModalFit) -> ScaledModes:
-    top = np.argmax(np.abs(fit.residue), axis=0)
-    at = np.arange(fit.n_modes)
-    largest = fit.residue[top, at]
-    shape = fit.residue / largest
-    spread = np.stack(
-        [
-            _ratio_std(fit.mode_covariance[k, 2:, 2:], fit.residue[:, k], top[k])
-            for k in range(fit.n_modes)
-        ],
-        axis=1,
-    )
-    return ScaledModes(
-        fit.natural_frequency,
-        fit.natural_frequency_std,
-        fit.damping_ratio,
-        fit.damping_ratio_std,
-        shape,
-        spread,
-        np.sign(largest),
-        np.full(fit.n_modes, np.nan),
-        np.full(fit.n_modes, np.nan),
-        None,
-        0.0,
-        fit.sensor_names,
-        "not scaled",
-        _PER.get(fit.reference.quantity, fit.reference.quantity),
-        False,
-        (*fit.notes, _NOT_SCALED),
-    )
-
-
-def _ratio_std(covariance: np.ndarray, residue: np.ndarray, top: int) -> np.ndarray:
-    slope = np.eye(len(residue)) / residue[top]
-    slope[:, top] -= residue / residue[top] ** 2
-    return np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", slope, covariance, slope), 0.0))
-
-
-def _by_drive_point(fit: LinearModalFit, residue: np.ndarray, by: DrivePoint) -> _Scaled:
-    if fit.reference.quantity not in ("force", "voltage"):
-        raise ValueError(
-            f"a drive point needs a force, but the reference {fit.reference.name} is the "
-            f"{fit.reference.quantity} of a base: give sensor masses, an added mass or a known "
-            "shape."
-        )
-    if by.sensor is None:
-        found = drive_point_of(fit)
-        if found is None:
-            raise ValueError(
-                "the shapes cannot be mass-normalised: no sensor is at the force "
-                f"{fit.reference.name} (point and axis of {', '.join(fit.sensor_names)} say none), "
-                "and no added mass, sensor masses or known shape was given."
-            )
-        by = DrivePoint(found.sensor, found.turned != by.turned)
-    d = fit.sensor_number(str(by.sensor))
-    sign = -1.0 if by.turned else 1.0
-    own = sign * residue[d]
-    std = fit.residue_std[d] * np.abs(residue[d] / fit.residue[d])
-    sure = np.abs(own) > _CERTAIN * std
-    if np.all(own[sure] < 0) and sure.any():
-        raise ValueError(
-            f"the residues at the drive point {fit.sensor_names[d]} are negative "
-            f"({own[sure][0]:.4g} 1/kg at {fit.natural_frequency[sure][0] / 2 / np.pi:.6g} Hz): "
-            "sensor and force point against one another; say that the sensor is turned, or change "
-            "a sign."
-        )
-    keep = sure & (own > 0)
-    if not keep.any():
-        raise ValueError(
-            f"the residues at the drive point {fit.sensor_names[d]} are within three standard "
-            "errors of zero: it lies at a node of all modes and gives no scale."
-        )
-    notes = tuple(
-        f"mode at {fit.natural_frequency[k] / 2 / np.pi:.6g} Hz left out: its residue at the drive "
-        f"point is {own[k]:.3g} ± {1.96 * std[k]:.2g} 1/kg (95 %), from which no shape follows"
-        for k in np.flatnonzero(~keep)
-    )
-    slopes = np.zeros(residue.T.shape)
-    slopes[:, d] = 0.5 / residue[d]
-    participation = np.sqrt(np.where(keep, own, 1.0))
-    by_name = f"scaled by the drive point {fit.sensor_names[d]}"
-    return _Scaled(participation, np.zeros(len(own)), slopes, keep, by_name, notes)
-
-
-def _by_added_mass(fit: LinearModalFit, residue: np.ndarray, by: AddedMassTest) -> _Scaled:
-    place = fit.sensor_number(by.sensor)
-    found = squared_shapes(fit, by.with_mass, by.mass, by.mass_std)
-    shape = np.sqrt(found.squared)
-    slopes = np.zeros(residue.T.shape)
-    slopes[:, place] = 1 / residue[place]
-    return _Scaled(
-        residue[place] / shape,
-        0.5 * found.squared_std / found.squared,
-        slopes,
-        np.ones(len(shape), dtype=bool),
-        f"scaled by an added mass of {by.mass:.4g} kg at {by.sensor}",
-        found.notes,
-    )
-
-
-def _by_masses(fit: LinearModalFit, residue: np.ndarray, by: SensorMasses) -> _Scaled:
-    mass = np.zeros(len(residue))
-    for name, value in by.mass.items():
-        if not (np.isfinite(value) and value >= 0):
-            raise ValueError(f"the mass at {name} must not be below zero (kg), but is {value:g}.")
-        mass[fit.sensor_number(name)] = value
-    if not mass.any():
-        raise ValueError("sensor masses must not all be zero.")
-    base = fit.reference.quantity == "acceleration"
-    if not base and by.fixture_mass is None:
-        raise ValueError(
-            "sensor masses scale the response to a base's motion, or with the mass of a free rigid "
-            f"fixture that to a force: the reference {fit.reference.name} is "
-            f"{fit.reference.quantity}, and no fixture mass is stated."
-        )
-    if by.fixture_mass is not None and not by.fixture_mass > 0:
-        raise ValueError(f"a fixture's mass must be positive (kg), but is {by.fixture_mass:g}.")
-    fixture = 1.0 if base else float(by.fixture_mass or 1.0)
-    total = mass @ residue
-    if np.any(total >= 0):
-        k = int(np.argmax(total >= 0))
-        raise ValueError(
-            f"Σ mass × residue must be negative for a structure moved by its base, but is "
-            f"{total[k]:.3g} at {fit.natural_frequency[k] / 2 / np.pi:.6g} Hz: a sensor is turned, "
-            "or the responses are absolute where relative ones were said."
-        )
-    size = np.sqrt(-total / fixture)
-    slopes = 0.5 * mass[None] / total[:, None]
-    note = (
-        f"effective masses: {', '.join(f'{value:.4g}' for value in -total)} kg by modes, of "
-        f"{mass.sum():.4g} kg at the sensors"
-        if base
-        else f"the forced fixture of {fixture:.4g} kg moves as the sensors' masses balance it"
-    )
-    return _Scaled(
-        -size if base else size,
-        np.zeros(len(size)),
-        slopes,
-        np.ones(len(size), dtype=bool),
-        "scaled by the masses at the sensors",
-        (note,),
-    )
-
-
-def _by_shape(fit: LinearModalFit, residue: np.ndarray, by: KnownShape) -> _Scaled:
-    place = fit.sensor_number(by.sensor)
-    if not np.isfinite(by.value) or by.value == 0:
-        raise ValueError(
-            f"the known shape at {by.sensor} must be finite and not zero, but is {by.value:g}."
-        )
-    slopes = np.zeros(residue.T.shape)
-    slopes[:, place] = 1 / residue[place]
-    n = residue.shape[1]
-    note = () if n == 1 else (f"the shape {by.value:.6g} at {by.sensor} was taken for every mode",)
-    return _Scaled(
-        residue[place] / by.value,
-        np.full(n, abs(by.std / by.value)),
-        slopes,
-        np.ones(n, dtype=bool),
-        f"scaled by the shape stated at {by.sensor}",
-        note,
-    )
-
-
-def _assembled(
-    fit: LinearModalFit,
-    residue: np.ndarray,
-    scaled: _Scaled,
-    gain: float,
-    chain: float,
-    free: Free | None,
-) -> ScaledModes:
-    shape = residue / scaled.participation
-    n, sensors = fit.n_modes, len(fit.sensors)
-    shape_std, own_std, mass_std = np.zeros((sensors, n)), np.zeros(n), np.zeros(n)
-    fixed = scaled.by.startswith("scaled by the drive") or scaled.by.endswith("at the sensors")
-    half = 0.5 if fixed else 0.0  # of an error of response over force, in ln φ and in ln p
-    for k in range(n):
-        covariance = fit.mode_covariance[k, 2:, 2:] / gain**2
-        slope_p = scaled.by_residues[k]
-        extra = scaled.relative_std[k] ** 2
-        own = slope_p @ covariance @ slope_p + extra + (chain * (1 - half)) ** 2
-        own_std[k] = abs(scaled.participation[k]) * np.sqrt(own)
-        slope = np.eye(sensors) / scaled.participation[k] - np.outer(shape[:, k], slope_p)
-        random = np.einsum("ij,jk,ik->i", slope, covariance, slope)
-        shared = shape[:, k] ** 2 * (extra + (chain * half) ** 2)
-        shape_std[:, k] = np.sqrt(np.maximum(random, 0.0) + shared)
-        top = int(np.argmax(np.abs(residue[:, k])))
-        mass_std[k] = np.hypot(np.sqrt(covariance[top, top]) / abs(residue[top, k]), chain)
-    keep = scaled.keep
-    rigid, rigid_participation, rigid_notes = rigid_body_mode(
-        fit,
-        gain,
-        None if free is None else (free.mass or 0.0),
-        drive_point_of(fit),
-        scaled.by,
-    )
-    per = "N" if gain != 1.0 else _PER.get(fit.reference.quantity, fit.reference.quantity)
-    volts = (
-        (
-            "participations are per volt: states with `drive_v` and the gain of the force in "
-            "newtons per volt free, or fixed to one, fit this model",
-        )
-        if per == "V"
-        else ()
-    )
-    return ScaledModes(
-        fit.natural_frequency[keep],
-        fit.natural_frequency_std[keep],
-        fit.damping_ratio[keep],
-        fit.damping_ratio_std[keep],
-        shape[:, keep],
-        shape_std[:, keep],
-        scaled.participation[keep],
-        own_std[keep],
-        mass_std[keep],
-        rigid,
-        rigid_participation,
-        fit.sensor_names,
-        scaled.by,
-        per,
-        True,
-        (*fit.notes, *scaled.notes, *rigid_notes, *volts),
-    )

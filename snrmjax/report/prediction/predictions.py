@@ -12,7 +12,6 @@ from snrmjax.identify.inference.fitted_response import (
     predicted_resonance,
 )
 from snrmjax.identify.inference.identification import Identification
-from snrmjax.identify.inference.plain_prediction import without_bands
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.pointwise.backbone import Backbone
 from snrmjax.identify.pointwise.missing_resonance import level_in_resonance
@@ -45,11 +44,15 @@ class Prediction(NamedTuple):
     """What the identified curves predict under one force."""
 
     force: float  # N
-    resonances: list[Resonance]
-    responses: list[PredictedResponse]
+    resonances: Sequence[Resonance]  # in order of amplitude
+    responses: Sequence[PredictedResponse]  # the main curve first; those of a joint fit with 1σ
     further: ResonanceDistribution  # of the resonance of a level that was not measured
     drive: float | None = None  # V, where the force is known as a drive voltage
-    banded: tuple[FittedResponse, ...] = ()  # the same of a joint fit, with 1σ
+
+    @property
+    def banded(self) -> list[FittedResponse]:
+        """The responses that have bands."""
+        return [one for one in self.responses if isinstance(one, FittedResponse)]
 
     @property
     def load(self) -> str:
@@ -106,8 +109,8 @@ def predictions_of_fit(
         further = predicted_resonance(
             fit, force, largest_amplitude_ratio=ratio, of=new, self_excited=loads.self_excited
         )
-        plain = without_bands(fit, banded)
-        found.append(Prediction(force, *plain, further, record, tuple(banded)))
+        tips = sorted((tip for one in banded for tip in one.resonances), key=lambda t: t.amplitude)
+        found.append(Prediction(force, tips, banded, further, record))
         notes += notes_on_trends(new.trends, found[-1].load)
     return tuple(found), tuple(notes)
 

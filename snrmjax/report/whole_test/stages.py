@@ -14,8 +14,9 @@ from snrmjax.doctor.check import check_test
 from snrmjax.doctor.findings import Checkup, Finding
 from snrmjax.identify.modal.free_decay import DecayModes
 from snrmjax.identify.modal.modal_fit import LinearModalFit
+from snrmjax.identify.modal.modes_of_tests import find_modes
 from snrmjax.identify.modal.response_data import joined_responses
-from snrmjax.identify.scaling.request import ModesRequest, find_modes, scale_of
+from snrmjax.identify.scaling.scale import DrivePoint, scale_modes
 from snrmjax.identify.scaling.scaled_modes import ScaledModes
 from snrmjax.io.laboratory.checkups import write_checkup
 from snrmjax.io.models import read_model
@@ -254,18 +255,17 @@ def _linear_model(folder: Path, files: TestFiles, request: TestRequest) -> _Mode
             "what are the linear modes? The folder has time records only: put a model.toml or "
             "frequency responses beside them."
         )
-    settings = ModesRequest(drive_point=request.drive_point)
-    fitted, further = find_modes(source, settings)  # type: ignore[arg-type]
-    scaled = _scaled(fitted, settings)
+    fitted, further = find_modes(source)  # type: ignore[arg-type]
+    scaled = _scaled(fitted, DrivePoint(request.drive_point))
     interest = _nearest_mode(scaled, files)
     write_modal_tables(folder, "model.toml", scaled, interest=interest)
     report = modal_report("model", scaled, fitted, interest=interest, further_notes=further)
     return _Modes(read_model(folder / "model.toml"), report, modes_sentence(scaled))
 
 
-def _scaled(fitted: LinearModalFit | DecayModes, settings: ModesRequest) -> ScaledModes:
+def _scaled(fitted: LinearModalFit | DecayModes, by: DrivePoint) -> ScaledModes:
     try:
-        return scale_of(fitted, settings)
+        return scale_modes(fitted, by)
     except ValueError as error:
         raise ValueError(
             f"how are the mode shapes scaled? {error} Answer by `--drive-point SENSOR`, or write "

@@ -11,7 +11,6 @@ from snrmjax.identify.curves.families import (
     FAMILIES,
     PowerLaw,
     Spline,
-    values_and_slopes,
 )
 from snrmjax.identify.curves.packed_curve import packed
 
@@ -29,7 +28,7 @@ def member(kind, size=None, argument="displacement"):
 @pytest.mark.parametrize("kind", FAMILIES)
 def test_host_values_and_slopes_are_those_of_the_program(kind):
     curve = member(kind)
-    values, slopes = values_and_slopes(curve, AMPLITUDE)
+    values, slopes = curve.values_and_slopes(AMPLITUDE)
     at = jnp.asarray(AMPLITUDE)
 
     def of(parameters):

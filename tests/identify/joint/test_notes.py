@@ -6,9 +6,9 @@ from truths.exact_states import TRUE, modes, noisy
 from truths.joint_fits import noisy_fit
 
 import snrmjax as sj
-from snrmjax.identify.inference.sensitivity import contributions
+from snrmjax.identify.inference.contributions import contributions
 from snrmjax.identify.joint.notes import (
-    NoiseAndLevels,
+    NoiseEstimate,
     notes_on_autocorrelation,
     notes_on_level_errors,
     notes_on_noise,
@@ -18,8 +18,8 @@ from snrmjax.io.joint_results import read_joint_fit, write_joint_fit
 
 
 def of_noise(*, stated, noise=15.0):
-    found = NoiseAndLevels(noise, 0.6, (0.041, 0.0, 0.0, 0.0))
-    return notes_on_noise(found, 1.8e-4, np.zeros(4), 4, stated=stated)
+    found = NoiseEstimate(noise, 0.6, np.array([0.041, 0.0, 0.0, 0.0]), stated)
+    return notes_on_noise(found, 1.8e-4, np.zeros(4), 4)
 
 
 def test_the_wandering_frequency_is_the_one_of_the_error_table():

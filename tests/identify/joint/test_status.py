@@ -10,7 +10,6 @@ from truths.joint_fits import noisy_fit
 
 import snrmjax as sj
 from snrmjax.identify.inference import located_points
-from snrmjax.identify.inference.located_points import LocatedStatus
 from snrmjax.identify.joint import family_fit, joint_fit
 from snrmjax.identify.joint.family_fit import FitStatus
 from snrmjax.io.joint_results import summarise_fit
@@ -57,7 +56,7 @@ def test_resonances_and_folds_that_are_not_located_are_counted_and_said(monkeypa
     assert found.folds == ()
     assert [one.kind for one in found.not_located] == ["fold"] * len(before.folds)
     for one, known in zip(found.not_located, before.folds, strict=True):
-        assert one.status == LocatedStatus.NOT_LOCATED
+        assert not one.located
         assert np.isnan(one.frequency_std)
         assert one.frequency == pytest.approx(known.frequency, rel=1e-3)
     assert "2 resonances or folds under 2.2 N could not be located" in found.note

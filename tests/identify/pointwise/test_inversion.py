@@ -18,7 +18,6 @@ from snrmjax.identify.pointwise.inversion import (
     CramersRule,
     closed_form,
     invert_amplitude_phase,
-    invert_one,
     invert_phasor,
 )
 from snrmjax.identify.pointwise.inversion_result import STATUS_MESSAGE, PointStatus, SnrmPoints
@@ -455,9 +454,9 @@ class TestShapes:
     def test_one_member_is_the_batch(self, measured):
         few = [jnp.asarray(a[:64]) for a in measured.phasors()]
         points = invert_phasor(*few)
-        natural, damping = jax.jit(jax.vmap(invert_one))(*few)
-        np.testing.assert_allclose(natural, points.natural_frequency, rtol=1e-12)
-        np.testing.assert_allclose(damping, points.damping_ratio, rtol=1e-9)
+        each = jax.jit(jax.vmap(invert_phasor))(*few)
+        np.testing.assert_allclose(each.natural_frequency, points.natural_frequency, rtol=1e-12)
+        np.testing.assert_allclose(each.damping_ratio, points.damping_ratio, rtol=1e-9)
 
     @pytest.mark.parametrize(
         "replaced",
@@ -547,7 +546,9 @@ def through_package(theta):
     )
     velocity = theta[2] * jnp.exp(1j * theta[3])
     residual = residual_velocity(modes, frequency, force)[0]
-    return jnp.stack(invert_one(shape[1] * participation[1] * force, frequency, velocity, residual))
+    constant = shape[1] * participation[1] * force
+    point = invert_phasor(constant, frequency, velocity, residual)
+    return jnp.stack([point.natural_frequency, point.damping_ratio])
 
 
 CASES = np.stack(

@@ -2,7 +2,6 @@
 
 from functools import partial
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ from snrmjax.identify.pointwise.backbone import Backbone
 from snrmjax.identify.pointwise.prediction import (
     LARGEST_AMPLITUDE_RATIO,
     predict_response,
-    resonance_by_fixed_point,
     resonances,
 )
 from snrmjax.methods.steady.mode_synthesis import ShapePreservingCurve
@@ -163,7 +161,6 @@ class TestResonances:
     def test_a_force_beyond_the_continued_curve_has_none(self):
         force = force_for(DUFFING, 1.01 * LARGEST_AMPLITUDE_RATIO)
         assert resonances(DUFFING, MODES, force) == []
-        assert resonance_by_fixed_point(DUFFING, MODES, force) is None
         assert (
             len(resonances(DUFFING, MODES, force_for(DUFFING, 0.99 * LARGEST_AMPLITUDE_RATIO))) == 1
         )
@@ -175,8 +172,6 @@ class TestResonances:
         (found,) = resonances(DUFFING, MODES, force, largest_amplitude_ratio=4.0)
         np.testing.assert_allclose(found.amplitude, 3.7 * LARGEST, rtol=1e-10)
         assert found.continued
-        again = resonance_by_fixed_point(DUFFING, MODES, force, largest_amplitude_ratio=4.0)
-        np.testing.assert_allclose(again.amplitude, found.amplitude, rtol=1e-8)
         assert not resonances(DUFFING, MODES, force, largest_amplitude_ratio=3.6)
 
     def test_a_curve_reaches_as_far_as_asked_and_says_where_it_extrapolates(self):
@@ -194,48 +189,16 @@ class TestResonances:
         assert small.note == ""
 
     @pytest.mark.parametrize("ratio", [0.0, -1.0, np.nan, np.inf])
-    @pytest.mark.parametrize("verb", [resonances, resonance_by_fixed_point, predict_response])
+    @pytest.mark.parametrize("verb", [resonances, predict_response])
     def test_the_ratio_must_be_positive(self, verb, ratio):
         with pytest.raises(ValueError, match="`largest_amplitude_ratio` must be positive"):
             verb(DUFFING, MODES, force_for(DUFFING, 0.5), largest_amplitude_ratio=ratio)
 
     @pytest.mark.parametrize("force", [0.0, -1.0, np.nan, np.inf])
-    @pytest.mark.parametrize("verb", [resonances, resonance_by_fixed_point, predict_response])
+    @pytest.mark.parametrize("verb", [resonances, predict_response])
     def test_a_force_must_be_positive(self, verb, force):
         with pytest.raises(ValueError, match="`force` must be positive"):
             verb(DUFFING, MODES, force)
-
-
-class TestFixedPoint:
-    @pytest.mark.parametrize("name", ["stiffening", "softening", "velocity"])
-    def test_it_agrees_with_newton_where_it_converges(self, name):
-        which = BACKBONES[name]
-        for part in (0.05, 0.4, 0.7):
-            force = force_for(which, part)
-            (newton,) = resonances(which, MODES, force)
-            found = resonance_by_fixed_point(which, MODES, force)
-            # Steps end below 1e-10; each shrinks by |g'| < 0.9 here.
-            np.testing.assert_allclose(*map(jax.tree.leaves, (found, newton)), rtol=1e-8)
-
-    def test_it_gives_up_where_damping_changes_fast(self):
-        # v ← |A|F/δ(v): its slope −a δ'/δ is below −1 where damping more than doubles.
-        which = backbone(W0**2 * line(0.0), RATE * line(8.0))
-        force = force_for(which, 0.9)
-        a = 0.9
-        assert 16 * a**2 / (1 + 8 * a**2) > 1
-        assert len(resonances(which, MODES, force)) == 1
-        assert resonance_by_fixed_point(which, MODES, force) is None
-        gentle = force_for(which, 0.2)
-        (newton,) = resonances(which, MODES, gentle)
-        found = resonance_by_fixed_point(which, MODES, gentle, start=0.2 * LARGEST)
-        np.testing.assert_allclose(*map(jax.tree.leaves, (found, newton)), rtol=1e-8)
-
-    def test_start_and_steps_count(self):
-        force = force_for(BUMPED, 0.9)
-        amplitudes = all_resonances(BUMPED, force)
-        found = resonance_by_fixed_point(BUMPED, MODES, force, start=0.95 * amplitudes[-1])
-        assert found is None or min(abs(found.amplitude / np.array(amplitudes) - 1)) < 1e-8
-        assert resonance_by_fixed_point(DUFFING, MODES, 0.01, max_steps=1) is None
 
 
 def force_balance(which, curve):

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 from truths.modal_structures import HERTZ, base_response, chain, receptance
 
+from snrmjax.cli.laboratory.modal_sources import asked_scale
 from snrmjax.identify.modal.base_motion import relative_to_base
 from snrmjax.identify.modal.linear_fit import fit_linear_modes
+from snrmjax.identify.modal.modes_of_tests import find_modes
 from snrmjax.identify.modal.state_responses import levels_by_velocity, responses_of_states
-from snrmjax.identify.scaling.request import ModesRequest, find_modes, scale_of
 from snrmjax.identify.scaling.scale import (
     AddedMassTest,
     Calibration,
@@ -231,20 +232,20 @@ def states(curve, levels=(1.0, 3.0), rng=None):
 def test_the_lowest_level_of_steady_states():
     data = states(0.0)
     assert levels_by_velocity(data) == [1, 2]
-    found, notes = find_modes(data, ModesRequest())
+    found, notes = find_modes(data)
     assert found.source == "stated"
     assert found.n_modes == 1
     assert abs(found.natural_frequency[0] - STRUCTURE.natural_frequency[0]) < (
         4 * found.natural_frequency_std[0]
     )
     assert "no amplitude dependence" in notes[0]
-    scaled = scale_of(found, ModesRequest(drive_point="tip"))
+    scaled = scale_modes(found, DrivePoint("tip"))
     assert scaled.shape[0, 0] == pytest.approx(SHAPES[0, 0], rel=5e-3)
 
 
 def test_an_amplitude_dependence_is_said_and_added_to_the_error():
     # Hardening: 2e-3 of the frequency for each 0.1 m/s.
-    found, notes = find_modes(states(0.02), ModesRequest())
+    found, notes = find_modes(states(0.02))
     assert any(
         "frequency of mode 1" in note and "depends on the amplitude" in note for note in notes
     )
@@ -276,10 +277,10 @@ BAD = [
     ("from 1 to 3", lambda: scale_modes(FIT, DrivePoint()).linear_modes(3)),
     (
         "one scale of the shapes",
-        lambda: scale_of(FIT, ModesRequest(unscaled=True, drive_point="s1")),
+        lambda: asked_scale(DrivePoint("s1"), unscaled=True),
     ),
-    ("needs its kilograms", lambda: scale_of(FIT, ModesRequest(added_mass=0.1))),
-    ("only with the masses at the sensors", lambda: scale_of(FIT, ModesRequest(fixture_mass=1.0))),
+    ("needs its kilograms", lambda: asked_scale(DrivePoint(), added_mass=0.1)),
+    ("only with the masses at the sensors", lambda: scale_modes(FIT, SensorMasses({}, 1.0))),
     ("no level 7", lambda: responses_of_states(states(0.0), 7)),
 ]
 

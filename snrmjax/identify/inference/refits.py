@@ -1,5 +1,6 @@
-"""Intervals of single unknowns of a joint fit by the profile of its cost."""
+"""What refits say of a joint fit's unknowns: profiles of its cost, and resampled states."""
 
+from collections.abc import Callable
 from enum import IntEnum
 
 import equinox as eqx
@@ -7,19 +8,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from snrmjax.identify.joint.family_fit import SOLVER
-from snrmjax.identify.joint.force_balance import BalanceProblem
+from snrmjax.identify.joint.force_balance import BalanceProblem, filled
 from snrmjax.identify.joint.free_unknowns import Unravel, padded_problem
 from snrmjax.identify.joint.joint_fit import JointFit
-from snrmjax.identify.joint.residuals import (
-    corrected_residuals,
-)
+from snrmjax.identify.joint.residuals import corrected_residuals
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.result import AbstractResult, Variable
 
 _PIN = 1e4  # weight, in its own 1σ, with which a profile holds an unknown
+_MOST_STEPS = 200  # of a refit
 _RISE = 3.84  # of χ² at the ends of a 95 % interval
 
 
@@ -96,17 +96,11 @@ def profile(fit: JointFit, name: str, *, n_points: int = 15, reach: float = 3.5)
     names = fit.names()
     if name not in names:
         raise ValueError(f"the fit has no unknown {name!r}; it has {', '.join(names[:6])}, …")
-    program = fit.packed()
-    vector, unravel, index = program.vector, program.unravel, int(program.own[names.index(name)])
-    std = np.sqrt(np.diag(program.padded_covariance(fit.covariance)))
+    refit, own = _refit_of(fit)
+    index = int(own[names.index(name)])
     offsets = np.linspace(-reach, reach, n_points | 1)
-    values = float(vector[index]) + std[index] * offsets
-    cost = np.asarray(
-        _pinned(
-            *(vector, unravel, padded_problem(fit.problem)),
-            *(jnp.asarray(std), np.array(index), jnp.asarray(values)),
-        )
-    )
+    values = float(refit.vector[index]) + float(refit.std[index]) * offsets
+    cost = np.asarray(_pinned(refit, np.array(index), jnp.asarray(values)))
     middle = len(cost) // 2
     # The value in the middle is the fit's own.
     rise = cost - cost[middle]
@@ -132,29 +126,81 @@ def _crossing(values: np.ndarray, rise: np.ndarray) -> tuple[float, IntervalEnd]
     return float("nan"), IntervalEnd.NOT_COMPUTED
 
 
-@compiled
-def _pinned(
-    vector: Array,
-    unravel: Unravel,
-    problem: BalanceProblem,
-    std: Array,
-    index: Array,
-    values: Array,
-) -> Float[Array, " value"]:
-    unit = jnp.where(std > 0, std, 1.0)
+def bootstrap(
+    fit: JointFit, n_samples: int = 200, *, seed: int = 0, levels: bool = False
+) -> Float[np.ndarray, "sample unknown"]:
+    """Unknowns of refits to states drawn with replacement, within every level.
 
-    def one(value: Array) -> Array:
-        def residuals(y: Array, _: None = None) -> Array:
-            point = vector + y * unit
-            free = corrected_residuals(point, unravel, problem)
-            held = _PIN * (point[index] - value) / unit[index]
-            return jnp.append(free, held)
+    With `levels` whole levels are drawn instead, which needs more of them than a curve has
+    parameters. A refit that does not converge is a row of NaN.
+    """
+    rng = np.random.default_rng(seed)
+    level = np.asarray(fit.data.level)
+    weights = np.zeros((n_samples, len(level)))
+    for row in weights:
+        if levels:
+            drawn = rng.integers(fit.data.n_levels, size=fit.data.n_levels)
+            row += np.bincount(drawn, minlength=fit.data.n_levels)[level]
+        else:
+            for number in range(fit.data.n_levels):
+                mine = np.flatnonzero(level == number)
+                np.add.at(row, rng.choice(mine, size=mine.size), 1.0)
+    weights = weights * np.asarray(fit.data.weight)
+    refit, own = _refit_of(fit)
+    room = len(refit.problem.data.level)
+    every = np.stack([filled(row, room, 0.0) for row in weights])
+    return np.asarray(_resampled(refit, jnp.asarray(every)))[:, own]
 
-        start = jnp.zeros_like(vector).at[index].set((value - vector[index]) / unit[index])
+
+class _Refit(eqx.Module):
+    """A fit's problem and where it ended, as compiled programs take them."""
+
+    vector: Float[Array, " entry"]
+    std: Float[Array, " entry"]
+    unravel: Unravel
+    problem: BalanceProblem
+
+    def solved(self, residuals: Callable[[Array], Array], start: Array) -> Float[Array, " entry"]:
+        """The unknowns that make residuals least, from a start on; NaN if none are found."""
+        unit = jnp.where(self.std > 0, self.std, 1.0)
         found: optx.Solution = optx.least_squares(
-            residuals, SOLVER, start, max_steps=200, throw=False
+            lambda y, _: residuals(self.vector + y * unit),
+            *(SOLVER, (start - self.vector) / unit),
+            max_steps=_MOST_STEPS,
+            throw=False,
         )
         good = found.result == optx.RESULTS.successful
-        return jnp.where(good, jnp.sum(residuals(found.value)[:-1] ** 2), jnp.nan)
+        return jnp.where(good, self.vector + found.value * unit, jnp.nan)
+
+
+def _refit_of(fit: JointFit) -> tuple[_Refit, Int[np.ndarray, " unknown"]]:
+    """The problem of refits, and where in its vector the fit's own unknowns are."""
+    program = fit.packed()
+    std = np.sqrt(np.diag(program.padded_covariance(fit.covariance)))
+    problem = padded_problem(fit.problem)
+    return _Refit(program.vector, jnp.asarray(std), program.unravel, problem), program.own
+
+
+@compiled
+def _resampled(refit: _Refit, weights: Array) -> Float[Array, "sample entry"]:
+    def one(weight: Array) -> Array:
+        given = (refit.unravel, refit.problem.with_data(weight=weight))
+        return refit.solved(lambda vector: corrected_residuals(vector, *given), refit.vector)
+
+    return jax.lax.map(one, weights)
+
+
+@compiled
+def _pinned(refit: _Refit, index: Array, values: Array) -> Float[Array, " value"]:
+    """The least χ² with one unknown held at each of some values."""
+    std = jnp.where(refit.std > 0, refit.std, 1.0)[index]
+
+    def one(value: Array) -> Array:
+        def residuals(vector: Array) -> Array:
+            free = corrected_residuals(vector, refit.unravel, refit.problem)
+            return jnp.append(free, _PIN * (vector[index] - value) / std)
+
+        found = refit.solved(residuals, refit.vector.at[index].set(value))
+        return jnp.sum(residuals(found)[:-1] ** 2)
 
     return jax.lax.map(one, values)

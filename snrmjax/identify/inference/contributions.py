@@ -1,4 +1,4 @@
-"""What the uncertainty of a joint fit comes from: derivatives by measurements, contributions."""
+"""What the uncertainty of a joint fit comes from: shares of every source of error."""
 
 from typing import NamedTuple
 
@@ -10,25 +10,18 @@ from jaxtyping import Array, Float
 
 from snrmjax.identify.curves.family_base import AbstractCurve
 from snrmjax.identify.curves.packed_curve import packed
-from snrmjax.identify.inference.fitted_curves import (
-    values_at_displacement,
-)
+from snrmjax.identify.inference.fitted_curves import values_at_displacement
 from snrmjax.identify.inference.table_result import AbstractTable
 from snrmjax.identify.joint.force_balance import (
     STATE_ERRORS,
     BalanceProblem,
-    Unknowns,
-    nearest_errors,
     slopes_by_error,
     weighting_at,
 )
 from snrmjax.identify.joint.free_unknowns import Unravel, padded_problem
-from snrmjax.identify.joint.joint_fit import (
-    JointFit,
-)
+from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.joint.residuals import (
     all_residuals,
-    whitened,
 )
 from snrmjax.identify.test_model.states import LEVEL_ERRORS
 from snrmjax.numerics.compiled import compiled
@@ -36,14 +29,6 @@ from snrmjax.numerics.least_squares import inverse_of
 from snrmjax.numerics.result import Variable
 
 _LISTED = 8  # sources on one screen
-
-
-class Sensitivity(NamedTuple):
-    """Derivatives of the free unknowns by everything that was measured or stated."""
-
-    by_measurement: Float[np.ndarray, "unknown state error"]  # of `STATE_ERRORS`, relative or rad
-    by_prior: Float[np.ndarray, "unknown prior"]  # levels, linear parameters, bends; per 1σ
-    covariance: Float[np.ndarray, "unknown unknown"]  # what follows from both
 
 
 class Contribution(NamedTuple):
@@ -110,74 +95,6 @@ class Contributions(AbstractTable[Contribution]):
         }
 
 
-def sensitivity(fit: JointFit) -> Sensitivity:
-    """Derivatives of the fit by every measured force, velocity and phase, second order included.
-
-    At the minimum of χ²(θ, data) the implicit function theorem gives dθ/dy = −H⁻¹ ∂²χ²/∂θ∂y with
-    the whole Hessian H, where Gauss and Newton leave out the residuals' curvature; the covariance
-    of independent errors of the stated size follows. States are corrected for their most likely
-    errors anew.
-
-    Returns a `Sensitivity`. One call costs about as much as a fit; its program is compiled anew
-    for another number of states, or another family.
-    """
-    vector, unravel = fit.vector()
-    found = _second_order(vector, unravel, fit.problem)
-    hessian, mixed = (np.asarray(part) for part in found)
-    # In units of the unknowns' own curvature: a value at rest may be known a million times worse.
-    curvature = np.diagonal(hessian)
-    unit = 1 / np.sqrt(np.where(curvature > 0, curvature, 1.0))
-    scaled = hessian * np.outer(unit, unit)
-    inverse = np.linalg.pinv(scaled, rcond=1e-13, hermitian=True) * np.outer(unit, unit)
-    p, n = len(vector), len(fit.data.level)
-    by_state = -inverse @ mixed.reshape(p, -1)
-    n_priors = fit.data.n_levels * len(LEVEL_ERRORS) + len(fit.unknowns.linear)
-    by_bends = inverse @ _bend_slopes(fit).T
-    by_prior = np.concatenate([inverse[:, p - n_priors :], by_bends], axis=1)
-    spread = by_state * np.asarray(fit.data.std).reshape(-1)
-    return Sensitivity(
-        by_measurement=by_state.reshape(p, n, len(STATE_ERRORS)),
-        by_prior=by_prior,
-        covariance=spread @ spread.T + by_prior @ by_prior.T,
-    )
-
-
-@compiled
-def _second_order(
-    vector: Array,
-    unravel: Unravel,
-    problem: BalanceProblem,
-) -> tuple[Array, Array]:
-    data = problem.data
-
-    def anew(unknowns: Unknowns, error: Array) -> Array:
-        """Records that err by so much, corrected for their most likely errors again."""
-        erring = problem.with_data(
-            force=data.force * jnp.exp(error[:, 0]),
-            velocity=data.velocity * jnp.exp(error[:, 1] + 1j * error[:, 2]),
-            correction=data.correction - error,
-        )
-        errors, own = nearest_errors(unknowns, erring)
-        return whitened(unknowns, erring.with_data(correction=errors), own)
-
-    def gradient(vector: Array, error: Array) -> Array:
-        def cost(vector: Array) -> Array:
-            unknowns = unravel(vector)
-            points = anew(unknowns, error)
-            curves = (unknowns.squared_frequency, unknowns.modal_damping)
-            priors = jnp.sum(unknowns.level**2) + jnp.sum(unknowns.linear**2)
-            priors = priors + sum(jnp.sum(c.prior_residuals() ** 2) for c in curves)
-            return 0.5 * (jnp.sum(points**2) + priors)
-
-        return jax.grad(cost)(vector)
-
-    none = jnp.zeros((len(data.level), len(STATE_ERRORS)))
-    hessian = jax.jacfwd(gradient)(vector, none)
-    # Every state's errors enter its own residuals: one pull back for each unknown.
-    mixed = jax.jacrev(gradient, argnums=1)(vector, none)
-    return hessian, mixed
-
-
 @compiled
 def _slopes_of_prior(curve: AbstractCurve) -> Float[Array, "row parameter"]:
     def of(parameters: Array) -> Array:
@@ -218,7 +135,7 @@ def contributions(fit: JointFit, *, n_amplitudes: int = 25) -> Contributions:
     by_state = np.einsum("pq,siq,sie->pse", inverse, points, by_error) * np.asarray(fit.data.std)
     measured = np.asarray(fit.motion().displacement)
     at = np.linspace(measured.min(), measured.max(), n_amplitudes)
-    slopes = values_at_displacement(fit, at)[1]
+    slopes = values_at_displacement(fit, at).slopes
 
     rows: list[tuple[str, str, np.ndarray]] = []
     for k, kind in enumerate(STATE_ERRORS):
