@@ -139,7 +139,7 @@ def level_gains(misfit: WeightedMisfit, fit: EffectFit) -> dict[int, LevelGain]:
     """By level: the acting force over the recorded one, where the misfit leaves it free."""
     predictions, gains = misfit.predictions, {}
     # Among the shared errors they come after the baseline's and a gain of all forces.
-    first = len(predictions.stated) + (predictions.force_gain_std > 0)
+    first = predictions.n_baseline_errors
     moved = misfit.noise.shared_errors(fit.rows)
     for k, place in enumerate(predictions.free_level_forces, first):
         value = 1 + FREE_LEVEL_FORCE_STD * float(moved[k])

@@ -179,8 +179,8 @@ def shared_by_both(
     A force of a level that is free is one of the levels'.
     """
     parts = old.noise.shared, new.noise.shared[kept]
-    common = [part[:, : old.first_level_force] for part in parts]
-    apart = [part[:, old.first_level_force :] for part in parts]
+    n = old.predictions.n_baseline_errors
+    common, apart = [part[:, :n] for part in parts], [part[:, n:] for part in parts]
     own = [part.shape[1] for part in apart]
     blank = np.zeros((len(parts[0]), own[1])), np.zeros((len(parts[1]), own[0]))
     return np.concatenate(

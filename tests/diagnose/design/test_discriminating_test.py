@@ -62,12 +62,12 @@ def test_a_free_force_of_a_measured_level_says_nothing_of_a_further_test():
     further = weighted_misfit(predictions)
     kept = np.arange(further.n_rows) < 6
     shared = shared_by_both(freed, further, kept)
-    by_force = shared[:, freed.first_level_force]
+    by_force = shared[:, predictions.n_baseline_errors]
     assert np.max(np.abs(by_force[: freed.n_rows])) > 1.0
     np.testing.assert_array_equal(by_force[freed.n_rows :], 0.0)
     # The gain that all forces share is that of both.
     np.testing.assert_array_equal(
-        shared[freed.n_rows :, freed.first_level_force - 1], further.noise.shared[kept][:, -1]
+        shared[freed.n_rows :, predictions.n_baseline_errors - 1], further.noise.shared[kept][:, -1]
     )
 
 
