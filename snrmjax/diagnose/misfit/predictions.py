@@ -107,6 +107,11 @@ class Predictions:
     error_scale: float = 1.0  # of errors over those that were stated or assumed
     free_level_forces: tuple[int, ...] = ()  # places of levels whose force has a gain of its own
 
+    @property
+    def n_baseline_errors(self) -> int:
+        """How many shared errors are the baseline's: they come first, then those of levels."""
+        return len(self.stated) + (self.force_gain_std > 0)
+
     def carried_back(self, by_error: Float[np.ndarray, "state column input"]) -> "Predictions":
         """The same as the records have it, by what errors do to the columns."""
         offset = -np.einsum("sci,si->sc", by_error, self.added)

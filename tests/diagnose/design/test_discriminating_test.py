@@ -3,6 +3,8 @@
 The states are those of `truths.growing_damping`.
 """
 
+import dataclasses
+
 import numpy as np
 import pytest
 from truths.growing_damping import (
@@ -58,7 +60,7 @@ def test_a_sum_of_squares_is_refitted_with_all_that_is_free():
 
 def test_a_free_force_of_a_measured_level_says_nothing_of_a_further_test():
     predictions = predictions_of(linear_model(), measured(), force_gain_std=0.2)
-    freed = weighted_misfit(predictions.with_level_forces_free((1,)))
+    freed = weighted_misfit(dataclasses.replace(predictions, free_level_forces=(1,)))
     further = weighted_misfit(predictions)
     kept = np.arange(further.n_rows) < 6
     shared = shared_by_both(freed, further, kept)
