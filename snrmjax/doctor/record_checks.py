@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from snrmjax.doctor.findings import FORCE_HARMONICS, Finding, Repair, percent
+from snrmjax.doctor.findings import FORCE_HARMONICS, Finding, percent
 from snrmjax.doctor.force_checks import fall
 from snrmjax.doctor.priors import (
     CERTAIN,
@@ -260,7 +260,6 @@ def _unsettled(
             f"the end, by up to {percent(worst)} (from {one.start / rate:.4g} s on).",
             "dwell longer, 5/(ζω) a step; or import this record, whose unsettled steps are left "
             "out.",
-            repairs=(Repair(read_record=True),),
         )
     ]
 

@@ -56,15 +56,15 @@ def whole_test(
     these names.
     """
     from snrmjax.report.whole_test.folder_contents import read_test_files
-    from snrmjax.report.whole_test.mends import tested_files
+    from snrmjax.report.whole_test.mends import files_of_test
     from snrmjax.report.whole_test.stages import TestRequest, run_whole_test
 
     with staged(out) as target:
         began = time.perf_counter()
         files = read_test_files(folder, model)
         say(f"files: {time.perf_counter() - began:.1f} s")
-        place = tested_files(folder, files, model, drive_point, out)
-        request = TestRequest(drive_point, go_on=go_on, diagnose=diagnose, place=place)
+        read = files_of_test(folder, files)
+        request = TestRequest(drive_point, go_on=go_on, diagnose=diagnose, read=read)
         name = folder.resolve().name
         found = run_whole_test(target, files, name, request, progress=say)
     for note in found.notes:

@@ -119,7 +119,8 @@ def write_import(folder: Path, found: Imported, files: Sequence[str] = ()) -> li
         write_atomically(folder / f"{stem}.csv", "\n".join(lines) + "\n")
         written.append(f"{stem}.csv")
     notes = tuple(dict.fromkeys(found.notes))
-    write_atomically(folder / "map.toml", map_text(found.used, found.assumed, notes, files))
+    text = map_text(found.used, found.assumed, notes, files, found.steps)
+    write_atomically(folder / "map.toml", text)
     return [*written, "map.toml"]
 
 

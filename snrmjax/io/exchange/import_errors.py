@@ -5,14 +5,13 @@ import re
 import numpy as np
 from jaxtyping import Float
 
-from snrmjax.io.exchange.import_map import ImportMap, ResponseMap
-from snrmjax.io.exchange.import_units import Assumptions
+from snrmjax.io.exchange.import_map import Assumption, Assumptions, ImportMap, ResponseMap
 from snrmjax.io.files import near_miss
 from snrmjax.io.laboratory.contents import NumberTable
 from snrmjax.io.laboratory.names import role_of
 
 _DEVIATION = re.compile(r"stdev|stddev|std|sigma|deviation|dev")
-_OF_ONE_ROW = "1σ of the row, by its name (if of each of N readings: divide by √N)"
+_OF_ONE_ROW = Assumption("1σ of the row, by its name (if of each of N readings: divide by √N)")
 
 
 def with_errors_by_name(

@@ -1,9 +1,7 @@
 """The map of an import: which channel or column is what, as options and as `map.toml`."""
 
-import os
 import shlex
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import tomli_w
@@ -11,6 +9,7 @@ import tomli_w
 from snrmjax.io.files import FilePath, file_name, read_text, shown
 from snrmjax.io.laboratory.contents import TextFormat
 from snrmjax.io.toml_table import TomlTable, parsed_toml
+from snrmjax.measure.recordings.step_counts import StepCounts
 
 RECORD_KINDS = ("steps", "sweep", "decay", "broadband")
 """What a time record may be: the last two are written as records, not as steady states."""
@@ -46,6 +45,27 @@ _MEANING = {
     "decimal": "mark of a text's numbers; empty: found",
     "header_row": "row of a text's names, from 1; 0: found",
 }
+
+
+class Assumption(NamedTuple):
+    """Why something was taken that nobody stated, and its value where the map has none yet."""
+
+    why: str
+    value: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.value}: {self.why}" if self.value else self.why
+
+
+class Assumptions(dict[str, Assumption]):
+    """What was taken for each key of the map that nobody stated, and why."""
+
+    def unit(self, key: str, told: str, file_unit: str) -> None:
+        """Record where a unit comes from: the map wins over the file."""
+        if not told and file_unit:
+            self[key] = Assumption("the file says so", file_unit)
+        elif told and file_unit and told != file_unit:
+            self[key] = Assumption(f"stated, though the file says {file_unit}", told)
 
 
 class ResponseMap(NamedTuple):
@@ -126,7 +146,7 @@ def read_import_map(path: FilePath) -> ImportMap:
     """A map from its TOML. Raises `ValueError` that names file, key and what was expected."""
     file = file_name(path)
     table = parsed_toml(read_text(path), file)
-    table.check_keys((), (*_MEANING, "response"))
+    table.check_keys((), (*_MEANING, "response", "steps"))
     found: dict[str, Any] = {}
     for key in _MEANING:
         if key not in table.entries:
@@ -163,32 +183,29 @@ def _amplitudes(table: TomlTable) -> tuple[str, ...]:
     return tuple(map(repr, table.numbers("force_amplitude", each="entry")))
 
 
-_FILES = "# files: "
-
-
-def files_of_map(path: FilePath) -> tuple[Path, ...]:
-    """The files that were read when a map was written; none where one of them is gone."""
-    lines = [line for line in read_text(path).splitlines() if line.startswith(_FILES)]
-    words = shlex.split(lines[0].removeprefix(_FILES)) if lines else []
-    files = tuple(Path(os.path.normpath(Path(path).parent / one)) for one in words)
-    return files if all(one.is_file() for one in files) else ()
+def steps_of_map(path: FilePath) -> StepCounts | None:
+    """How many steps of the records an import used; None where there were none."""
+    found = parsed_toml(read_text(path), file_name(path)).entries.get("steps")
+    return None if found is None else StepCounts(found["used"], found.get("left_out", {}))
 
 
 def map_text(
     used: ImportMap,
-    assumed: Mapping[str, str],
+    assumed: Mapping[str, Assumption],
     notes: tuple[str, ...] = (),
     files: Sequence[str] = (),
+    steps: StepCounts | None = None,
 ) -> str:
     """`map.toml`: every key with its meaning, and what was assumed with the reason.
 
     Arguments: `assumed` has the reason of each key that nobody stated; keys of the k-th response
-    (from 1) as "response 1.unit"; `files` that were read, as seen from the map's folder.
+    (from 1) as "response 1.unit"; `files` that were read, as seen from the map's folder;
+    `steps` of the records that were used and left out.
     """
     lines = [
         "# How the laboratory's files were read. Take it for the next test: snrmjax import "
         "FILE --map map.toml --out DIR",
-        *([_FILES + shlex.join(files)] if files else []),
+        *(["# files: " + shlex.join(files)] if files else []),
         *(f"# note: {' '.join(note.split())}" for note in notes),
     ]
     for key, meaning in _MEANING.items():
@@ -201,14 +218,17 @@ def map_text(
         for key, value in one._asdict().items():
             why = _comment(f"response {k + 1}.{key}", value, assumed)
             lines.append(_line(key, value) + (f"  # {why}" if why else ""))
+    if steps is not None:
+        lines += ["", tomli_w.dumps({"steps": steps._asdict()}).rstrip()]
     return "\n".join(lines) + "\n"
 
 
-def _comment(key: str, value: object, assumed: Mapping[str, str]) -> str:
+def _comment(key: str, value: object, assumed: Mapping[str, Assumption]) -> str:
     """Why a value was assumed, and what else it could be; empty for one that was stated."""
     if key not in assumed:
         return ""
-    why = " ".join(assumed[key].split()).removeprefix(f"{value}: ")
+    one = assumed[key]
+    why = " ".join((one.why if one.value == value else str(one)).split())
     others = ", ".join(one for one in CHOICES.get(key, ()) if one not in ("", value))
     return f"assumed: {why}" + (f" (else {others})" if others else "")
 

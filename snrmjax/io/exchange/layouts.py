@@ -1,6 +1,7 @@
 """Records, responses and steady states as named arrays and texts: what MATLAB and netCDF hold."""
 
 import dataclasses
+from pathlib import Path
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -9,6 +10,7 @@ from jaxtyping import Num
 
 from snrmjax.io.exchange.import_map import ImportMap
 from snrmjax.io.exchange.import_units import AMPLITUDE_FACTORS, force_meaning, motion_meaning
+from snrmjax.io.files import read_text
 from snrmjax.io.laboratory.contents import NumberTable
 from snrmjax.io.tables import steady_state_fields, steady_states_of_fields
 from snrmjax.io.units import HERTZ, in_unit
@@ -22,6 +24,7 @@ SHORTEST_RECORD = 64
 """Samples below which readers take columns beside a time for a table, not for a record."""
 
 _OWN = ("frequency_hz", "velocity_re_m_s", "velocity_im_m_s")
+_OWN_FILES = ({"frequency_hz", "velocity_re_m_s"}, {"frequency_hz", "velocity_m_s", "level"})
 
 
 class Field(NamedTuple):
@@ -85,6 +88,12 @@ def state_fields(states: SteadyStates, file: str) -> dict[str, Field]:
 def is_own_table(table: NumberTable) -> bool:
     """Whether a table has the columns of our CSV."""
     return all(name in table.columns for name in _OWN)
+
+
+def is_own_file(path: Path) -> bool:
+    """Whether a CSV is meant as ours, by its header: its reader then says what is amiss."""
+    header = {word.strip().strip("\ufeff") for word in read_text(path).split("\n", 1)[0].split(",")}
+    return any(columns <= header for columns in _OWN_FILES)
 
 
 def states_of_own_table(table: NumberTable, file: str) -> SteadyStates:

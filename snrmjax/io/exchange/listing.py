@@ -74,8 +74,8 @@ def _columns(table: NumberTable) -> list[str]:
     if frequency and force and not _first(table, ("level",)):
         size = np.abs(table.columns[force])
         if np.all(size > 0) and np.isfinite(size).all():
-            number, note = number_levels("auto", size, None, np.real(table.columns[frequency]))
-            lines.append(f"    found: {counted_levels(number, note)}")
+            number, rule = number_levels("auto", size, None, np.real(table.columns[frequency]))
+            lines.append(f"    found: {counted_levels(number, rule)}")
     lines += [
         f"    {name}: text, {', '.join(list(dict.fromkeys(words))[:4])}"
         for name, words in table.words.items()

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from snrmjax.io.exchange.import_levels import MeasuredPart
-from snrmjax.io.exchange.import_map import ImportMap, ResponseMap
-from snrmjax.io.exchange.import_units import Assumptions, Force, force_meaning, motion_meaning
+from snrmjax.io.exchange.import_map import Assumption, Assumptions, ImportMap, ResponseMap
+from snrmjax.io.exchange.import_units import Force, force_meaning, motion_meaning
 from snrmjax.io.files import near_miss
 from snrmjax.measure.recordings.channels import Channel, Quantity
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
@@ -51,7 +51,7 @@ def import_responses(
         else:
             channel = one.references[reference]
             if not _si(channel) and not told.force_unit:
-                assumed["force_unit"] = "N: the file states none of the reference"
+                assumed["force_unit"] = Assumption("the file states none of the reference", "N")
             if told.force_unit and _si(channel) not in ("", told.force_unit):
                 raise ValueError(
                     f"--force-unit says {told.force_unit}, but the responses of {file} are over "
@@ -87,16 +87,18 @@ def import_responses(
             )
         )
     if spectra:
-        assumed["force_amplitude"] = "spectra or responses over one reference, of amplitude 1"
+        assumed["force_amplitude"] = Assumption(
+            "spectra or responses over one reference, of amplitude 1"
+        )
     if not told.level:
-        assumed["level"] = "one level a set of responses, in the file's order"
+        assumed["level"] = Assumption("one level a set of responses, in the file's order")
     if told.level not in ("", "z", "order", "force", "runs", "file"):
         raise ValueError(f"--level must be order, z, force or file of {file}, not {told.level!r}.")
     if told.level == "z" and not np.isfinite(z).all():
         raise ValueError(f"--level z: {file} states no value on the z axis: --level order.")
     told = told._replace(responses=responses, level=told.level or "order")
     if spectra and not told.amplitude:
-        assumed["amplitude"] = "peak: nothing is said"
+        assumed["amplitude"] = Assumption("nothing is said", "peak")
     if spectra:
         factor = _PEAK[told.amplitude]
         parts = [p._replace(force=p.force * factor, velocity=p.velocity * factor) for p in parts]
@@ -168,10 +170,10 @@ def _velocity(
     if whole.phase_sign == "lag":
         values = values.conj()
     elif not whole.phase_sign:
-        assumed["phase_sign"] = "lead: phasors are e^(+iwt)"
+        assumed["phase_sign"] = Assumption("phasors are e^(+iwt)", "lead")
     sensor = told.sensor or (UNNAMED_SENSOR[0] if len(whole.responses) == 1 else told.channel)
     if not told.sensor:
-        assumed[f"response {number}.sensor"] = "not stated; --sensor names it"
+        assumed[f"response {number}.sensor"] = Assumption("not stated; --sensor names it")
     as_channel = Channel(told.channel, _motion(quantity))
     turn = velocity_factors([as_channel], [1], one.frequency)[:, 0, 0]
     return values * turn, ResponseMap(told.channel, quantity, told.unit, sensor)

@@ -7,9 +7,8 @@ from jaxtyping import Complex, Float
 
 from snrmjax.io.exchange.import_errors import response_errors, with_errors_by_name
 from snrmjax.io.exchange.import_levels import MeasuredPart
-from snrmjax.io.exchange.import_map import ImportMap, ResponseMap
+from snrmjax.io.exchange.import_map import Assumption, Assumptions, ImportMap, ResponseMap
 from snrmjax.io.exchange.import_units import (
-    Assumptions,
     Force,
     amplitude_factor,
     force_meaning,
@@ -128,7 +127,7 @@ def _response(
     )
     assumed.unit(f"response {number}.unit", one.unit, table.units.get(one.channel, ""))
     if not one.quantity:
-        assumed[f"response {number}.quantity"] = f"the unit {unit} says so"
+        assumed[f"response {number}.quantity"] = Assumption(f"the unit {unit} says so")
     role = role_of(one.channel)
     imaginary, phase = one.imaginary, one.phase
     if np.iscomplexobj(values):
@@ -144,14 +143,16 @@ def _response(
                     f"{', '.join(table.columns)}."
                 )
             key = "imaginary" if imaginary else "phase"
-            assumed[f"response {number}.{key}"] = "by the names of the columns"
+            assumed[f"response {number}.{key}"] = Assumption("by the names of the columns")
         if imaginary:
             phasor = np.empty(len(values), dtype=complex)
             phasor.real, phasor.imag = values, _real(table, imaginary, file, "--imaginary")
             if told.phase_sign == "lag":
                 phasor = phasor.conj()
             elif not told.phase_sign:
-                assumed["phase_sign"] = "lead: a positive imaginary part is ahead of the force"
+                assumed["phase_sign"] = Assumption(
+                    "a positive imaginary part is ahead of the force", "lead"
+                )
         else:
             if np.nanmin(values, initial=0.0) < 0:
                 raise ValueError(
@@ -161,7 +162,7 @@ def _response(
             phasor = values * np.exp(1j * _phase(table, phase, told, file, assumed, "--phase"))
     sensor = one.sensor or (UNNAMED_SENSOR[0] if len(told.responses) == 1 else one.channel)
     if not one.sensor:
-        assumed[f"response {number}.sensor"] = "not stated; --sensor names it"
+        assumed[f"response {number}.sensor"] = Assumption("not stated; --sensor names it")
     turn = velocity_factors([Channel(one.channel, quantity)], [1], omega)[:, 0, 0]  # type: ignore[arg-type]
     filled = one._replace(quantity=quantity, sensor=sensor, phase=phase, imaginary=imaginary)
     return phasor * factor * turn, filled, factor * turn
@@ -212,7 +213,7 @@ def _level(
         )
     columns = columns_by_role(table, "level")
     if len(columns) == 1 and np.isfinite(_real(table, columns[0], file, "--level")).all():
-        assumed["level"] = "the column's name says so"
+        assumed["level"] = Assumption("the column's name says so")
         return columns[0], _real(table, columns[0], file, "--level")
     return "", None
 
@@ -259,7 +260,7 @@ def _only(
     if len(found) != 1:
         listed = ", ".join(found or table.columns)
         raise ValueError(f"which column of {file} is the {what}? {option} names it, of {listed}.")
-    assumed[what] = "the column's name says so"
+    assumed[what] = Assumption("the column's name says so")
     return found[0]
 
 
