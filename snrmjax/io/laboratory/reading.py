@@ -5,7 +5,7 @@ import os
 from pathlib import Path
 
 from snrmjax.io.files import FilePath, file_name
-from snrmjax.io.laboratory.arrays.matlab4_files import begins_as_v4
+from snrmjax.io.laboratory.arrays.matlab_files import is_old_matlab
 from snrmjax.io.laboratory.contents import Kind, LaboratoryFile, TextFormat
 
 _ROOM = "snrmjax.io.laboratory"
@@ -64,7 +64,7 @@ def _kind(path: FilePath) -> Kind:
         return "matlab" if matlab else "netcdf" if netcdf else "hdf5"
     if head.startswith(b"TDSm"):
         return "tdms"
-    if head.startswith(b"MATLAB 5") or begins_as_v4(head):
+    if is_old_matlab(head, Path(path).suffix):
         return "matlab"
     first = head.lstrip(b"\r\n").split(b"\n", 1)[0].rstrip()
     if first == b"    -1":
