@@ -1,4 +1,4 @@
-"""Records, responses and steady states as named arrays and texts: what MATLAB and netCDF hold."""
+"""Records as named arrays and texts, and tables with the columns of our CSV."""
 
 import dataclasses
 from pathlib import Path
@@ -12,10 +12,8 @@ from snrmjax.io.exchange.import_map import ImportMap
 from snrmjax.io.exchange.import_units import AMPLITUDE_FACTORS, force_meaning, motion_meaning
 from snrmjax.io.files import read_text
 from snrmjax.io.laboratory.contents import NumberTable
-from snrmjax.io.tables import steady_state_fields, steady_states_of_fields
-from snrmjax.io.units import HERTZ, in_unit
+from snrmjax.io.tables import steady_states_of_fields
 from snrmjax.measure.recordings.channels import Channel
-from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.recordings.velocity_states import velocity_factors
 from snrmjax.measure.states import SteadyStates
@@ -54,35 +52,6 @@ def record_fields(record: TimeRecording, file: str) -> dict[str, Field]:
         "point": Field(at, [one.point for one in record.channels]),
         "direction": Field(at, [one.direction for one in record.channels]),
     }
-
-
-def response_fields(one: FrequencyResponses, level: float) -> dict[str, Field]:
-    """Frequency responses in SI units, Hz, and their level (NaN: not stated)."""
-    every = ("response", "reference", "frequency")
-    return {
-        "frequency_hz": Field(
-            every[2:], np.array([in_unit(float(omega), HERTZ) for omega in one.frequency])
-        ),
-        "value_re": Field(every, np.ascontiguousarray(one.values.real)),
-        "value_im": Field(every, np.ascontiguousarray(one.values.imag)),
-        "coherence": Field(every, one.coherence),
-        "response": Field(every[:1], [_line(channel) for channel in one.responses]),
-        "reference": Field(every[1:2], [_line(channel) for channel in one.references]),
-        "level_value": Field((), np.asarray(float(level))),
-    }
-
-
-def state_fields(states: SteadyStates, file: str) -> dict[str, Field]:
-    """Steady states by the columns of our CSV, one row a state and sensor.
-
-    Raises `ValueError` as `write_steady_states` does.
-    """
-    found = {}
-    for name, texts in steady_state_fields(states, file).items():
-        numbers = name != "sensor"
-        values = np.array([float(text) if text else np.nan for text in texts]) if numbers else texts
-        found[name] = Field(("row",), values)
-    return found
 
 
 def is_own_table(table: NumberTable) -> bool:
@@ -176,8 +145,3 @@ def _text(value: float) -> str:
     if np.isnan(number):
         return ""
     return str(int(number)) if number.is_integer() and abs(number) < 2**53 else repr(number)
-
-
-def _line(one: Channel) -> str:
-    """A channel as a line of text."""
-    return "|".join((one.name, one.quantity, one.si_unit, one.point, one.direction))

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import scipy.io
 from truths.import_runs import run_import as run
+from truths.uff_writing import write_uff
 
 from snrmjax.io import read_steady_states, write_steady_states
 from snrmjax.io.exchange.exports import write_netcdf
 from snrmjax.io.exchange.import_map import read_import_map
-from snrmjax.io.laboratory.uff.writing import write_uff
 from snrmjax.measure import Channel, steady_states, time_recording
 from snrmjax.measure.recordings.frequency_responses import frequency_responses
 
@@ -183,7 +183,7 @@ def stepped(n_steps=4):
 
 def test_a_record_of_steps_in_volts(tmp_path):
     path = tmp_path / "steps.nc"
-    write_netcdf(path, recordings=[stepped()])
+    write_netcdf(path, [stepped()])
     words = ("--force", "CH1", "--force-unit", "50 N", "--response", "CH2:acceleration")
     states = imported(tmp_path, path, *words, "--unit", "10 g", "--level", "force")
     np.testing.assert_allclose(states.frequency, HERTZ * np.arange(20, 24), rtol=1e-5)
@@ -195,7 +195,7 @@ def test_a_record_of_steps_in_volts(tmp_path):
 
 def test_options_without_effect_are_refused(tmp_path):
     path = tmp_path / "steps.nc"
-    write_netcdf(path, recordings=[stepped()])
+    write_netcdf(path, [stepped()])
     words = (path, "--force", "CH1", "--force-unit", "50 N", "--out", tmp_path / "out")
     code, said = run(*words, "--response", "CH2:acceleration:10 g", "--unit", "g")
     assert code == 2

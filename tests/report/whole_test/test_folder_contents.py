@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from truths.matlab_writing import write_matlab
+from truths.uff_writing import write_uff
 
-from snrmjax.io.exchange.exports import write_matlab
-from snrmjax.io.laboratory.uff.writing import write_uff
 from snrmjax.measure import Channel, frequency_responses, time_recording
 from snrmjax.measure.states import with_levels_apart
 from snrmjax.report.whole_test.folder_contents import read_test_files

@@ -6,14 +6,14 @@ import re
 import numpy as np
 import pytest
 from truths.import_runs import run_import
+from truths.matlab_writing import write_matlab
+from truths.uff_writing import write_uff
 from typer.testing import CliRunner
 
 import snrmjax as sj
 from snrmjax.cli import app
 from snrmjax.doctor import Checkup
-from snrmjax.io.exchange.exports import write_matlab
 from snrmjax.io.exchange.import_map import steps_of_map
-from snrmjax.io.laboratory.uff.writing import write_uff
 from snrmjax.measure import Channel, frequency_responses, time_recording
 from snrmjax.measure.recordings.step_counts import StepCounts, joined_counts
 from snrmjax.report.html import LiveFigures, Report

@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from snrmjax.io.laboratory.arrays.own_responses import take_responses
 from snrmjax.io.laboratory.arrays.structs import read_struct
 from snrmjax.io.laboratory.arrays.value_tree import Node
 from snrmjax.io.laboratory.contents import Kind, LaboratoryFile
@@ -19,18 +18,17 @@ def file_of_tree(
 ) -> LaboratoryFile:
     """All that is found in a tree; `notes` say what of the file is not in it."""
     budget = Budget(name)
-    own, rest = take_responses(tree, budget)
-    found = read_struct("", rest, budget)
-    if not (own or found.recordings or found.responses or found.tables):
+    found = read_struct("", tree, budget)
+    if not (found.recordings or found.responses or found.tables):
         listed = f" ({', '.join(list(tree)[:_MOST_NAMED])})" if tree else ""
         notes = [*notes, *(() if notes or found.notes else (f"{_NOTHING}{listed}.",))]
     return LaboratoryFile(
         name,
         kind,
         tuple(found.recordings),
-        (*(one for one, _ in own), *found.responses),
+        tuple(found.responses),
         found.numbered(),
         (),
         tuple(dict.fromkeys((*notes, *found.notes))),
-        (*(level for _, level in own), *(np.nan for _ in found.responses)),
+        tuple(np.nan for _ in found.responses),
     )
