@@ -1,4 +1,4 @@
-"""Universal files of what tests made: functions 58b or 58, mode shapes 55."""
+"""Universal files of what tests made: functions 58b or 58."""
 
 import re
 import tempfile
@@ -41,8 +41,8 @@ _HEADER_LINES, _LITTLE_ENDIAN, _IEEE = 11, 1, 2
 _AXES = ("abscissa", "ordinate", "orddenom", "z_axis")
 
 
-def write_uff(path, *, recordings=(), responses=(), levels=(), shapes=(), binary=True):
-    """Write time records, frequency responses (data sets 58) and mode shapes (55) in SI units.
+def write_uff(path, *, recordings=(), responses=(), levels=(), binary=True):
+    """Write time records, frequency responses (data sets 58) in SI units.
 
     `levels` has one number for each of `responses`, their z axis. In text (`binary` False) values
     have twelve digits and uneven abscissae six.
@@ -50,8 +50,6 @@ def write_uff(path, *, recordings=(), responses=(), levels=(), shapes=(), binary
     sets = [fields for record in recordings for fields in _of_recording(record)]
     for one, z in zip(responses, levels or [0.0] * len(responses), strict=True):
         sets += _of_responses(one, float(np.nan_to_num(z)))
-    for modes in shapes:
-        sets += _of_shapes(modes)
     functions = [fields for fields in sets if fields["type"] == 58 and binary]
     others = [fields for fields in sets if not (binary and fields["type"] == 58)]
     with tempfile.TemporaryDirectory() as folder:
@@ -119,50 +117,6 @@ def _side(one, side, axis):
         f"{axis}_spec_data_type": _TYPES[one.quantity],
         f"{axis}_axis_units_lab": one.si_unit or "NONE",
     }
-
-
-def _of_shapes(modes):
-    """Mode shapes: one data set a mode, real (normal mode) or complex."""
-    points = list(dict.fromkeys(modes.points))
-    axes = ["+x", "+y", "+z", "+rx", "+ry", "+rz"]
-    ways = [way.replace("-", "+") if way else "+x" for way in modes.directions]
-    rotated, real = any("r" in way for way in ways), modes.is_real
-    kinds = np.float64 if real else np.complex128
-    sets = []
-    for k, shape in enumerate(modes.shapes):
-        every = np.zeros((6 if rotated else 3, len(points)), dtype=kinds)
-        for value, point, way, said in zip(
-            shape, modes.points, ways, modes.directions, strict=True
-        ):
-            sign = -1 if said.startswith("-") else 1
-            every[axes.index(way), points.index(point)] = sign * (value.real if real else value)
-        sets.append(
-            {
-                "type": 55,
-                "data_ch": 3 if rotated else 2,
-                "spec_data_type": 8,
-                "load_case": 0,
-                "mode_n": k + 1,
-                "node_nums": np.array([int(point) for point in points]),
-                **{f"r{axis + 1}": row for axis, row in enumerate(every)},
-                **_modal_fields(modes, k),
-            }
-        )
-    return sets
-
-
-def _modal_fields(modes, k):
-    """Frequency and damping of a mode, as those of a normal mode or as an eigenvalue."""
-    omega, ratio = float(modes.frequency[k]), float(np.nan_to_num(modes.damping_ratio[k]))
-    if modes.is_real:
-        return {
-            "analysis_type": 2,
-            "freq": in_unit(omega, HERTZ),
-            "modal_m": float(np.nan_to_num(modes.modal_mass[k])),
-            "modal_damp_vis": ratio,
-            "modal_damp_his": 0.0,
-        }
-    return {"analysis_type": 3, "eig": complex(-ratio * omega, omega * np.sqrt(1 - ratio**2))}
 
 
 def _binary_function(fields):

@@ -98,12 +98,6 @@ def _datasets(held: LaboratoryFile, told: ImportMap) -> list[_Dataset]:
     every += [_Dataset(one.name, held.name, one) for one in held.tables]
     if held.responses:
         every.append(_Dataset("responses", held.name, held.responses, held.levels))
-    if not every:
-        what = " and ".join([*["mode shapes"] * bool(held.shapes), *["nodes"] * bool(held.nodes)])
-        raise ValueError(
-            f"{held.name} holds {what} only: a model is made of mode shapes by hand, or of "
-            "frequency responses by `snrmjax modes`."
-        )
     names = [one.name for one in every]
     if told.dataset:
         alike = [one for one in every if one.name == told.dataset]

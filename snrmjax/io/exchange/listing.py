@@ -42,13 +42,6 @@ def listed_contents(held: LaboratoryFile) -> list[str]:
         lines += _short([f"    reference {channel}" for channel in one.references])
     if len(held.responses) > _MOST:
         lines.append(f"  … {len(held.responses) - _MOST} further sets of responses")
-    for shapes in held.shapes:
-        lines.append(
-            f"  mode shapes {shapes.name}: {len(shapes.frequency)} modes at "
-            f"{len(shapes.points)} places"
-        )
-    for nodes in held.nodes:
-        lines += [f"  {nodes.name}: {nodes.n_rows} points of the structure", *_columns(nodes)]
     return [*lines, *(f"  note: {note}" for note in held.notes[:_MOST])]
 
 

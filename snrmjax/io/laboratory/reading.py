@@ -23,9 +23,9 @@ _HDF5 = b"\x89HDF\r\n\x1a\n"
 
 
 def read_laboratory_file(path: FilePath, text_format: TextFormat | None = None) -> LaboratoryFile:
-    """All recordings, frequency responses, tables and shapes of a file.
+    """All recordings, frequency responses and tables of a file.
 
-    Formats: UFF/UNV (58, 58b, 55, 15, 2411, 151, 164), MATLAB v4 to v7.3, HDF5, netCDF 4, TDMS, and
+    Formats: UFF/UNV (58, 58b), MATLAB v4 to v7.3, HDF5, netCDF 4, TDMS, and
     CSV or other separated text. Long records are not read before they are asked for (HDF5,
     netCDF, MATLAB v7.3, TDMS).
     Arguments: `text_format` says how a CSV is written where that is not found out by itself.

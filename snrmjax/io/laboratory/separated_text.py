@@ -68,7 +68,7 @@ def read_separated_text(path: Path, text_format: TextFormat | None = None) -> La
     stem = path.stem or "table"
     tables = tuple(table._replace(name=stem) for table in found.numbered())
     records = tuple(found.recordings)
-    return LaboratoryFile(file, "csv", records, (), tables, (), (*notes, *found.notes))
+    return LaboratoryFile(file, "csv", records, (), tables, (*notes, *found.notes))
 
 
 def _exact() -> dict[str, Any]:

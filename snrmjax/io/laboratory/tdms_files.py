@@ -138,7 +138,7 @@ def _read(path: Path) -> LaboratoryFile:
         tables.extend(table._replace(name=name) for table in found.numbered())
         notes.extend(found.notes)
     return LaboratoryFile(
-        path.name, "tdms", tuple(recordings), (), tuple(tables), (), tuple(dict.fromkeys(notes))
+        path.name, "tdms", tuple(recordings), (), tuple(tables), tuple(dict.fromkeys(notes))
     )
 
 

@@ -28,7 +28,6 @@ def file_of_tree(
         tuple(found.recordings),
         tuple(found.responses),
         found.numbered(),
-        (),
         tuple(dict.fromkeys((*notes, *found.notes))),
         tuple(np.nan for _ in found.responses),
     )
