@@ -19,9 +19,9 @@ from snrmjax.model.structures import Structure, modes_of
 from snrmjax.report.html import Report, ReportFigure, ReportTable, Section, number, write_report
 from snrmjax.report.style import (
     COLUMN,
-    LINE,
     SERIES,
     Style,
+    banded,
     fit_axis,
     legend,
     name_axes,
@@ -132,15 +132,13 @@ def methods_figure(results: tuple[MethodResult, ...]) -> Figure:
             colour, label = SERIES[k % len(SERIES)], _NAMES.get(one.method, one.method)
             kept.append(y)
             if one.method in _LINES:
-                style: Style = {"linestyle": _LINES[one.method], "linewidth": LINE}
+                style: Style = {"linestyle": _LINES[one.method], "zorder": 2}
                 band = 1.96 * np.nan_to_num(spread)
                 level = np.asarray(one.level)[at]
                 for count, run in enumerate(np.unique(level)):  # a curve for each record
                     own = level == run
                     name = label if count == 0 else None
-                    axes.plot(x[own], y[own], color=colour, label=name, **style)
-                    low, high = (y - band)[own], (y + band)[own]
-                    axes.fill_between(x[own], low, high, color=colour, alpha=0.15, linewidth=0)
+                    banded(axes, x[own], y[own], band[own], colour, name, band=None, **style)
             else:
                 size = 4.0 if len(x) <= _FEW else 2.0
                 style = {"markersize": size, "linestyle": "none", "zorder": 3 - 0.01 * len(x)}
