@@ -41,7 +41,7 @@ from snrmjax.report.joint_report import (
     joint_figures,
     joint_sections,
     reported_fit,
-    with_joint_fit,
+    words_of_fit,
 )
 from snrmjax.report.prediction.predictions import (
     Loads,
@@ -312,7 +312,7 @@ def findings_report(
     if "nnm" in figures:
         shown = [ReportFigure(figures["nnm"], MODE_CAPTION)]
         further.append(Section("The nonlinear normal mode", (), shown))
-    report = identification_report(
+    return identification_report(
         found.identification,
         found.model.modes,
         figures,
@@ -324,8 +324,8 @@ def findings_report(
             [f"Resonance at {p.load}: {where_in_words(p.further)}." for p in found.predictions],
         ),
         further=further,
+        words=None if found.fitted is None else words_of_fit(found.fitted.fit),
     )
-    return report if found.fitted is None else with_joint_fit(report, found.fitted.fit)
 
 
 def write_findings(

@@ -1,6 +1,5 @@
 """The command `import`: what a laboratory's files hold, and their way to our tables."""
 
-import inspect
 import os
 from pathlib import Path
 from typing import Annotated, Any
@@ -8,30 +7,8 @@ from typing import Annotated, Any
 import typer
 
 from snrmjax.cli.console import say, staged, warn
-from snrmjax.cli.options import FILES
+from snrmjax.cli.options import FILES, Row, with_options
 from snrmjax.io.exchange.import_map import KEYS, RESPONSE_KEYS, ImportMap, MapKey
-
-_RESPONSE = MapKey(
-    "channel or column of a response, as CH2:acceleration or CH2:acceleration:g; one a sensor",
-    "NAME[:KIND[:UNIT]]",
-)
-
-
-def _parameter(name: str, key: MapKey) -> inspect.Parameter:
-    """The option of a key of the map: a switch, a number, a word, or repeated words."""
-    default: Any = ImportMap._field_defaults.get(name, ())
-    kind: Any = list[str] if isinstance(default, tuple) else type(default)
-    option = typer.Option(
-        f"--{name.replace('_', '-')}",
-        help=f"{key.meaning[0].upper()}{key.meaning[1:]}{' (repeatable)' * (kind == list[str])}.",
-        metavar=key.metavar or None,
-        rich_help_panel=key.group,
-        show_default=False,
-        min=0 if kind is int else None,
-    )
-    annotation = Annotated[kind, option]
-    keyword = inspect.Parameter.KEYWORD_ONLY
-    return inspect.Parameter(name, keyword, default=default or kind(), annotation=annotation)
 
 
 def import_(
@@ -96,8 +73,27 @@ def import_(
     say(f"written to {out}: {', '.join(written)}")
 
 
+_RESPONSE = MapKey(
+    "channel or column of a response, as CH2:acceleration or CH2:acceleration:g; one a sensor",
+    "NAME[:KIND[:UNIT]]",
+)
+
+
+def _row(name: str, key: MapKey) -> Row:
+    """The option of a key of the map: a switch, a number, a word, or repeated words."""
+    default: Any = ImportMap._field_defaults.get(name, ())
+    several = isinstance(default, tuple)
+    said = f"{key.meaning[0].upper()}{key.meaning[1:]}{' (repeatable)' * several}."
+    kind = list[str] if several else type(default)
+    least = 0 if kind is int else None
+    return Row(name, kind, said, key.metavar or None, None if several else default, least)
+
+
 _OPTIONS = {"force": KEYS["force"], "response": _RESPONSE, **RESPONSE_KEYS, **KEYS}
-_FIXED = [one for one in inspect.signature(import_).parameters.values() if one.name != "options"]
-import_.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
-    [*_FIXED, *(_parameter(name, key) for name, key in _OPTIONS.items())]
+with_options(
+    import_,
+    {
+        group: [_row(name, key) for name, key in _OPTIONS.items() if key.group == group]
+        for group in dict.fromkeys(key.group for key in _OPTIONS.values())
+    },
 )

@@ -1,16 +1,14 @@
 """The command `modes`: linear modes from frequency responses, low levels and decays."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from snrmjax.cli.console import say, staged, warn
 from snrmjax.cli.laboratory.modal_sources import read_modal_sources, sensor_values
-from snrmjax.cli.options import FILES
+from snrmjax.cli.options import FILES, Row, with_options
 from snrmjax.io.units import HERTZ
-
-_FIT, _SCALE = "Fit", "Scale of the shapes"
 
 
 def modes(
@@ -34,143 +32,7 @@ def modes(
         ),
     ],
     interest: Annotated[int, typer.Option(help="Mode of interest, from 1.", min=1)] = 1,
-    reference: Annotated[
-        str | None, typer.Option(help="Reference channel where there are several.", metavar="NAME")
-    ] = None,
-    level: Annotated[
-        int | None, typer.Option(help="Level of steady states (default: the lowest).")
-    ] = None,
-    from_hz: Annotated[
-        float | None, typer.Option(help="Lower end of the band.", rich_help_panel=_FIT)
-    ] = None,
-    to_hz: Annotated[
-        float | None,
-        typer.Option(help="Upper end of the band; decays are thinned to it.", rich_help_panel=_FIT),
-    ] = None,
-    poles: Annotated[
-        str | None,
-        typer.Option(
-            help="Natural frequencies in Hz by hand, as 79.0,427.5.",
-            metavar="HZ,…",
-            rich_help_panel=_FIT,
-        ),
-    ] = None,
-    order: Annotated[
-        int | None, typer.Option(help="Take the poles of one model order.", rich_help_panel=_FIT)
-    ] = None,
-    highest_order: Annotated[
-        int | None, typer.Option(help="Highest model order.", rich_help_panel=_FIT)
-    ] = None,
-    residuals: Annotated[
-        str,
-        typer.Option(
-            help="Residual terms of modes outside the band: auto, both, lower, upper, none.",
-            rich_help_panel=_FIT,
-        ),
-    ] = "auto",
-    window: Annotated[
-        str | None,
-        typer.Option(
-            help="hann: model the leakage of averages of random excitation.", rich_help_panel=_FIT
-        ),
-    ] = None,
-    instrument_phase: Annotated[
-        bool | None,
-        typer.Option(
-            help="Free a phase of the instruments (default: over a voltage only).",
-            rich_help_panel=_FIT,
-        ),
-    ] = None,
-    base: Annotated[
-        str | None,
-        typer.Option(
-            help="The reference is the motion of a base, the responses are: absolute, relative.",
-            metavar="KIND",
-            rich_help_panel=_FIT,
-        ),
-    ] = None,
-    drive_point: Annotated[
-        str | None,
-        typer.Option(
-            help="Sensor at the force (default: by point and axis).",
-            metavar="NAME",
-            rich_help_panel=_SCALE,
-        ),
-    ] = None,
-    turned: Annotated[
-        bool,
-        typer.Option(
-            "--turned",
-            help="The drive point's sensor is against the force.",
-            rich_help_panel=_SCALE,
-        ),
-    ] = False,
-    added_mass: Annotated[
-        float | None,
-        typer.Option(help="Added mass in kg of a second test.", rich_help_panel=_SCALE),
-    ] = None,
-    mass_at: Annotated[
-        str | None,
-        typer.Option(help="Sensor at the added mass.", metavar="NAME", rich_help_panel=_SCALE),
-    ] = None,
-    with_mass: Annotated[
-        list[Path] | None,
-        typer.Option(
-            help="Test with the added mass (repeatable).", metavar="FRF", rich_help_panel=_SCALE
-        ),
-    ] = None,
-    sensor_mass: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Mass that a sensor stands for, as tip=0.2 (repeatable); with --base, or with "
-            "--fixture-mass.",
-            metavar="NAME=KG",
-            rich_help_panel=_SCALE,
-        ),
-    ] = None,
-    fixture_mass: Annotated[
-        float | None,
-        typer.Option(help="Mass in kg of a free fixture that is forced.", rich_help_panel=_SCALE),
-    ] = None,
-    known_shape: Annotated[
-        str | None,
-        typer.Option(
-            help="Mass-normalised shape at a sensor, as midspan=11.84.",
-            metavar="NAME=VALUE",
-            rich_help_panel=_SCALE,
-        ),
-    ] = None,
-    unscaled: Annotated[
-        bool,
-        typer.Option(
-            "--unscaled",
-            help="Relative shapes: frequency and damping only.",
-            rich_help_panel=_SCALE,
-        ),
-    ] = False,
-    newtons_per_volt: Annotated[
-        float | None,
-        typer.Option(help="Calibration of a drive voltage.", rich_help_panel=_SCALE),
-    ] = None,
-    newtons_per_volt_std: Annotated[
-        float, typer.Option(help="Its 1σ.", rich_help_panel=_SCALE)
-    ] = 0.0,
-    calibration_std: Annotated[
-        float,
-        typer.Option(help="Relative 1σ of response over force.", rich_help_panel=_SCALE),
-    ] = 0.0,
-    free: Annotated[
-        bool,
-        typer.Option(
-            "--free",
-            help="Structure free as a rigid body: write that mode.",
-            rich_help_panel=_SCALE,
-        ),
-    ] = False,
-    mass: Annotated[
-        float | None,
-        typer.Option(help="Its mass in kg, if weighed (implies --free).", rich_help_panel=_SCALE),
-    ] = None,
+    **options: Any,
 ) -> None:
     """Find linear modes with their errors and write them as a model.
 
@@ -186,32 +48,16 @@ def modes(
         raise ValueError(f"--out must be a model to write (.toml), but is {out.name!r}.")
     if out.is_dir():
         raise ValueError(f"--out {out} is a folder, but a file to write is expected.")
-    request = ModesRequest(
-        reference=reference,
-        level=level,
-        from_frequency=None if from_hz is None else from_hz * HERTZ,
-        to_frequency=None if to_hz is None else to_hz * HERTZ,
-        poles=_poles(poles),
-        order=order,
-        highest_order=highest_order,
-        residual_terms=residuals,
-        window=window,
-        instrument_phase=instrument_phase,
-        base=base,
-        unscaled=unscaled,
-        drive_point=drive_point,
-        turned=turned,
-        added_mass=added_mass,
-        mass_at=mass_at,
-        sensor_mass=sensor_values("--sensor-mass", sensor_mass or ()),
-        fixture_mass=fixture_mass,
-        known_shape=sensor_values("--known-shape", () if known_shape is None else (known_shape,)),
-        newtons_per_volt=newtons_per_volt,
-        newtons_per_volt_std=newtons_per_volt_std,
-        calibration_std=calibration_std,
-        free=free or mass is not None,
-        mass=mass,
-    )
+    with_mass, ends = options.pop("with_mass"), (options.pop("from_hz"), options.pop("to_hz"))
+    low, high = (None if one is None else one * HERTZ for one in ends)
+    shape = options.pop("known_shape")
+    options |= {
+        "poles": _poles(options["poles"]),
+        "sensor_mass": sensor_values("--sensor-mass", options["sensor_mass"]),
+        "known_shape": sensor_values("--known-shape", () if shape is None else (shape,)),
+        "free": options["free"] or options["mass"] is not None,
+    }
+    request = ModesRequest(from_frequency=low, to_frequency=high, **options)
     with staged(out.parent) as folder:
         found, notes = find_modes(read_modal_sources(data), request)
         second = find_modes(read_modal_sources(with_mass), request)[0] if with_mass else None
@@ -237,3 +83,61 @@ def _poles(text: str | None) -> tuple[float, ...] | None:
                 f"--poles must be frequencies in Hz with commas between them, but has {word!r}."
             ) from error
     return tuple(found)
+
+
+_DATA_ROWS = (
+    Row("reference", str, "Reference channel where there are several.", "NAME"),
+    Row("level", int, "Level of steady states (default: the lowest)."),
+)
+_FIT_ROWS = (
+    Row("from_hz", float, "Lower end of the band."),
+    Row("to_hz", float, "Upper end of the band; decays are thinned to it."),
+    Row("poles", str, "Natural frequencies in Hz by hand, as 79.0,427.5.", "HZ,…"),
+    Row("order", int, "Take the poles of one model order."),
+    Row("highest_order", int, "Highest model order."),
+    Row(
+        *("residual_terms", str),
+        "Residual terms of modes outside the band: auto, both, lower, upper, none.",
+        *(None, "auto", None, "--residuals"),
+    ),
+    Row("window", str, "hann: model the leakage of averages of random excitation."),
+    Row(
+        *("instrument_phase", bool),
+        "Free a phase of the instruments (default: over a voltage only).",
+    ),
+    Row(
+        *("base", str),
+        "The reference is the motion of a base, the responses are: absolute, relative.",
+        "KIND",
+    ),
+)
+_SCALE_ROWS = (
+    Row("drive_point", str, "Sensor at the force (default: by point and axis).", "NAME"),
+    Row("turned", bool, "The drive point's sensor is against the force.", None, False),
+    Row("added_mass", float, "Added mass in kg of a second test."),
+    Row("mass_at", str, "Sensor at the added mass.", "NAME"),
+    Row("with_mass", list[Path], "Test with the added mass (repeatable).", "FRF"),
+    Row(
+        *("sensor_mass", list[str]),
+        "Mass that a sensor stands for, as tip=0.2 (repeatable); with --base, or with "
+        "--fixture-mass.",
+        "NAME=KG",
+    ),
+    Row("fixture_mass", float, "Mass in kg of a free fixture that is forced."),
+    Row(
+        *("known_shape", str),
+        "Mass-normalised shape at a sensor, as midspan=11.84.",
+        "NAME=VALUE",
+    ),
+    Row(
+        *("unscaled", bool),
+        "Relative shapes: frequency and damping only.",
+        *(None, False),
+    ),
+    Row("newtons_per_volt", float, "Calibration of a drive voltage."),
+    Row("newtons_per_volt_std", float, "Its 1σ.", None, 0.0),
+    Row("calibration_std", float, "Relative 1σ of response over force.", None, 0.0),
+    Row("free", bool, "Structure free as a rigid body: write that mode.", None, False),
+    Row("mass", float, "Its mass in kg, if weighed (implies --free)."),
+)
+with_options(modes, {None: _DATA_ROWS, "Fit": _FIT_ROWS, "Scale of the shapes": _SCALE_ROWS})
