@@ -75,7 +75,7 @@ def valid_files(folder):
     scipy.io.savemat(folder / "b.mat", {"d": np.array(rows, dtype=kinds)}, do_compression=True)
     old = {"freq": hertz, "H": hertz + 1j, "title": "of level 4"}
     scipy.io.savemat(folder / "d.mat", old, format="4")
-    write_netcdf(folder / "a.nc", [record])
+    write_netcdf(folder / "a.nc", record)
     with h5py.File(folder / "a.h5", "w") as file:
         for key, values in zip(("freq", "F", "X", "Y"), rng.normal(size=(4, 200)), strict=True):
             file.create_dataset(f"test/{key}", data=values, compression="gzip", chunks=(50,))

@@ -7,7 +7,7 @@ import typer
 
 from snrmjax.cli.console import say, staged, warn
 from snrmjax.cli.measured_tests import read_measured_test
-from snrmjax.cli.options import FILES, Out
+from snrmjax.cli.options import Linear, Out
 from snrmjax.io.models import read_model
 
 
@@ -24,15 +24,7 @@ def compare(
             show_default=False,
         ),
     ],
-    model: Annotated[
-        Path,
-        typer.Option(
-            help="Linear model of the structure (TOML), as for identify.",
-            metavar="MODEL",
-            rich_help_panel=FILES,
-            show_default=False,
-        ),
-    ],
+    model: Linear,
     out: Out,
     method: Annotated[
         list[str] | None,

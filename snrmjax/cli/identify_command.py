@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from snrmjax.cli.console import say, staged, warn
-from snrmjax.cli.options import FILES, Out, Row, require_positive, with_options
+from snrmjax.cli.options import Linear, Out, Row, require_positive, with_options
 from snrmjax.identify.pointwise.backbone_points import AmplitudeArgument, AmplitudeMeasure
 from snrmjax.identify.prediction.new_level import DayToDay
 from snrmjax.io.models import read_model
@@ -24,16 +24,7 @@ def identify(
             show_default=False,
         ),
     ],
-    model: Annotated[
-        Path,
-        typer.Option(
-            help="Linear model of the structure (TOML): frequencies, damping ratios, mass-"
-            "normalised shapes, participations.",
-            metavar="MODEL",
-            rich_help_panel=FILES,
-            show_default=False,
-        ),
-    ],
+    model: Linear,
     out: Out,
     **options: Any,
 ) -> None:
@@ -110,7 +101,8 @@ _PREDICTION = (
     Row(
         *("extrapolate", float),
         "Predict up to this multiple of the largest measured amplitude; 1 ends where the data end.",
-        *("RATIO", 1.5, 1.0),
+        *("RATIO", 1.5),
+        least=1.0,
     ),
     Row(
         *("day_std", str),
@@ -140,7 +132,7 @@ _CURVES = (
     Row(
         *("knots", int),
         "Knots of each curve at most. Default: up to 42; curves bend as much as the data ask for.",
-        *(None, None, 2),
+        least=2,
     ),
     Row(
         *("anchor", bool),
@@ -168,7 +160,9 @@ _JOINT = (
     Row(
         *("further", int),
         "Advise this many further measurements, those that narrow the bands most.",
-        *("COUNT", None, 1, "--next"),
+        "COUNT",
+        least=1,
+        flag="--next",
     ),
 )
 with_options(

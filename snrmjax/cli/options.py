@@ -27,6 +27,17 @@ Out = Annotated[
         show_default=False,
     ),
 ]
+Linear = Annotated[
+    Path,
+    typer.Option(
+        "--model",
+        help="Linear model of the structure (TOML): frequencies, damping ratios, mass-normalised "
+        "shapes, participations.",
+        metavar="MODEL",
+        rich_help_panel=FILES,
+        show_default=False,
+    ),
+]
 Harmonics = Annotated[
     int,
     typer.Option(help="Harmonics of the motion that are balanced, beside its mean.", min=1, max=99),
@@ -43,7 +54,7 @@ def require_positive(option: str, values: Sequence[float], unit: str) -> None:
 class Row(NamedTuple):
     """An option of a command: its name in Python, what it takes, and the line of its help.
 
-    A `bool` that is `False` is a switch, one that is None has a `--no-` form; a list is repeatable.
+    A `bool` that is `False` is a switch, another one has a `--no-` form; a list is repeatable.
     """
 
     name: str
@@ -65,7 +76,7 @@ def with_options(command: Callable[..., None], panels: Mapping[str | None, Seque
 
 def _parameter(row: Row, panel: str | None) -> inspect.Parameter:
     flag = row.flag or f"--{row.name.replace('_', '-')}"
-    if row.kind is bool and row.default is None:
+    if row.kind is bool and row.default is not False:
         flag = f"{flag}/--no-{flag[2:]}"
     said = isinstance(row.default, float) or bool(row.default)
     option = typer.Option(

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from snrmjax.identify.modal.response_data import joined_responses
-from snrmjax.io.exchange.layouts import is_own_file
+from snrmjax.io.exchange.own_tables import is_own_file
 from snrmjax.io.files import file_name
 from snrmjax.io.laboratory.reading import read_laboratory_file
 from snrmjax.io.tables import read_steady_states

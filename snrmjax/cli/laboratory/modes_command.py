@@ -98,7 +98,8 @@ _FIT_ROWS = (
     Row(
         *("residual_terms", str),
         "Residual terms of modes outside the band: auto, both, lower, upper, none.",
-        *(None, "auto", None, "--residuals"),
+        default="auto",
+        flag="--residuals",
     ),
     Row("window", str, "hann: model the leakage of averages of random excitation."),
     Row(

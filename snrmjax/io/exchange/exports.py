@@ -1,16 +1,14 @@
 """Writing what an import gives: steady states, records as CSV or netCDF 4, and the map."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from snrmjax.io.exchange.import_map import map_text
 from snrmjax.io.exchange.importing import Imported
-from snrmjax.io.exchange.layouts import Field, record_fields
 from snrmjax.io.exchange.record_import import record_columns
-from snrmjax.io.files import FilePath, file_name, write_atomically, written_whole
+from snrmjax.io.files import FilePath, write_atomically, written_whole
 from snrmjax.io.laboratory.libraries import library
 from snrmjax.io.tables import write_steady_states
 from snrmjax.measure.recordings.time_recording import TimeRecording
@@ -20,20 +18,33 @@ _BLOCK = 2**20  # samples of all channels that are written at once
 _PIECE = 2**15  # numbers of a piece of the file
 
 
-def write_netcdf(path: FilePath, recordings: Sequence[TimeRecording]) -> None:
-    """Write records as netCDF 4 in SI units, block by block: they need not fit into memory.
+def write_netcdf(path: FilePath, record: TimeRecording) -> None:
+    """Write a record as netCDF 4 in SI units, block by block: it need not fit into memory.
 
-    Groups `record_1`, … with `sampling_rate_hz`, `start_time_s`, `channels` and what is known of
-    them, and `values`, one row a channel. `read_laboratory_file` gives all numbers back bit for
-    bit. Raises `ValueError` for records of fewer than 64 samples.
+    It has `sampling_rate_hz`, `start_time_s`, `channels` and what is known of them, and `values`,
+    one row a channel. `read_laboratory_file` gives all numbers back bit for bit.
     """
-    h5netcdf, file = library("h5netcdf", "writing netCDF"), file_name(path)
-    fields = [record_fields(one, file) for one in recordings]
+    h5netcdf, h5py = library("h5netcdf", "writing netCDF"), library("h5py", "writing netCDF")
+    width = len(record.channels)
+    words = {
+        "channels": record.channel_names,
+        "quantity": [one.quantity for one in record.channels],
+        "unit": [one.si_unit for one in record.channels],
+        "point": [one.point for one in record.channels],
+        "direction": [one.direction for one in record.channels],
+    }
+    numbers = {"sampling_rate_hz": record.sampling_rate, "start_time_s": record.start_time}
     with written_whole(path) as new, h5netcdf.File(new, "w") as target:
-        for k, (record, told) in enumerate(zip(recordings, fields, strict=True)):
-            group = target.create_group(f"record_{k + 1}")
-            _put_fields(group, told)
-            _put_samples(group, record)
+        target.dimensions.update({"channel": width, "sample": record.n_samples})
+        for name, number in numbers.items():
+            target.create_variable(name, (), dtype="<f8")[...] = number
+        for name, texts in words.items():
+            column = target.create_variable(name, ("channel",), dtype=h5py.string_dtype())
+            column[...] = np.array(texts, dtype=object)
+        piece = (width, max(1, min(record.n_samples, _PIECE // width)))
+        values = target.create_variable("values", ("channel", "sample"), dtype="<f8", chunks=piece)
+        for block in record.blocks(max(1, _BLOCK // width)):
+            values[:, block.start : block.start + block.values.shape[1]] = block.values
 
 
 def write_import(folder: Path, found: Imported, files: Sequence[str] = ()) -> list[str]:
@@ -51,7 +62,7 @@ def write_import(folder: Path, found: Imported, files: Sequence[str] = ()) -> li
         stem = "record" if k == 0 else f"record_{k + 1}"
         columns = record_columns(record, found.used)
         if record.n_samples * len(columns) > _MOST_ROWS:
-            write_netcdf(folder / f"{stem}.nc", [record])
+            write_netcdf(folder / f"{stem}.nc", record)
             written.append(f"{stem}.nc")
             continue
         values = np.vstack([record.time(), record.values([one.name for one in columns.values()])])
@@ -63,25 +74,3 @@ def write_import(folder: Path, found: Imported, files: Sequence[str] = ()) -> li
     text = map_text(found.used, found.assumed, notes, files, found.steps)
     write_atomically(folder / "map.toml", text)
     return [*written, "map.toml"]
-
-
-def _put_fields(group: Any, fields: Mapping[str, Field]) -> None:
-    """Arrays and texts into a group of a netCDF file."""
-    h5py = library("h5py", "writing netCDF")
-    for name, one in fields.items():
-        values = np.asarray(one.values, dtype=object if isinstance(one.values, list) else None)
-        for side, length in zip(one.sides, values.shape, strict=True):
-            if side not in group.dimensions:
-                group.dimensions[side] = length
-        kind = h5py.string_dtype() if isinstance(one.values, list) else values.dtype
-        group.create_variable(name, one.sides, dtype=kind)[...] = values
-
-
-def _put_samples(group: Any, record: TimeRecording) -> None:
-    """Samples block by block."""
-    width = len(record.channels)
-    group.dimensions["sample"] = record.n_samples
-    piece = (width, max(1, min(record.n_samples, _PIECE // width)))
-    values = group.create_variable("values", ("channel", "sample"), dtype="<f8", chunks=piece)
-    for block in record.blocks(max(1, _BLOCK // width)):
-        values[:, block.start : block.start + block.values.shape[1]] = block.values

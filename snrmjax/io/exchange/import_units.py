@@ -1,12 +1,13 @@
 """Units and quantities of an import: stated by the map, by the file, or asked for."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from snrmjax.io.exchange.import_map import Assumption, Assumptions, ImportMap
+from snrmjax.io.files import near_miss
 from snrmjax.io.laboratory.physical_units import UnitMeaning, unit_meaning
 from snrmjax.measure.recordings.channels import SI_UNIT
 
@@ -22,6 +23,17 @@ class Force(NamedTuple):
     factor: float
     is_voltage: bool
     unit: str
+
+
+def require_name(option: str, name: str, known: Iterable[str], what: str, file: str) -> None:
+    """Raise `ValueError` where an option names nothing that a file has; `what` are those there."""
+    names = list(known)
+    if name not in names:
+        near = near_miss(name, names)
+        raise ValueError(
+            f"{option} names {name!r}, but {file} has the {what} {', '.join(names)}"
+            f"{f' (did you mean {near}?)' if near else ''}."
+        )
 
 
 def force_meaning(told: ImportMap, file_unit: str, what: str) -> Force:

@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from snrmjax.io.exchange.import_levels import MeasuredPart, numbered_levels
 from snrmjax.io.exchange.import_map import Assumption, Assumptions, ImportMap
 from snrmjax.io.exchange.import_units import Force
-from snrmjax.io.exchange.layouts import (
+from snrmjax.io.exchange.own_tables import (
     is_own_table,
     restated,
     restated_in_words,
@@ -205,7 +205,8 @@ def _stated(errors: Sequence[tuple[np.ndarray | None, np.ndarray]]) -> np.ndarra
 def _filled(used: ImportMap, assumed: Assumptions) -> ImportMap:
     """The map with choices that were assumed, so that the next test is read alike."""
     keys = ("amplitude", "phase_sign", "phase_unit")
-    return used._replace(**{key: assumed[key].value for key in keys if key in assumed})
+    words: dict[str, Any] = {key: assumed[key].value for key in keys if key in assumed}
+    return used._replace(**words)
 
 
 def _rule(used: ImportMap, parts: Sequence[MeasuredPart]) -> str:

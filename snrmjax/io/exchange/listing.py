@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from snrmjax.io.exchange.layouts import is_own_table
+from snrmjax.io.exchange.own_tables import is_own_table
 from snrmjax.io.laboratory.contents import LaboratoryFile, NumberTable
 from snrmjax.io.laboratory.names import role_of
 from snrmjax.measure.recordings.channels import Channel

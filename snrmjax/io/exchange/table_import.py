@@ -15,6 +15,7 @@ from snrmjax.io.exchange.import_units import (
     frequency_in_rad,
     motion_meaning,
     phase_in_rad,
+    require_name,
 )
 from snrmjax.io.files import near_miss
 from snrmjax.io.laboratory.contents import NumberTable
@@ -58,7 +59,7 @@ def import_table(
             raise ValueError(
                 f"{force_name} of {file} has negative amplitudes: --force names another column."
             )
-        size = raw.astype(complex) * force.factor
+        size = _complex(raw, told, assumed) * force.factor
         if told.force_phase:
             angle = _phase(table, told.force_phase, told, file, assumed, "--force-phase")
             size = size * np.exp(1j * angle)
@@ -131,7 +132,7 @@ def _response(
     role = role_of(one.channel)
     imaginary, phase = one.imaginary, one.phase
     if np.iscomplexobj(values):
-        phasor = values.astype(complex)
+        phasor = _complex(values, told, assumed)
     else:
         if not imaginary and not phase:
             imaginary, phase = _partner(table, one.channel, role, told)
@@ -166,6 +167,14 @@ def _response(
     turn = velocity_factors([Channel(one.channel, quantity)], [1], omega)[:, 0, 0]  # type: ignore[arg-type]
     filled = one._replace(quantity=quantity, sensor=sensor, phase=phase, imaginary=imaginary)
     return phasor * factor * turn, filled, factor * turn
+
+
+def _complex(values: np.ndarray, told: ImportMap, assumed: Assumptions) -> np.ndarray:
+    """Phasors as e^(+iwt), conjugated where the sign of their phases is said to be the other."""
+    if np.iscomplexobj(values) and not told.phase_sign:
+        assumed["phase_sign"] = Assumption("phasors are e^(+iwt)", "lead")
+    phasors = values.astype(complex)
+    return phasors.conj() if told.phase_sign == "lag" else phasors
 
 
 def _partner(table: NumberTable, channel: str, role: str, told: ImportMap) -> tuple[str, str]:
@@ -231,12 +240,7 @@ def _check(omega: Float[np.ndarray, " row"], force: Float[np.ndarray, " row"], f
 
 
 def _column(table: NumberTable, name: str, file: str, option: str) -> np.ndarray:
-    if name not in table.columns:
-        near = near_miss(name, table.columns)
-        raise ValueError(
-            f"{option} names {name!r}, but {file} has the columns {', '.join(table.columns)}"
-            f"{f' (did you mean {near}?)' if near else ''}."
-        )
+    require_name(option, name, table.columns, "columns", file)
     return np.asarray(table.columns[name])
 
 

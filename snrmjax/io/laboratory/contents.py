@@ -32,13 +32,6 @@ class NumberTable(NamedTuple):
         """Number of rows."""
         return len(next(iter(self.columns.values())))
 
-    def column(self, name: str) -> Num[np.ndarray, " row"]:
-        """A column by name. Raises `ValueError` that lists those there are."""
-        if name not in self.columns:
-            listed = ", ".join(self.columns)
-            raise ValueError(f"table {self.name} has no column {name!r}; it has {listed}.")
-        return self.columns[name]
-
 
 class TextFormat(NamedTuple):
     """How a text is written; what is None is found out.

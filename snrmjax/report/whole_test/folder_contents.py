@@ -15,7 +15,7 @@ from snrmjax.io.exchange.import_map import (
     steps_of_map,
 )
 from snrmjax.io.exchange.importing import Imported, import_files
-from snrmjax.io.exchange.layouts import is_own_file
+from snrmjax.io.exchange.own_tables import is_own_file
 from snrmjax.io.exchange.record_import import told_record
 from snrmjax.io.files import read_text
 from snrmjax.io.laboratory.contents import LaboratoryFile

@@ -17,7 +17,7 @@ _LARGEST = 2**29  # bytes of a file before v7.3, which is read whole, and number
 
 def is_old_matlab(head: bytes, suffix: str) -> bool:
     """Whether a file is of MATLAB before v7.3: v4 begins with a whole number below 5000."""
-    first = (int.from_bytes(head[:4], order) for order in ("little", "big"))  # type: ignore[arg-type]
+    first = (int.from_bytes(head[:4], order) for order in ("little", "big"))
     return head.startswith(b"MATLAB 5") or (suffix.lower() == ".mat" and min(first) < 5000)
 
 

@@ -7,7 +7,6 @@ import numpy as np
 from snrmjax.io.laboratory.arrays.structs import read_struct
 from snrmjax.io.laboratory.arrays.value_tree import Node
 from snrmjax.io.laboratory.contents import Kind, LaboratoryFile
-from snrmjax.io.laboratory.libraries import Budget
 
 _MOST_NAMED = 6
 _NOTHING = "it has only texts, single numbers and empty arrays"
@@ -17,8 +16,7 @@ def file_of_tree(
     name: str, kind: Kind, tree: Mapping[str, Node], notes: Sequence[str]
 ) -> LaboratoryFile:
     """All that is found in a tree; `notes` say what of the file is not in it."""
-    budget = Budget(name)
-    found = read_struct("", tree, budget)
+    found = read_struct("", tree)
     if not (found.recordings or found.responses or found.tables):
         listed = f" ({', '.join(list(tree)[:_MOST_NAMED])})" if tree else ""
         notes = [*notes, *(() if notes or found.notes else (f"{_NOTHING}{listed}.",))]

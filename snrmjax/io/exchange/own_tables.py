@@ -1,12 +1,10 @@
-"""Records as named arrays and texts, and tables with the columns of our CSV."""
+"""Tables with the columns of our CSV: recognised, read, and restated in other units."""
 
 import dataclasses
 from pathlib import Path
-from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Num
 
 from snrmjax.io.exchange.import_map import ImportMap
 from snrmjax.io.exchange.import_units import AMPLITUDE_FACTORS, force_meaning, motion_meaning
@@ -14,44 +12,11 @@ from snrmjax.io.files import read_text
 from snrmjax.io.laboratory.contents import NumberTable
 from snrmjax.io.tables import steady_states_of_fields
 from snrmjax.measure.recordings.channels import Channel
-from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.recordings.velocity_states import velocity_factors
 from snrmjax.measure.states import SteadyStates
 
-SHORTEST_RECORD = 64
-"""Samples below which readers take columns beside a time for a table, not for a record."""
-
 _OWN = ("frequency_hz", "velocity_re_m_s", "velocity_im_m_s")
 _OWN_FILES = ({"frequency_hz", "velocity_re_m_s"}, {"frequency_hz", "velocity_m_s", "level"})
-
-
-class Field(NamedTuple):
-    """A named array, or a list of texts, and the names of its sides."""
-
-    sides: tuple[str, ...]
-    values: Num[np.ndarray, "..."] | list[str]
-
-
-def record_fields(record: TimeRecording, file: str) -> dict[str, Field]:
-    """All of a time record but its samples, which are too many to be held.
-
-    Raises `ValueError` for fewer samples than readers take for a record.
-    """
-    if record.n_samples < SHORTEST_RECORD:
-        raise ValueError(
-            f"a record in {file} must have {SHORTEST_RECORD} samples at least, but has "
-            f"{record.n_samples}."
-        )
-    at = ("channel",)
-    return {
-        "sampling_rate_hz": Field((), np.asarray(float(record.sampling_rate))),
-        "start_time_s": Field((), np.asarray(float(record.start_time))),
-        "channels": Field(at, list(record.channel_names)),
-        "quantity": Field(at, [one.quantity for one in record.channels]),
-        "unit": Field(at, [one.si_unit for one in record.channels]),
-        "point": Field(at, [one.point for one in record.channels]),
-        "direction": Field(at, [one.direction for one in record.channels]),
-    }
 
 
 def is_own_table(table: NumberTable) -> bool:
