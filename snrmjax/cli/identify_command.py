@@ -55,19 +55,21 @@ def identify(
         structure = read_model(model)
         measured = read_steady_states(data, structure)
         if given & _ASK_FOR_FIT:
-            settings = workflow.JointFitSettings(
-                *(options["fit"] or "auto", tuple(options["free"])),
+            found = workflow.identify_jointly(
+                *(measured, structure, loads),
+                families=options["fit"] or "auto",
+                free=options["free"],
                 robust=options["robust"],
                 further=options["further"] or 0,
             )
-            found = workflow.identify_jointly(measured, structure, settings, loads)
         else:
-            curves = workflow.CurveSettings(
-                *(options["amplitude"], options["measure"]),
+            found = workflow.identify_by_points(
+                *(measured, structure, loads),
+                amplitude=options["amplitude"],
+                measure=options["measure"],
                 n_knots=options["knots"],
                 anchor=options["anchor"],
             )
-            found = workflow.identify_by_points(measured, structure, curves, loads)
         for note in found.notes:
             warn(note)
         files = {"data": data.name, "model": f"{structure.name} ({model.name})"}

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.filesize import decimal
 
 from snrmjax.cli.console import console, say, staged, warn
 from snrmjax.cli.options import FILES, Out, Row, with_options
@@ -163,9 +164,10 @@ def _say_study(study: "Study") -> None:
 
 
 def _say_expected(expected: "Expected") -> None:
+    size, memory = decimal(expected.size), decimal(expected.memory)
     say(
-        f"after the first chunk: about {_duration(expected.seconds)} to go, {_bytes(expected.size)}"
-        f" on disk in the end, {_bytes(expected.memory)} of memory"
+        f"after the first chunk: about {_duration(expected.seconds)} to go, {size} on disk in the "
+        f"end, {memory} of memory"
     )
 
 
@@ -266,7 +268,3 @@ def _duration(seconds: float) -> str:
     if seconds < 90:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
-
-
-def _bytes(size: int) -> str:
-    return f"{size / 1e9:.2g} GB" if size > 1e9 else f"{size / 1e6:.2g} MB"

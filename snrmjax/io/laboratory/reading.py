@@ -12,8 +12,8 @@ _ROOM = "snrmjax.io.laboratory"
 _READERS: dict[Kind, tuple[str, str]] = {
     "uff": ("uff.reading", "read_uff"),
     "matlab": ("arrays.matlab_files", "read_matlab"),
-    "hdf5": ("arrays.hdf5_files", "read_hdf5"),
-    "netcdf": ("arrays.hdf5_files", "read_netcdf"),
+    "hdf5": ("arrays.tree_contents", "read_hdf5"),
+    "netcdf": ("arrays.tree_contents", "read_netcdf"),
     "tdms": ("tdms_files", "read_tdms"),
     "csv": ("separated_text", "read_separated_text"),
 }

@@ -46,9 +46,7 @@ from snrmjax.report.whole_test.folder_contents import NamedRecord, TestFiles
 from snrmjax.report.whole_test.mends import FilesRead, is_certain, with_options
 from snrmjax.report.whole_test.undiagnosed import not_diagnosed
 from snrmjax.report.workflow import (
-    CurveSettings,
     Findings,
-    JointFitSettings,
     Loads,
     headline,
     identify_by_points,
@@ -363,12 +361,12 @@ def _identified(data: SteadyStates, model: Structure) -> tuple[Findings, tuple[s
     drive_only = not np.isfinite(np.asarray(data.force)).any()
     free = ("instrument_phase",) if drive_only else ()
     try:
-        return identify_jointly(data, model, JointFitSettings(free=free), Loads()), ()
+        return identify_jointly(data, model, Loads(), free=free), ()
     except ValueError as error:
         if drive_only:
             raise
         reason = f"curves go through single points, as a joint fit was not possible: {error}"
-        return identify_by_points(data, model, CurveSettings(), Loads()), (reason,)
+        return identify_by_points(data, model, Loads()), (reason,)
 
 
 def _write_whole_report(
