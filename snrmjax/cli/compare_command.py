@@ -46,17 +46,19 @@ def compare(
 
     Writes compare.csv, summary.json, compare.png and report.html.
     """
+    from snrmjax.methods.comparison import compare_methods
+    from snrmjax.model.structures import modes_of
     from snrmjax.report.methods import comparison_report
 
     with staged(out) as folder:
         structure = read_model(model)
         tests = [one for path in data for one in read_measured_test(path, structure)]
-        found = comparison_report.run_methods(tests, structure, tuple(method) if method else None)
-        for line in found.comparison.records:
+        found = compare_methods(tests, modes_of(structure), tuple(method) if method else None)
+        for line in found.records:
             say(line)
-        for why in found.comparison.stopped.values():
+        for why in found.stopped.values():
             warn(f"did not run: {why}")
         name = ", ".join(path.stem.replace("_", " ") for path in data)
-        comparison_report.write_comparison(folder, found, name)
+        comparison_report.write_comparison(folder, found, name, structure.name)
     say(comparison_report.comparison_sentence(found))
     say(f"written to {out}: open {out / 'report.html'}")

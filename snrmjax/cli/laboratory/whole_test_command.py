@@ -46,10 +46,10 @@ def whole_test(
             *(options["drive_point"], options["go_on"], options["diagnose"]), read=read
         )
         name = folder.resolve().name
-        found = run_whole_test(target, files, name, request, progress=say)
-    for note in found.notes:
+        notes, lines = run_whole_test(target, files, name, request, progress=say)
+    for note in notes:
         warn(note)
-    for line in found.lines:
+    for line in lines:
         say(line)
     say(f"written to {out}: open {out / 'report.html'}")
 

@@ -90,9 +90,7 @@ class TestFiles(NamedTuple):
     records: tuple[NamedRecord, ...]
     passed: tuple[tuple[str, str], ...]  # file and why nothing was measured in it
     notes: tuple[str, ...]  # what was assumed of a file
-    texts: tuple[
-        tuple[str, tuple[str, ...]], ...
-    ] = ()  # file and lines: what people wrote, and the map
+    texts: tuple[tuple[str, tuple[str, ...]], ...] = ()  # lines that people wrote, and the map's
     steps_at_import: StepCounts | None = None
 
     def rows(self) -> Iterator[tuple[str, str]]:

@@ -69,17 +69,6 @@ class TestRequest(NamedTuple):
     read: FilesRead | None = None  # of which imports that mend are written
 
 
-class WholeTest(NamedTuple):
-    """What a test gave, stage by stage."""
-
-    model: Structure
-    checkup: Checkup
-    findings: Findings
-    diagnosis: Diagnosis | None
-    notes: tuple[str, ...]
-    lines: tuple[str, ...]  # the results in plain sentences
-
-
 class _Modes(NamedTuple):
     model: Structure
     report: Report | None  # None where the folder had a model
@@ -101,13 +90,14 @@ def run_whole_test(
     name: str,
     request: TestRequest,
     progress: Callable[[str], None] = lambda _: None,
-) -> WholeTest:
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Check, find linear modes, identify and diagnose a test, and write all of it into a folder.
 
     Writes model.toml and modes.csv where the linear modes were found here, measured.csv (all
     steady states), check.json, report.html, and what `identify` and `diagnose` write into folders
     of these names.
     Arguments: `progress` is told each stage when it ends, with its seconds.
+    Returns notes, and the results in plain sentences.
     Raises `ValueError`, as a question, where it would have to guess: which sensor is at the force,
     or whether to go on in spite of what the check found; and as its stages do.
     """
@@ -183,7 +173,7 @@ def run_whole_test(
         + (" The diagnosis was left out: the first note says why." if skipped else ""),
     )
     stage.ends("report")
-    return WholeTest(modes.model, checkup, findings, diagnosis, notes, lines)
+    return notes, lines
 
 
 class _Stages:
