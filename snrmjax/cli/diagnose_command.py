@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from snrmjax.cli.console import say, staged, warn
-from snrmjax.cli.options import FILES, Out, Row, with_options
+from snrmjax.cli.options import FILES, OptionRow, Out, with_options
 from snrmjax.io.models import read_model
 from snrmjax.io.tables import read_steady_states
 
@@ -101,25 +101,25 @@ def diagnose(
         raise ValueError(f"no diagnosis for {len(refused)} of {len(data)}: {', '.join(refused)}.")
 
 
-_RESPONSES = Row(
+_RESPONSES = OptionRow(
     *("responses", bool),
     "Simulate the responses of the model as given and as completed, for comparison with the data. "
     "Default: for a single file.",
 )
 _FILE_ROWS = (
-    Row(
+    OptionRow(
         *("plan", Path),
         "Write the measurement that would decide an open answer: a CSV of steady states to be "
         "filled in.",
         "FILE",
     ),
-    Row(
+    OptionRow(
         *("add", list[Path]),
         "Further steady states of the same structure, such as a plan that was filled in: one "
         "diagnosis of all states (repeatable).",
         "FILE",
     ),
-    Row(
+    OptionRow(
         *("former", Path),
         "diagnosis.json of the states without those of `--add`: fits begin at its answers too, and "
         "the notes say what the further states changed.",

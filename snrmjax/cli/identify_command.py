@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from snrmjax.cli.console import say, staged, warn
-from snrmjax.cli.options import Linear, Out, Row, require_positive, with_options
+from snrmjax.cli.options import Linear, OptionRow, Out, require_positive, with_options
 from snrmjax.identify.pointwise.backbone_points import AmplitudeArgument, AmplitudeMeasure
 from snrmjax.identify.prediction.new_level import DayToDay
 from snrmjax.io.models import read_model
@@ -81,7 +81,7 @@ def identify(
 
 
 _GENERAL = (
-    Row(
+    OptionRow(
         *("axis", Literal["velocity", "displacement", "acceleration"]),
         "Amplitude over which backbone, damping, the joint fit's curves and residuals are drawn; "
         "responses over frequency stay velocities. Displacement and acceleration also add a column "
@@ -90,60 +90,60 @@ _GENERAL = (
     ),
 )
 _PREDICTION = (
-    Row(
+    OptionRow(
         *("predict_force", list[float]),
         "Predict resonance and response under this force in N; give it again for more.",
         "N",
     ),
-    Row(
+    OptionRow(
         *("predict_drive", list[float]),
         "The same under this drive voltage in V, for data with drive_v.",
         "V",
     ),
-    Row(
+    OptionRow(
         *("extrapolate", float),
         "Predict up to this multiple of the largest measured amplitude; 1 ends where the data end.",
         *("RATIO", 1.5),
         least=1.0,
     ),
-    Row(
+    OptionRow(
         *("day_std", str),
         "Predict for another day's test, which differs from this one by so much: relative 1σ of "
         "natural frequency, damping and gain, as 0.001,0.05,0.02.",
         "FREQUENCY,DAMPING,GAIN",
     ),
-    Row(
+    OptionRow(
         *("self_excited", bool),
         "Let extrapolated damping be negative, as no passive structure's is.",
         *(None, False),
     ),
 )
 _CURVES = (
-    Row(
+    OptionRow(
         *("amplitude", AmplitudeArgument),
         "Amplitude of which natural frequency and damping are functions: displacement (right for a "
         "nonlinear stiffness) or velocity.",
         *(None, "displacement"),
     ),
-    Row(
+    OptionRow(
         *("measure", AmplitudeMeasure),
         "Take the amplitude of the fundamental, or the peak of the motion with its measured "
         "harmonics.",
         *(None, "fundamental"),
     ),
-    Row(
+    OptionRow(
         *("knots", int),
         "Knots of each curve at most. Default: up to 42; curves bend as much as the data ask for.",
         least=2,
     ),
-    Row(
+    OptionRow(
         *("anchor", bool),
         "Make both curves start at the linear frequency and damping of the model.",
         *(None, False),
     ),
 )
 _JOINT = (
-    Row(
+    OptionRow(
         *("fit", str),
         "Family of the backbone and, after a comma, of the damping: auto (a smooth curve that "
         "bends as much as the data ask for), polynomial:2, power_law, spline:5, smoothing_spline; "
@@ -152,14 +152,14 @@ _JOINT = (
         "Default: auto,auto where another option asks for a joint fit.",
         "BACKBONE[,DAMPING]",
     ),
-    Row(
+    OptionRow(
         *("free", list[str]),
         "Errors of the instruments to be found with the curves: force_gain (N per V for data with "
         "drive_v), force_offset, instrument_phase; several with commas.",
         "NAME[,NAME]",
     ),
-    Row("robust", bool, "Give outlying states less weight.", None, False),
-    Row(
+    OptionRow("robust", bool, "Give outlying states less weight.", None, False),
+    OptionRow(
         *("further", int),
         "Advise this many further measurements, those that narrow the bands most.",
         "COUNT",

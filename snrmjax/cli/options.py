@@ -51,7 +51,7 @@ def require_positive(option: str, values: Sequence[float], unit: str) -> None:
             raise ValueError(f"`{option}` must be above zero, but is {value:g} {unit}.")
 
 
-class Row(NamedTuple):
+class OptionRow(NamedTuple):
     """An option of a command: its name in Python, what it takes, and the line of its help.
 
     A `bool` that is `False` is a switch, another one has a `--no-` form; a list is repeatable.
@@ -66,7 +66,9 @@ class Row(NamedTuple):
     flag: str = ""  # how it is written, where that is not the name
 
 
-def with_options(command: Callable[..., None], panels: Mapping[str | None, Sequence[Row]]) -> None:
+def with_options(
+    command: Callable[..., None], panels: Mapping[str | None, Sequence[OptionRow]]
+) -> None:
     """Give a command, which takes them as `**options`, the options of some panels of its help."""
     signature = inspect.signature(command)
     own = [one for one in signature.parameters.values() if one.kind is not one.VAR_KEYWORD]
@@ -74,7 +76,7 @@ def with_options(command: Callable[..., None], panels: Mapping[str | None, Seque
     command.__signature__ = signature.replace(parameters=[*own, *made])  # type: ignore[attr-defined]
 
 
-def _parameter(row: Row, panel: str | None) -> inspect.Parameter:
+def _parameter(row: OptionRow, panel: str | None) -> inspect.Parameter:
     flag = row.flag or f"--{row.name.replace('_', '-')}"
     if row.kind is bool and row.default is not False:
         flag = f"{flag}/--no-{flag[2:]}"

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from snrmjax.cli.console import console, say, staged, warn
-from snrmjax.cli.options import FILES, Out, Row, with_options
+from snrmjax.cli.options import FILES, OptionRow, Out, with_options
 
 if TYPE_CHECKING:
     from snrmjax.io.reduction.source import ReductionSource
@@ -53,13 +53,13 @@ def rom(
 
 
 _SOURCES = (
-    Row(
+    OptionRow(
         *("tables", Path),
         "Folder with cases.csv (or cases.npz) and modes.toml: load cases that another code has "
         "run.",
         "DIR",
     ),
-    Row(
+    OptionRow(
         *("calculix", Path),
         "CalculiX deck of the structure, with its mesh, material and supports. Its load cases are "
         "kept in a folder beside it (deck.jobs for deck.inp), for later runs.",
@@ -67,8 +67,8 @@ _SOURCES = (
     ),
 )
 _FURTHER = (
-    Row("modes", str, "Numbers of the modes to keep, with --calculix.", "1,3"),
-    Row("no_study", bool, "Leave out the study over the size of the loads.", None, False),
+    OptionRow("modes", str, "Numbers of the modes to keep, with --calculix.", "1,3"),
+    OptionRow("no_study", bool, "Leave out the study over the size of the loads.", None, False),
 )
 with_options(rom, {FILES: _SOURCES, None: _FURTHER})
 

@@ -11,7 +11,7 @@ import typer
 from rich.filesize import decimal
 
 from snrmjax.cli.console import console, say, staged, warn
-from snrmjax.cli.options import FILES, Out, Row, with_options
+from snrmjax.cli.options import FILES, OptionRow, Out, with_options
 
 if TYPE_CHECKING:
     import xarray
@@ -90,24 +90,24 @@ def run(
 
 
 _RUN_ROWS = (
-    Row(
+    OptionRow(
         *("processes", int),
         "Processes of this machine, each on one core; by default one for every core.",
         least=1,
     ),
-    Row(
+    OptionRow(
         *("scheduler", str),
         "Address of a running Dask scheduler whose workers see the same folders, such as "
         "tcp://node1:8786.",
         "ADDRESS",
     ),
-    Row(
+    OptionRow(
         *("shard", str),
         "Compute the I-th of N parts only, on a shared folder; the one that ends last makes the "
         "data set.",
         "I/N",
     ),
-    Row("quiet", bool, "Say nothing but what is wrong.", None, False),
+    OptionRow("quiet", bool, "Say nothing but what is wrong.", None, False),
 )
 with_options(run, {None: _RUN_ROWS})
 study_app.command(

@@ -56,14 +56,14 @@ def check(
     """
     from snrmjax.doctor.check import check_test
     from snrmjax.io.laboratory.checkups import read_recordings, write_checkup
-    from snrmjax.report.whole_test.mends import FilesRead, with_options
+    from snrmjax.report.whole_test.mends import FilesRead, with_imports
 
     with staged(out) as folder:
         structure = None if model is None else read_model(model)
         tables = [read_steady_states(path, structure) for path in data]
         recordings = [one for path in record or () for one in read_recordings(path)]
         found = check_test(tables, structure, recordings)
-        found = with_options(found, FilesRead(tuple(data)))
+        found = with_imports(found, FilesRead(tuple(data)))
         write_checkup(folder / "check.json", found)
     for note in found.notes:
         warn(note)

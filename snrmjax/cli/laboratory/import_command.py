@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from snrmjax.cli.console import say, staged, warn
-from snrmjax.cli.options import FILES, Row, with_options
+from snrmjax.cli.options import FILES, OptionRow, with_options
 from snrmjax.io.exchange.import_map import KEYS, RESPONSE_KEYS, ImportMap, MapKey
 
 
@@ -79,14 +79,14 @@ _RESPONSE = MapKey(
 )
 
 
-def _row(name: str, key: MapKey) -> Row:
+def _row(name: str, key: MapKey) -> OptionRow:
     """The option of a key of the map: a switch, a number, a word, or repeated words."""
     default: Any = ImportMap._field_defaults.get(name, ())
     several = isinstance(default, tuple)
     said = f"{key.meaning[0].upper()}{key.meaning[1:]}{' (repeatable)' * several}."
     kind = list[str] if several else type(default)
     least = 0 if kind is int else None
-    return Row(name, kind, said, key.metavar or None, None if several else default, least)
+    return OptionRow(name, kind, said, key.metavar or None, None if several else default, least)
 
 
 _OPTIONS = {"force": KEYS["force"], "response": _RESPONSE, **RESPONSE_KEYS, **KEYS}

@@ -7,7 +7,7 @@ import typer
 
 from snrmjax.cli.console import say, staged, warn
 from snrmjax.cli.laboratory.modal_sources import read_modal_sources, sensor_values
-from snrmjax.cli.options import FILES, Row, with_options
+from snrmjax.cli.options import FILES, OptionRow, with_options
 from snrmjax.io.units import HERTZ
 
 
@@ -57,7 +57,8 @@ def modes(
         "known_shape": sensor_values("--known-shape", () if shape is None else (shape,)),
         "free": options["free"] or options["mass"] is not None,
     }
-    request = ModesRequest(from_frequency=low, to_frequency=high, **options)
+    added = options.pop("second_mass")
+    request = ModesRequest(from_frequency=low, to_frequency=high, added_mass=added, **options)
     with staged(out.parent) as folder:
         found, notes = find_modes(read_modal_sources(data), request)
         second = find_modes(read_modal_sources(with_mass), request)[0] if with_mass else None
@@ -86,59 +87,63 @@ def _poles(text: str | None) -> tuple[float, ...] | None:
 
 
 _DATA_ROWS = (
-    Row("reference", str, "Reference channel where there are several.", "NAME"),
-    Row("level", int, "Level of steady states (default: the lowest)."),
+    OptionRow("reference", str, "Reference channel where there are several.", "NAME"),
+    OptionRow("level", int, "Level of steady states (default: the lowest)."),
 )
 _FIT_ROWS = (
-    Row("from_hz", float, "Lower end of the band."),
-    Row("to_hz", float, "Upper end of the band; decays are thinned to it."),
-    Row("poles", str, "Natural frequencies in Hz by hand, as 79.0,427.5.", "HZ,…"),
-    Row("order", int, "Take the poles of one model order."),
-    Row("highest_order", int, "Highest model order."),
-    Row(
+    OptionRow("from_hz", float, "Lower end of the band."),
+    OptionRow("to_hz", float, "Upper end of the band; decays are thinned to it."),
+    OptionRow("poles", str, "Natural frequencies in Hz by hand, as 79.0,427.5.", "HZ,…"),
+    OptionRow("order", int, "Take the poles of one model order."),
+    OptionRow("highest_order", int, "Highest model order."),
+    OptionRow(
         *("residual_terms", str),
         "Residual terms of modes outside the band: auto, both, lower, upper, none.",
         default="auto",
         flag="--residuals",
     ),
-    Row("window", str, "hann: model the leakage of averages of random excitation."),
-    Row(
+    OptionRow("window", str, "hann: model the leakage of averages of random excitation."),
+    OptionRow(
         *("instrument_phase", bool),
         "Free a phase of the instruments (default: over a voltage only).",
     ),
-    Row(
+    OptionRow(
         *("base", str),
         "The reference is the motion of a base, the responses are: absolute, relative.",
         "KIND",
     ),
 )
 _SCALE_ROWS = (
-    Row("drive_point", str, "Sensor at the force (default: by point and axis).", "NAME"),
-    Row("turned", bool, "The drive point's sensor is against the force.", None, False),
-    Row("added_mass", float, "Added mass in kg of a second test."),
-    Row("mass_at", str, "Sensor at the added mass.", "NAME"),
-    Row("with_mass", list[Path], "Test with the added mass (repeatable).", "FRF"),
-    Row(
+    OptionRow("drive_point", str, "Sensor at the force (default: by point and axis).", "NAME"),
+    OptionRow("turned", bool, "The drive point's sensor is against the force.", None, False),
+    OptionRow(
+        *("second_mass", float),
+        "Added mass in kg of a second test.",
+        flag="--added-mass",
+    ),
+    OptionRow("mass_at", str, "Sensor at the added mass.", "NAME"),
+    OptionRow("with_mass", list[Path], "Test with the added mass (repeatable).", "FRF"),
+    OptionRow(
         *("sensor_mass", list[str]),
         "Mass that a sensor stands for, as tip=0.2 (repeatable); with --base, or with "
         "--fixture-mass.",
         "NAME=KG",
     ),
-    Row("fixture_mass", float, "Mass in kg of a free fixture that is forced."),
-    Row(
+    OptionRow("fixture_mass", float, "Mass in kg of a free fixture that is forced."),
+    OptionRow(
         *("known_shape", str),
         "Mass-normalised shape at a sensor, as midspan=11.84.",
         "NAME=VALUE",
     ),
-    Row(
+    OptionRow(
         *("unscaled", bool),
         "Relative shapes: frequency and damping only.",
         *(None, False),
     ),
-    Row("newtons_per_volt", float, "Calibration of a drive voltage."),
-    Row("newtons_per_volt_std", float, "Its 1σ.", None, 0.0),
-    Row("calibration_std", float, "Relative 1σ of response over force.", None, 0.0),
-    Row("free", bool, "Structure free as a rigid body: write that mode.", None, False),
-    Row("mass", float, "Its mass in kg, if weighed (implies --free)."),
+    OptionRow("newtons_per_volt", float, "Calibration of a drive voltage."),
+    OptionRow("newtons_per_volt_std", float, "Its 1σ.", None, 0.0),
+    OptionRow("calibration_std", float, "Relative 1σ of response over force.", None, 0.0),
+    OptionRow("free", bool, "Structure free as a rigid body: write that mode.", None, False),
+    OptionRow("mass", float, "Its mass in kg, if weighed (implies --free)."),
 )
 with_options(modes, {None: _DATA_ROWS, "Fit": _FIT_ROWS, "Scale of the shapes": _SCALE_ROWS})

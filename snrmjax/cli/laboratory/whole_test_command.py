@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from snrmjax.cli.console import say, staged, warn
-from snrmjax.cli.options import FILES, Out, Row, with_options
+from snrmjax.cli.options import FILES, OptionRow, Out, with_options
 
 
 def whole_test(
@@ -54,12 +54,14 @@ def whole_test(
     say(f"written to {out}: open {out / 'report.html'}")
 
 
-_MODEL = Row(
+_MODEL = OptionRow(
     "model", Path, "Linear model, in place of the folder's or of frequency responses.", "MODEL"
 )
 _FURTHER = (
-    Row("drive_point", str, "Sensor at the force, by which mode shapes are scaled.", "NAME"),
-    Row("go_on", bool, "Go on in spite of errors that the check finds.", None, False),
-    Row("diagnose", bool, "Look for what the model lacks, too (a minute or more).", None, True),
+    OptionRow("drive_point", str, "Sensor at the force, by which mode shapes are scaled.", "NAME"),
+    OptionRow("go_on", bool, "Go on in spite of errors that the check finds.", None, False),
+    OptionRow(
+        "diagnose", bool, "Look for what the model lacks, too (a minute or more).", None, True
+    ),
 )
 with_options(whole_test, {FILES: (_MODEL,), None: _FURTHER})

@@ -37,7 +37,7 @@ def files_of_test(folder: Path, files: TestFiles) -> FilesRead | None:
     )
 
 
-def with_options(checkup: Checkup, read: FilesRead | None) -> Checkup:
+def with_imports(checkup: Checkup, read: FilesRead | None) -> Checkup:
     """The findings with the import that mends each; the first certain one with that of all."""
     if read is None:
         return checkup

@@ -43,7 +43,7 @@ from snrmjax.report.interactive.folded_records import folded_records
 from snrmjax.report.interactive.state_explorer import FoldedRecord, state_explorer
 from snrmjax.report.modal.modal_report import modal_report, modes_sentence, write_modal_tables
 from snrmjax.report.whole_test.folder_contents import NamedRecord, TestFiles
-from snrmjax.report.whole_test.mends import FilesRead, is_certain, with_options
+from snrmjax.report.whole_test.mends import FilesRead, is_certain, with_imports
 from snrmjax.report.whole_test.undiagnosed import not_diagnosed
 from snrmjax.report.workflow import (
     Findings,
@@ -119,7 +119,7 @@ def run_whole_test(
     data = join_steady_states(parts)
     stage.ends(f"{data.n_states} steady states")
     checkup = check_test(parts, modes.model, [one.record for one in files.records])
-    checkup = with_options(checkup, request.read)
+    checkup = with_imports(checkup, request.read)
     _stop_at_errors(checkup, request)
     write_steady_states(folder / "measured.csv", data)
     write_checkup(folder / "check.json", checkup)

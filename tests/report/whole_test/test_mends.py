@@ -159,7 +159,7 @@ def test_options_of_a_laboratorys_files_are_those_of_their_map(repair, options):
         (Path("raw/a.csv"),), Path("raw/map.toml"), ImportMap((ResponseMap("a", "acceleration"),))
     )
     finding = Finding("wrong_unit", "error", "", "", "Again.", (), (repair,))
-    (told,) = mends.with_options(Checkup((finding,)), read).findings
+    (told,) = mends.with_imports(Checkup((finding,)), read).findings
     line = f"snrmjax import raw/a.csv --map raw/map.toml {options} --out raw/mended"
     assert told.mend == (f"Again: `{line}`." if options else "Again.")
 
