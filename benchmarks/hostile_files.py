@@ -35,14 +35,12 @@ SECONDS, MEGABYTES, GUARD = 10, 200, 2**30
 def valid_files(folder):
     """Valid files of every format by name."""
     import h5py
+    import pyuff
     import scipy.io
     from nptdms import ChannelObject, TdmsWriter
 
-    from snrmjax.io.exchange.exports import write_matlab, write_netcdf
-    from snrmjax.io.laboratory.contents import measured_shapes
-    from snrmjax.io.laboratory.uff.writing import write_uff
-    from snrmjax.measure import Channel, steady_states, time_recording
-    from snrmjax.measure.recordings.frequency_responses import frequency_responses
+    from snrmjax.io.exchange.exports import write_netcdf
+    from snrmjax.measure import Channel, time_recording
 
     rng = np.random.default_rng(1)
     hertz = np.linspace(79, 81, 40)
@@ -54,24 +52,30 @@ def valid_files(folder):
         ],
         1000.0,
     )
-    curve = frequency_responses(
-        2 * np.pi * hertz,
-        rng.normal(size=(1, 1, 40)) + 1j,
-        [Channel("a", "velocity", "", 1.0, "1", "+z")],
-        [Channel("f", "force", "", 1.0, "1", "+z")],
-    )
-    shapes = measured_shapes([500.0], [0.01], [[1.0, 2.0]], ["1", "2"], ["+z", "+z"])
-    states = steady_states([1, 1], [500.0, 501.0], [0.1, 0.1], [0.1 + 0.1j, 0.2])
-    every = {"recordings": [record], "responses": [curve], "levels": [0.1]}
-    write_uff(folder / "a.uff", **every, shapes=[shapes])
-    write_uff(folder / "b.uff", **every, shapes=[shapes], binary=False)
-    write_matlab(folder / "a.mat", **every, states=states)
+    place = {"rsp_node": 1, "rsp_dir": 3, "ref_node": 1, "ref_dir": 3}
+    frf = {
+        "func_type": 4,
+        "abscissa_spacing": 0,
+        "abscissa_spec_data_type": 18,
+        "z_axis_value": 0.1,
+    }
+    frf |= {"ordinate_spec_data_type": 11, "orddenom_spec_data_type": 13}
+    wave = {"func_type": 1, "abscissa_spacing": 1, "abscissa_spec_data_type": 17}
+    wave |= {"ordinate_spec_data_type": 13, "orddenom_spec_data_type": 0}
+    time, values = np.arange(300) / 1000, rng.normal(size=300)
+    for name, binary in (("a.uff", 1), ("b.uff", 0)):
+        curve = pyuff.prepare_58(x=hertz, data=values[:40] + 1j, binary=binary, **place, **frf)
+        tone = pyuff.prepare_58(x=time, data=values, binary=binary, **place, **wave)
+        pyuff.UFF(str(folder / name)).write_sets([curve, tone], "add")
+    cells = {"fs": 1000.0, "signal": record.values().T, "names": np.array(["a", "b"], dtype=object)}
+    steps = {"freq": hertz, "force": hertz / 800, "v": values[:40] ** 2}
+    scipy.io.savemat(folder / "a.mat", {"run": cells, "steps": steps})
     kinds = [(key, object) for key in ("freq", "force", "amplitude", "phase")]
     rows = [(hertz, hertz * 0 + 0.1 * k, hertz / 80, hertz) for k in (1, 2)]
     scipy.io.savemat(folder / "b.mat", {"d": np.array(rows, dtype=kinds)}, do_compression=True)
     old = {"freq": hertz, "H": hertz + 1j, "title": "of level 4"}
     scipy.io.savemat(folder / "d.mat", old, format="4")
-    write_netcdf(folder / "a.nc", **every, states=states)
+    write_netcdf(folder / "a.nc", record)
     with h5py.File(folder / "a.h5", "w") as file:
         for key, values in zip(("freq", "F", "X", "Y"), rng.normal(size=(4, 200)), strict=True):
             file.create_dataset(f"test/{key}", data=values, compression="gzip", chunks=(50,))

@@ -38,10 +38,9 @@ def ours(path):
     for one in held.recordings:
         rows = one.samples.read(range(len(one.channels)), 0, one.n_samples)
         found += list(zip(one.channel_names, rows, strict=True))
-    for one in (*held.tables, *held.nodes):
-        length = {} if held.kind != "uff" else {"x_m", "y_m", "z_m"}
+    for one in held.tables:
         found += [
-            (f"{one.name}.{key}", column, key in length)
+            (f"{one.name}.{key}", column)
             for key, column in one.columns.items()
             if key not in COUNTERS and not (held.kind == "uff" and key in ("time", "frequency"))
         ]
@@ -53,8 +52,6 @@ def ours(path):
                     found.append((f"{output.name} over {given.name}", values, True))
                 if not np.isnan(one.coherence[k, m]).all():
                     found.append((f"coherence of {output.name}", one.coherence[k, m]))
-    for one in held.shapes:
-        found += [(f"mode {k + 1}", row) for k, row in enumerate(one.shapes)]
     return held, found, "\n".join((*lines, *held.notes))
 
 
@@ -64,24 +61,12 @@ def of_uff(path):
 
     source = pyuff.UFF(str(path))
     types = [int(number) for number in source.get_set_types()]
-    # Nodes are in the file's unit of length, of which data set 164 says how many are a metre.
-    metre = source.read_sets(types.index(164))["length"] if 164 in types else 1.0
     for k, number in enumerate(types):
         name = f"type {number}"
-        if number not in (15, 55, 58, 2411):
-            if number not in (151, 164):
-                yield name, None
-            continue
-        one = source.read_sets(k)
         if number == 58:
-            yield name, one["data"]
-        elif number in (15, 2411):
-            yield name, np.asarray(one["node_nums"])
-            yield from ((name, np.asarray(one[axis]) / metre) for axis in ("x", "y", "z"))
-        elif number == 55:
-            rows = [one[f"r{k}"] for k in range(1, 7) if f"r{k}" in one]
-            moving = [row for row in rows if np.any(row)]
-            yield name, np.array(moving or rows).T.reshape(-1)
+            yield name, source.read_sets(k)["data"]
+        elif number not in (151, 164):
+            yield name, None
 
 
 def of_tdms(path):

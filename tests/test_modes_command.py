@@ -9,10 +9,10 @@ from unittest import mock
 import numpy as np
 import pytest
 from truths.modal_structures import HERTZ, chain, integrated, receptance
+from truths.uff_writing import write_uff
 
 import snrmjax as sj
 from snrmjax.cli import main
-from snrmjax.io.laboratory.uff.writing import write_uff
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.frequency_responses import frequency_responses
 from snrmjax.measure.recordings.time_recording import time_recording

@@ -7,7 +7,7 @@ import typer
 
 from snrmjax.cli.console import say, staged, warn
 from snrmjax.cli.measured_tests import read_measured_test
-from snrmjax.cli.options import FILES, Out
+from snrmjax.cli.options import Linear, Out
 from snrmjax.io.models import read_model
 
 
@@ -24,15 +24,7 @@ def compare(
             show_default=False,
         ),
     ],
-    model: Annotated[
-        Path,
-        typer.Option(
-            help="Linear model of the structure (TOML), as for identify.",
-            metavar="MODEL",
-            rich_help_panel=FILES,
-            show_default=False,
-        ),
-    ],
+    model: Linear,
     out: Out,
     method: Annotated[
         list[str] | None,
@@ -54,17 +46,19 @@ def compare(
 
     Writes compare.csv, summary.json, compare.png and report.html.
     """
+    from snrmjax.methods.comparison import compare_methods
+    from snrmjax.model.structures import modes_of
     from snrmjax.report.methods import comparison_report
 
     with staged(out) as folder:
         structure = read_model(model)
         tests = [one for path in data for one in read_measured_test(path, structure)]
-        found = comparison_report.run_methods(tests, structure, tuple(method) if method else None)
-        for line in found.comparison.records:
+        found = compare_methods(tests, modes_of(structure), tuple(method) if method else None)
+        for line in found.records:
             say(line)
-        for why in found.comparison.stopped.values():
+        for why in found.stopped.values():
             warn(f"did not run: {why}")
         name = ", ".join(path.stem.replace("_", " ") for path in data)
-        comparison_report.write_comparison(folder, found, name)
+        comparison_report.write_comparison(folder, found, name, structure.name)
     say(comparison_report.comparison_sentence(found))
     say(f"written to {out}: open {out / 'report.html'}")

@@ -56,9 +56,7 @@ def demo(out: Out) -> None:
         data = test.steady_states
         write_steady_states(folder / "steady_states.csv", data)
         say("identifying backbone and damping, predicting responses")
-        found = workflow.identify_by_points(
-            data, model, workflow.CurveSettings(), workflow.Loads(FLAT_BEAM_FORCES)
-        )
+        found = workflow.identify_by_points(data, model, workflow.Loads(FLAT_BEAM_FORCES))
         found = found._replace(truth=branch, simulated=tuple(curves))
         done = {"data": "a virtual test with seeded noise", "model": model.name}
         workflow.write_findings(folder, found, "The chain on the flat beam", done)

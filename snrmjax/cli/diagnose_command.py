@@ -1,12 +1,12 @@
 """The command `diagnose`: what a model lacks."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from snrmjax.cli.console import say, staged, warn
-from snrmjax.cli.options import FILES, Out
+from snrmjax.cli.options import FILES, OptionRow, Out, with_options
 from snrmjax.io.models import read_model
 from snrmjax.io.tables import read_steady_states
 
@@ -35,45 +35,7 @@ def diagnose(
         ),
     ],
     out: Out,
-    responses: Annotated[
-        bool | None,
-        typer.Option(
-            help="Simulate the responses of the model as given and as completed, for comparison "
-            "with the data. Default: for a single file.",
-            show_default=False,
-        ),
-    ] = None,
-    plan: Annotated[
-        Path | None,
-        typer.Option(
-            help="Write the measurement that would decide an open answer: a CSV of steady states "
-            "to be filled in.",
-            metavar="FILE",
-            rich_help_panel=FILES,
-            show_default=False,
-        ),
-    ] = None,
-    add: Annotated[
-        list[Path] | None,
-        typer.Option(
-            help="Further steady states of the same structure, such as a plan that was filled in: "
-            "one diagnosis of all states (repeatable).",
-            metavar="FILE",
-            rich_help_panel=FILES,
-            show_default=False,
-        ),
-    ] = None,
-    former: Annotated[
-        Path | None,
-        typer.Option(
-            "--continue",
-            help="diagnosis.json of the states without those of `--add`: fits begin at its "
-            "answers too, and the notes say what the further states changed.",
-            metavar="FILE",
-            rich_help_panel=FILES,
-            show_default=False,
-        ),
-    ] = None,
+    **options: Any,
 ) -> None:
     """Find the physics that a model lacks: where it disagrees with the data, and what that is.
 
@@ -87,6 +49,7 @@ def diagnose(
     from snrmjax.report.diagnosis_report import readable_verdict, write_diagnosis
 
     several = len(data) > 1
+    plan, add, former = options["plan"], options["add"], options["former"]
     for option, given in (("--plan", plan), ("--add", add), ("--continue", former)):
         if several and given:
             raise ValueError(f"`{option}` is for one data file, but {len(data)} are given.")
@@ -105,11 +68,11 @@ def diagnose(
             with staged(out / path.stem if several else out) as folder:
                 structure = read_model(own)
                 measured = read_steady_states(path, structure)
-                for file in add or ():
+                for file in add:
                     measured = read_further_states(file, structure, measured)
                 for note in measured.notes:
                     warn(note)
-                simulate = not several if responses is None else responses
+                simulate = not several if options["responses"] is None else options["responses"]
                 found, _ = write_diagnosis(
                     folder, path.stem, structure, measured, simulate=simulate, former=before
                 )
@@ -136,6 +99,35 @@ def diagnose(
         say(f"written to {out}: open {out / 'report.html'}")
     if refused:
         raise ValueError(f"no diagnosis for {len(refused)} of {len(data)}: {', '.join(refused)}.")
+
+
+_RESPONSES = OptionRow(
+    *("responses", bool),
+    "Simulate the responses of the model as given and as completed, for comparison with the data. "
+    "Default: for a single file.",
+)
+_FILE_ROWS = (
+    OptionRow(
+        *("plan", Path),
+        "Write the measurement that would decide an open answer: a CSV of steady states to be "
+        "filled in.",
+        "FILE",
+    ),
+    OptionRow(
+        *("add", list[Path]),
+        "Further steady states of the same structure, such as a plan that was filled in: one "
+        "diagnosis of all states (repeatable).",
+        "FILE",
+    ),
+    OptionRow(
+        *("former", Path),
+        "diagnosis.json of the states without those of `--add`: fits begin at its answers too, and "
+        "the notes say what the further states changed.",
+        "FILE",
+        flag="--continue",
+    ),
+)
+with_options(diagnose, {None: (_RESPONSES,), FILES: _FILE_ROWS})
 
 
 def _write_plan(file: Path, found: "Diagnosis") -> None:

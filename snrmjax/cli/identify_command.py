@@ -1,41 +1,16 @@
 """The command `identify`: backbone and damping from measured steady states."""
 
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, Literal
 
 import typer
 
 from snrmjax.cli.console import say, staged, warn
-from snrmjax.cli.options import FILES, Out, require_positive
+from snrmjax.cli.options import Linear, OptionRow, Out, require_positive, with_options
+from snrmjax.identify.pointwise.backbone_points import AmplitudeArgument, AmplitudeMeasure
 from snrmjax.identify.prediction.new_level import DayToDay
 from snrmjax.io.models import read_model
 from snrmjax.io.tables import read_steady_states
-
-_PREDICTION = "Predicted responses"
-_CURVES, _JOINT = "Curves through points (without --fit)", "Joint fit of all states"
-
-
-class Amplitude(StrEnum):
-    """The amplitude of which an identified frequency and damping are functions."""
-
-    displacement = "displacement"
-    velocity = "velocity"
-
-
-class AmplitudeAxis(StrEnum):
-    """The amplitude that figures and tables show."""
-
-    velocity = "velocity"
-    displacement = "displacement"
-    acceleration = "acceleration"
-
-
-class Measure(StrEnum):
-    """The amplitude of the measured motion that enters the equations."""
-
-    fundamental = "fundamental"
-    peak = "peak"
 
 
 def identify(
@@ -49,141 +24,9 @@ def identify(
             show_default=False,
         ),
     ],
-    model: Annotated[
-        Path,
-        typer.Option(
-            help="Linear model of the structure (TOML): frequencies, damping ratios, mass-"
-            "normalised shapes, participations.",
-            metavar="MODEL",
-            rich_help_panel=FILES,
-            show_default=False,
-        ),
-    ],
+    model: Linear,
     out: Out,
-    predict_force: Annotated[
-        list[float] | None,
-        typer.Option(
-            help="Predict resonance and response under this force in N; give it again for more.",
-            metavar="N",
-            rich_help_panel=_PREDICTION,
-        ),
-    ] = None,
-    predict_drive: Annotated[
-        list[float] | None,
-        typer.Option(
-            help="The same under this drive voltage in V, for data with drive_v.",
-            metavar="V",
-            rich_help_panel=_PREDICTION,
-        ),
-    ] = None,
-    extrapolate: Annotated[
-        float,
-        typer.Option(
-            help="Predict up to this multiple of the largest measured amplitude; 1 ends where the "
-            "data end.",
-            metavar="RATIO",
-            min=1.0,
-            rich_help_panel=_PREDICTION,
-        ),
-    ] = 1.5,
-    day_std: Annotated[
-        str | None,
-        typer.Option(
-            help="Predict for another day's test, which differs from this one by so much: relative "
-            "1σ of natural frequency, damping and gain, as 0.001,0.05,0.02.",
-            metavar="FREQUENCY,DAMPING,GAIN",
-            rich_help_panel=_PREDICTION,
-        ),
-    ] = None,
-    self_excited: Annotated[
-        bool,
-        typer.Option(
-            "--self-excited",
-            help="Let extrapolated damping be negative, as no passive structure's is.",
-            rich_help_panel=_PREDICTION,
-        ),
-    ] = False,
-    axis: Annotated[
-        AmplitudeAxis,
-        typer.Option(
-            help="Amplitude over which backbone, damping, the joint fit's curves and residuals "
-            "are drawn; responses over frequency stay velocities. Displacement and acceleration "
-            "also add a column to points.csv and backbone.csv.",
-        ),
-    ] = AmplitudeAxis.velocity,
-    amplitude: Annotated[
-        Amplitude,
-        typer.Option(
-            help="Amplitude of which natural frequency and damping are functions: displacement "
-            "(right for a nonlinear stiffness) or velocity.",
-            rich_help_panel=_CURVES,
-        ),
-    ] = Amplitude.displacement,
-    measure: Annotated[
-        Measure,
-        typer.Option(
-            help="Take the amplitude of the fundamental, or the peak of the motion with its "
-            "measured harmonics.",
-            rich_help_panel=_CURVES,
-        ),
-    ] = Measure.fundamental,
-    knots: Annotated[
-        int | None,
-        typer.Option(
-            help="Knots of each curve at most. Default: up to 42; curves bend as much as the data "
-            "ask for.",
-            min=2,
-            rich_help_panel=_CURVES,
-        ),
-    ] = None,
-    anchor: Annotated[
-        bool,
-        typer.Option(
-            "--anchor",
-            help="Make both curves start at the linear frequency and damping of the model.",
-            rich_help_panel=_CURVES,
-        ),
-    ] = False,
-    fit: Annotated[
-        str | None,
-        typer.Option(
-            help="Family of the backbone and, after a comma, of the damping: auto (a smooth curve "
-            "that bends as much as the data ask for), polynomial:2, power_law, spline:5, "
-            "smoothing_spline; for damping also constant, viscous_quadratic, viscous_coulomb, "
-            "viscous_microslip. :2 is its size (left out: the simplest in the smooth curve's "
-            "band), @velocity its amplitude. Default: auto,auto where another option asks for a "
-            "joint fit.",
-            metavar="BACKBONE[,DAMPING]",
-            rich_help_panel=_JOINT,
-        ),
-    ] = None,
-    free: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Errors of the instruments to be found with the curves: force_gain (N per V for "
-            "data with drive_v), force_offset, instrument_phase; several with commas.",
-            metavar="NAME[,NAME]",
-            rich_help_panel=_JOINT,
-        ),
-    ] = None,
-    robust: Annotated[
-        bool,
-        typer.Option(
-            "--robust",
-            help="Give outlying states less weight.",
-            rich_help_panel=_JOINT,
-        ),
-    ] = False,
-    further: Annotated[
-        int | None,
-        typer.Option(
-            "--next",
-            help="Advise this many further measurements, those that narrow the bands most.",
-            metavar="COUNT",
-            min=1,
-            rich_help_panel=_JOINT,
-        ),
-    ] = None,
+    **options: Any,
 ) -> None:
     """Identify backbone and damping from measured steady states, and predict responses.
 
@@ -199,36 +42,140 @@ def identify(
 
     given = {name for name in context.params if _was_given(context, name)}
     _check_options(given)
-    require_positive("--predict-force", predict_force or (), "N")
-    require_positive("--predict-drive", predict_drive or (), "V")
+    forces, drives = options["predict_force"], options["predict_drive"]
+    require_positive("--predict-force", forces, "N")
+    require_positive("--predict-drive", drives, "V")
+    day = options["day_std"]
     loads = Loads(
-        *(tuple(predict_force or ()), tuple(predict_drive or ()), extrapolate),
-        day=None if day_std is None else _day_to_day(day_std),
-        self_excited=self_excited,
+        *(tuple(forces), tuple(drives), options["extrapolate"]),
+        day=None if day is None else _day_to_day(day),
+        self_excited=options["self_excited"],
     )
     with staged(out) as folder:
         structure = read_model(model)
         measured = read_steady_states(data, structure)
         if given & _ASK_FOR_FIT:
-            settings = workflow.JointFitSettings(
-                fit or "auto", tuple(free or ()), robust=robust, further=further or 0
+            found = workflow.identify_jointly(
+                *(measured, structure, loads),
+                families=options["fit"] or "auto",
+                free=options["free"],
+                robust=options["robust"],
+                further=options["further"] or 0,
             )
-            found = workflow.identify_jointly(measured, structure, settings, loads)
         else:
-            curves = workflow.CurveSettings(
-                amplitude.value, measure.value, n_knots=knots, anchor=anchor
+            found = workflow.identify_by_points(
+                *(measured, structure, loads),
+                amplitude=options["amplitude"],
+                measure=options["measure"],
+                n_knots=options["knots"],
+                anchor=options["anchor"],
             )
-            found = workflow.identify_by_points(measured, structure, curves, loads)
         for note in found.notes:
             warn(note)
         files = {"data": data.name, "model": f"{structure.name} ({model.name})"}
-        shown = SHOWN_AMPLITUDES[axis.value]
+        shown = SHOWN_AMPLITUDES[options["axis"]]
         workflow.write_findings(folder, found, data.stem.replace("_", " "), files, shown)
     for line in workflow.headline(found):
         say(line)
     say(f"written to {out}: open {out / 'report.html'}")
 
 
+_GENERAL = (
+    OptionRow(
+        *("axis", Literal["velocity", "displacement", "acceleration"]),
+        "Amplitude over which backbone, damping, the joint fit's curves and residuals are drawn; "
+        "responses over frequency stay velocities. Displacement and acceleration also add a column "
+        "to points.csv and backbone.csv.",
+        *(None, "velocity"),
+    ),
+)
+_PREDICTION = (
+    OptionRow(
+        *("predict_force", list[float]),
+        "Predict resonance and response under this force in N; give it again for more.",
+        "N",
+    ),
+    OptionRow(
+        *("predict_drive", list[float]),
+        "The same under this drive voltage in V, for data with drive_v.",
+        "V",
+    ),
+    OptionRow(
+        *("extrapolate", float),
+        "Predict up to this multiple of the largest measured amplitude; 1 ends where the data end.",
+        *("RATIO", 1.5),
+        least=1.0,
+    ),
+    OptionRow(
+        *("day_std", str),
+        "Predict for another day's test, which differs from this one by so much: relative 1σ of "
+        "natural frequency, damping and gain, as 0.001,0.05,0.02.",
+        "FREQUENCY,DAMPING,GAIN",
+    ),
+    OptionRow(
+        *("self_excited", bool),
+        "Let extrapolated damping be negative, as no passive structure's is.",
+        *(None, False),
+    ),
+)
+_CURVES = (
+    OptionRow(
+        *("amplitude", AmplitudeArgument),
+        "Amplitude of which natural frequency and damping are functions: displacement (right for a "
+        "nonlinear stiffness) or velocity.",
+        *(None, "displacement"),
+    ),
+    OptionRow(
+        *("measure", AmplitudeMeasure),
+        "Take the amplitude of the fundamental, or the peak of the motion with its measured "
+        "harmonics.",
+        *(None, "fundamental"),
+    ),
+    OptionRow(
+        *("knots", int),
+        "Knots of each curve at most. Default: up to 42; curves bend as much as the data ask for.",
+        least=2,
+    ),
+    OptionRow(
+        *("anchor", bool),
+        "Make both curves start at the linear frequency and damping of the model.",
+        *(None, False),
+    ),
+)
+_JOINT = (
+    OptionRow(
+        *("fit", str),
+        "Family of the backbone and, after a comma, of the damping: auto (a smooth curve that "
+        "bends as much as the data ask for), polynomial:2, power_law, spline:5, smoothing_spline; "
+        "for damping also constant, viscous_quadratic, viscous_coulomb, viscous_microslip. :2 is "
+        "its size (left out: the simplest in the smooth curve's band), @velocity its amplitude. "
+        "Default: auto,auto where another option asks for a joint fit.",
+        "BACKBONE[,DAMPING]",
+    ),
+    OptionRow(
+        *("free", list[str]),
+        "Errors of the instruments to be found with the curves: force_gain (N per V for data with "
+        "drive_v), force_offset, instrument_phase; several with commas.",
+        "NAME[,NAME]",
+    ),
+    OptionRow("robust", bool, "Give outlying states less weight.", None, False),
+    OptionRow(
+        *("further", int),
+        "Advise this many further measurements, those that narrow the bands most.",
+        "COUNT",
+        least=1,
+        flag="--next",
+    ),
+)
+with_options(
+    identify,
+    {
+        None: _GENERAL,
+        "Predicted responses": _PREDICTION,
+        "Curves through points (without --fit)": _CURVES,
+        "Joint fit of all states": _JOINT,
+    },
+)
 _ASK_FOR_FIT = {"fit", "free", "further"}
 _NOT_WITH_FIT = {
     "amplitude": "name the amplitude with the family, as in `--fit polynomial:2@velocity`",

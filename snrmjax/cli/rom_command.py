@@ -1,12 +1,12 @@
 """The command `rom`: a reduced-order model from finite elements."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from snrmjax.cli.console import console, say, staged, warn
-from snrmjax.cli.options import FILES, Out
+from snrmjax.cli.options import FILES, OptionRow, Out, with_options
 
 if TYPE_CHECKING:
     from snrmjax.io.reduction.source import ReductionSource
@@ -27,35 +27,7 @@ def rom(
             show_default=False,
         ),
     ] = None,
-    tables: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder with cases.csv and modes.toml: load cases that another code has run.",
-            metavar="DIR",
-            rich_help_panel=FILES,
-            show_default=False,
-        ),
-    ] = None,
-    calculix: Annotated[
-        Path | None,
-        typer.Option(
-            help="CalculiX deck of the structure, with its mesh, material and supports. Its load "
-            "cases are kept in a folder beside it (deck.jobs for deck.inp), for later runs.",
-            metavar="DECK",
-            rich_help_panel=FILES,
-            show_default=False,
-        ),
-    ] = None,
-    modes: Annotated[
-        str | None,
-        typer.Option(
-            help="Numbers of the modes to keep, with --calculix.", metavar="1,3", show_default=False
-        ),
-    ] = None,
-    no_study: Annotated[
-        bool,
-        typer.Option("--no-study", help="Leave out the study over the size of the loads."),
-    ] = False,
+    **options: Any,
 ) -> None:
     """Condense static load cases of finite elements to a reduced-order model.
 
@@ -69,15 +41,35 @@ def rom(
     )
 
     with staged(out) as folder:
-        source = _source(beam, tables, calculix, modes)
+        source = _source(beam, options["tables"], options["calculix"], options["modes"])
         with console.status("static load cases …"):
-            found = reduce(source, study=not no_study, report=_progress)
+            found = reduce(source, study=not options["no_study"], report=_progress)
         write_reduction(folder, found)
     for note in found.notes:
         warn(note)
     _say_scale(found)
     say(reduction_sentence(found))
     say(f"written to {out}")
+
+
+_SOURCES = (
+    OptionRow(
+        *("tables", Path),
+        "Folder with cases.csv and modes.toml: load cases that another code has run.",
+        "DIR",
+    ),
+    OptionRow(
+        *("calculix", Path),
+        "CalculiX deck of the structure, with its mesh, material and supports. Its load cases are "
+        "kept in a folder beside it (deck.jobs for deck.inp), for later runs.",
+        "DECK",
+    ),
+)
+_FURTHER = (
+    OptionRow("modes", str, "Numbers of the modes to keep, with --calculix.", "1,3"),
+    OptionRow("no_study", bool, "Leave out the study over the size of the loads.", None, False),
+)
+with_options(rom, {FILES: _SOURCES, None: _FURTHER})
 
 
 def _source(

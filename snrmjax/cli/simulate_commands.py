@@ -1,7 +1,6 @@
 """The commands `simulate` and `nnm`: what a model does."""
 
-from enum import StrEnum
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 import typer
@@ -12,13 +11,6 @@ from snrmjax.cli.options import Harmonics, Model, Out, require_positive
 from snrmjax.io.models import read_model
 from snrmjax.io.units import HERTZ
 from snrmjax.simulate.continuation.continuation import STATUS_MESSAGE
-
-
-class Tongues(StrEnum):
-    """What to do where a normal mode runs out on an internal resonance and back."""
-
-    follow = "follow"
-    skip = "skip"
 
 
 def simulate(
@@ -119,12 +111,12 @@ def nnm(
     out: Out,
     harmonics: Harmonics = 9,
     tongues: Annotated[
-        Tongues,
+        Literal["follow", "skip"],
         typer.Option(
             help="Where an internal resonance lets the mode run out and back: follow this tongue, "
             "or skip it."
         ),
-    ] = Tongues.follow,
+    ] = "follow",
 ) -> None:
     """Follow the undamped nonlinear normal mode of interest from its linear frequency.
 
@@ -142,7 +134,7 @@ def nnm(
             raise ValueError(f"`--to-hz` must differ from the linear frequency, {linear:g} Hz.")
         _report_equilibria(structure)
         branch = sj.nonlinear_normal_mode(
-            structure, to_hz * HERTZ, harmonic_order=harmonics, tongues=tongues.value
+            structure, to_hz * HERTZ, harmonic_order=harmonics, tongues=tongues
         )
         for tongue in branch.tongues:
             say(

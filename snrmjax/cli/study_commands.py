@@ -5,12 +5,12 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from snrmjax.cli.console import console, say, staged, warn
-from snrmjax.cli.options import FILES, Out
+from snrmjax.cli.options import FILES, OptionRow, Out, with_options
 
 if TYPE_CHECKING:
     import xarray
@@ -31,6 +31,10 @@ study_app = typer.Typer(
     rich_markup_mode="rich",
 )
 
+Store = Annotated[
+    Path,
+    typer.Argument(help="The data set of a complete study.", metavar="STORE", show_default=False),
+]
 StudyOut = Annotated[
     Path,
     typer.Option(
@@ -44,10 +48,6 @@ StudyOut = Annotated[
 ]
 
 
-@study_app.command(
-    epilog="Example: snrmjax study run study.toml --out study.zarr. On a batch queue, one task of "
-    "four: snrmjax study run study.toml --out study.zarr --shard 3/4"
-)
 def run(
     file: Annotated[
         Path,
@@ -56,33 +56,7 @@ def run(
         ),
     ],
     out: StudyOut,
-    processes: Annotated[
-        int | None,
-        typer.Option(
-            help="Processes of this machine, each on one core; by default one for every core.",
-            min=1,
-            show_default=False,
-        ),
-    ] = None,
-    scheduler: Annotated[
-        str | None,
-        typer.Option(
-            help="Address of a running Dask scheduler whose workers see the same folders, such as "
-            "tcp://node1:8786.",
-            metavar="ADDRESS",
-            show_default=False,
-        ),
-    ] = None,
-    shard: Annotated[
-        str | None,
-        typer.Option(
-            help="Compute the I-th of N parts only, on a shared folder; the one that ends last "
-            "makes the data set.",
-            metavar="I/N",
-            show_default=False,
-        ),
-    ] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing but what is wrong.")] = False,
+    **options: Any,
 ) -> None:
     """Run a study, or continue one that was stopped: the same command again.
 
@@ -92,13 +66,14 @@ def run(
     from snrmjax.study.study_file import read_study
     from snrmjax.study.workers import ClusterGone
 
+    quiet, shard = options["quiet"], options["shard"]
     part = None if shard is None else _shard(shard)
     study = read_study(file)
     if not quiet:
         _say_study(study)
     try:
         with _progress(quiet) as progress:
-            settings = RunSettings(processes, scheduler, part, progress)
+            settings = RunSettings(options["processes"], options["scheduler"], part, progress)
             done = run_study(study, out, settings)
     except KeyboardInterrupt:
         warn("stopped; the same command continues.")
@@ -110,14 +85,36 @@ def run(
         _say_done(done, out)
 
 
+_RUN_ROWS = (
+    OptionRow(
+        *("processes", int),
+        "Processes of this machine, each on one core; by default one for every core.",
+        least=1,
+    ),
+    OptionRow(
+        *("scheduler", str),
+        "Address of a running Dask scheduler whose workers see the same folders, such as "
+        "tcp://node1:8786.",
+        "ADDRESS",
+    ),
+    OptionRow(
+        *("shard", str),
+        "Compute the I-th of N parts only, on a shared folder; the one that ends last makes the "
+        "data set.",
+        "I/N",
+    ),
+    OptionRow("quiet", bool, "Say nothing but what is wrong.", None, False),
+)
+with_options(run, {None: _RUN_ROWS})
+study_app.command(
+    epilog="Example: snrmjax study run study.toml --out study.zarr. On a batch queue, one task of "
+    "four: snrmjax study run study.toml --out study.zarr --shard 3/4"
+)(run)
+
+
 @study_app.command(epilog="Example: snrmjax study report study.zarr --out report")
 def report(
-    store: Annotated[
-        Path,
-        typer.Argument(
-            help="The data set of a complete study.", metavar="STORE", show_default=False
-        ),
-    ],
+    store: Store,
     out: Out,
 ) -> None:
     """Draw a study: distributions, main effects, response bands, where members failed.

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from snrmjax.doctor.corrections import TestCorrection, corrections
-from snrmjax.doctor.findings import Checkup, Finding, Repair, gravest_first, percent, rows_in_words
+from snrmjax.doctor.findings import Checkup, Finding, gravest_first, percent, rows_in_words
 from snrmjax.doctor.force_checks import deepest_fall, dropout_findings, harmonic_findings
 from snrmjax.doctor.judgement import (
     CheckedStates,
@@ -196,7 +196,6 @@ def _mended(seen: CheckedStates, base: Judged, one: TestCorrection, where: str) 
             f"at equal amplitude the natural frequency of {one.name} is {100 * one.value:.3g} % "
             f"from {'file 1' if len(seen.files) == 2 else 'the others'}'s{left}",
             "identify them apart: one call and one model for each structure or assembly.",
-            repairs=(Repair(apart=True),),
         )
     if one.kind == "volts_as_force":
         return _of_gains(one, where, left, seen.files)
@@ -214,7 +213,6 @@ def _mended(seen: CheckedStates, base: Judged, one: TestCorrection, where: str) 
             f"about {percent(one.value)} of a change is left at the end of a step{left}",
             "dwell longer, 5/(ζω) a step; or import the time record, whose unsettled steps are "
             "left out.",
-            repairs=(Repair(read_record=True),),
         )
     return _clipping(seen, states, one, where, left)
 
@@ -248,7 +246,6 @@ def _of_gains(
         f"{' and '.join(said)} what the other levels ask for{left}",
         "if the column is a voltage, measure the force; else another range or calibration was set "
         f"there: divide the force of {' and of '.join(numbers)} in the file that it comes from.",
-        repairs=tuple(Repair(force=float(1 / factors[k]), levels=(int(k) + 1,)) for k in few),
         title=f"force on another scale at level {' and '.join(str(k + 1) for k in few)}",
     )
 

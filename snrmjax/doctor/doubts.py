@@ -54,7 +54,7 @@ def doubt(
 
 def _sentence(one: Finding) -> str:
     """A finding's fact and what mends it."""
-    more = "; `snrmjax check` writes the command." if one.repairs else "."
+    more = "; `snrmjax check` writes the import." if one.repairs else "."
     return f"{one.evidence} To mend it: {one.mend.rstrip('.')}{more}"
 
 

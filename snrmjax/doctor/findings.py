@@ -45,7 +45,7 @@ _MEANINGS = {
 
 
 class Repair(NamedTuple):
-    """How a table is read again, relative to how it was read: what a command does."""
+    """How a table is read again, relative to how it was read: what options of an import say."""
 
     response: float = 1.0  # factor of the velocities
     force: float = 1.0  # likewise
@@ -54,11 +54,6 @@ class Repair(NamedTuple):
     quantity: str = ""  # "acceleration" or "displacement" that was taken for a velocity
     conjugate: bool = False
     phase_unit: str = ""  # "deg" or "rad"
-    fit_gain: bool = False  # then identify with the gain of the force unknown
-    scale_model: bool = False  # find the model's shapes anew
-    apart: bool = False  # identify each table for itself
-    read_record: bool = False  # import the time record
-    levels: tuple[int, ...] = ()  # of which alone the force has that factor, from 1
 
 
 class Finding(NamedTuple):
@@ -74,7 +69,7 @@ class Finding(NamedTuple):
     evidence: str  # one fact in numbers
     mend: str  # the line or option that mends it
     rows: tuple[int, ...] = ()
-    repairs: tuple[Repair, ...] = ()  # that commands can do, the likeliest first
+    repairs: tuple[Repair, ...] = ()  # that an import can do, the likeliest first
     title: str = ""  # where the kind is wider than what was found
 
     @property

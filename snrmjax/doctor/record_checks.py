@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 from jaxtyping import Float
 
-from snrmjax.doctor.findings import FORCE_HARMONICS, Finding, Repair, percent
+from snrmjax.doctor.findings import FORCE_HARMONICS, Finding, percent
 from snrmjax.doctor.force_checks import fall
 from snrmjax.doctor.priors import (
     CERTAIN,
@@ -249,7 +249,6 @@ def _unsettled(
             f"the end, by up to {percent(worst)} (from {one.start / rate:.4g} s on).",
             "dwell longer, 5/(ζω) a step; or import this record, whose unsettled steps are left "
             "out.",
-            repairs=(Repair(read_record=True),),
         )
     ]
 

@@ -74,7 +74,7 @@ def scale_findings(
         where,
         f"{size}: the force column may be a drive voltage of {kappa:.3g} V per N.",
         "if it is a voltage, call the column `drive_v` and leave its gain to the identification.",
-        repairs=(Repair(force_unit="V", fit_gain=True),),
+        repairs=(Repair(force_unit="V"),),
     )
     shape = Finding(
         "shape_not_mass_normalised",
@@ -83,7 +83,6 @@ def scale_findings(
         f"{size}: the shape of the model may not be mass-normalised.",
         f"if so, divide `shape` and `participation` of the model by {np.sqrt(kappa):.4g} each, or "
         "find the modes anew, scaled by the sensor at the force.",
-        repairs=(Repair(scale_model=True),),
     )
     of_force, of_shape = _signs(scale.judged, model, bend)
     return [*found, *[volts] * (of_force >= of_shape), *[shape] * (of_shape >= of_force)]
@@ -189,6 +188,6 @@ def shaker_damping(fit: Judged, model: Structure, where: str) -> list[Finding]:
             "its drive is taken for the force.",
             "measure the force at the structure, or call a voltage `drive_v`; if it is that force, "
             "repeat the linear test on this assembly.",
-            repairs=(Repair(force_unit="V", fit_gain=True),),
+            repairs=(Repair(force_unit="V"),),
         )
     ]

@@ -155,33 +155,12 @@ def comparison_figure(
         raise ValueError("there is no response to show: `before` or `after` is empty.")
     r = sensor_index(data.sensors, sensor or data.sensors[0])
     frequency, speed = np.asarray(data.frequency) / HERTZ, np.abs(np.asarray(data.velocity))[:, r]
-    unit = unit_for(speed, "m/s")
     same = at_curve_force(data, [curve.force for curve in before])
-    margin = 0.1 * np.ptp(frequency)
-    ends = frequency.min() - margin, frequency.max() + margin
-    top = 1.2 * float(np.nanmax(speed)) / unit.size
-    figure, grid = panels(PAGE, 3.3, 1, 2)
-    pale = {**DOT, "color": MEASURED, "alpha": 0.35, "markeredgewidth": 0.0, "markersize": 3.0}
-    for axes, curves, colour, name in (
-        (grid[0, 0], before, "0.35", "model as given"),
-        (grid[0, 1], after, IDENTIFIED, "completed model"),
-    ):
-        marks(axes, frequency[~same], speed[~same] / unit.size, pale, "measured, other forces")
-        marks(axes, frequency[same], speed[same] / unit.size, {**DOT, "zorder": 4}, "measured")
-        for k, curve in enumerate(curves):
-            size = np.abs(np.asarray(curve.velocity)[:, 1, r]) / unit.size
-            label = name if k == 0 else None
-            axes.plot(curve.frequency / HERTZ, size, color=colour, **CURVE, label=label)
-        peaks = [np.max(np.abs(c.velocity[:, 1, r]), initial=0.0) for c in curves]  # or no point
-        highest = float(max(peaks)) / unit.size
-        if highest > top:
-            place: Style = {"transform": axes.transAxes, "ha": "right", "va": "top"}
-            text = f"peaks up to {highest:.2g} {unit.name}"
-            place["bbox"] = {"facecolor": "white", "alpha": 0.8, "linewidth": 0, "pad": 1.5}
-            axes.text(0.99, 0.99, text, fontsize=SMALL, color="0.3", **place)
-        axes.set(xlim=ends, ylim=(0.0, top))
-    level = f"Velocity amplitude ({unit.name})"
-    return _named_side_by_side(figure, grid, level)
+    lines = [
+        [(one.frequency / HERTZ, np.abs(np.asarray(one.velocity)[:, 1, r])) for one in curves]
+        for curves in (before, after)
+    ]
+    return _beside_one_another(lines, frequency, speed, same, ("Velocity amplitude", "m/s"))
 
 
 def held_velocity_figure(
@@ -194,28 +173,50 @@ def held_velocity_figure(
     r = sensor_index(data.sensors, sensor)
     good = np.asarray(data.measured)[:, r]
     frequency, force = np.asarray(data.frequency)[good] / HERTZ, np.asarray(data.force)[good]
-    unit = unit_for(force, "N")
-    figure, grid = panels(PAGE, 3.3, 1, 2)
-    top = 1.2 * float(np.nanmax(force)) / unit.size
+    lines = [[(one.frequency / HERTZ, one.force) for one in curves] for curves in (before, after)]
+    every, what = np.ones(len(force), dtype=bool), ("Force amplitude", "N")
+    return _beside_one_another(lines, frequency, force, every, what, ", velocity held")
+
+
+def _beside_one_another(
+    lines: Sequence[Sequence[tuple[np.ndarray, np.ndarray]]],
+    frequency: np.ndarray,
+    measured: np.ndarray,
+    same: np.ndarray,
+    what: tuple[str, str],
+    condition: str = "",
+) -> Figure:
+    """Curves of the model as given and of the completed one over the same measured states.
+
+    Arguments: states that are not under the `same` force as a curve are pale; `what` is measured,
+    and its unit.
+    """
+    unit = unit_for(measured, what[1])
+    margin = 0.1 * np.ptp(frequency)
+    ends = frequency.min() - margin, frequency.max() + margin
+    top = 1.2 * float(np.nanmax(measured)) / unit.size
+    figure, ((left, right),) = panels(PAGE, 3.3, 1, 2)
+    pale = {**DOT, "alpha": 0.35, "markeredgewidth": 0.0, "markersize": 3.0}
     for axes, curves, colour, name in (
-        (grid[0, 0], before, "0.35", "model as given"),
-        (grid[0, 1], after, IDENTIFIED, "completed model"),
+        (left, lines[0], "0.35", "model as given"),
+        (right, lines[1], IDENTIFIED, "completed model"),
     ):
-        marks(axes, frequency, force / unit.size, {**DOT, "zorder": 4}, "measured")
-        for k, curve in enumerate(curves):
+        marks(axes, frequency[~same], measured[~same] / unit.size, pale, "measured, other forces")
+        marks(axes, frequency[same], measured[same] / unit.size, {**DOT, "zorder": 4}, "measured")
+        for k, (x, y) in enumerate(curves):
             label = name if k == 0 else None
-            shown = curve.force / unit.size
-            axes.plot(curve.frequency / HERTZ, shown, color=colour, **CURVE, label=label)
-        axes.set(ylim=(0.0, top))
-    what = f"Force amplitude ({unit.name})"
-    return _named_side_by_side(figure, grid, what, ", velocity held")
-
-
-def _named_side_by_side(figure: Figure, grid: np.ndarray, what: str, condition: str = "") -> Figure:
-    """Two panels of models over frequency that share the axis of `what`, named."""
-    name_axes(grid[0, 0], f"(a) model as given{condition}", "Frequency (Hz)", what)
-    name_axes(grid[0, 1], f"(b) completed model{condition}", "Frequency (Hz)", "")
-    grid[0, 1].tick_params(labelleft=False)
+            axes.plot(x, y / unit.size, color=colour, **CURVE, label=label)
+        highest = max(float(np.max(y, initial=0.0)) for _, y in curves) / unit.size  # or no point
+        if highest > top:
+            place: Style = {"transform": axes.transAxes, "ha": "right", "va": "top"}
+            text = f"peaks up to {highest:.2g} {unit.name}"
+            place["bbox"] = {"facecolor": "white", "alpha": 0.8, "linewidth": 0, "pad": 1.5}
+            axes.text(0.99, 0.99, text, fontsize=SMALL, color="0.3", **place)
+        axes.set(xlim=ends, ylim=(0.0, top))
+    quantity = f"{what[0]} ({unit.name})"
+    name_axes(left, f"(a) model as given{condition}", "Frequency (Hz)", quantity)
+    name_axes(right, f"(b) completed model{condition}", "Frequency (Hz)", "")
+    right.tick_params(labelleft=False)
     legend(figure)
     return figure
 

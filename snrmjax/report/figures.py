@@ -55,6 +55,7 @@ from snrmjax.report.style import (
     SIMULATED,
     STAR,
     PrintedFigure,
+    banded,
     dress,
     explain_lines,
     fit_axis,
@@ -149,7 +150,7 @@ def backbone_figure(
     measured, own = measured / unit.size, own / unit.size
     top = 1.06 * np.max([*measured[use], *own[use]])
     curve = sample_backbone(backbone)
-    amplitude = shown.of(curve.velocity, curve.frequency * HERTZ) / unit.size
+    amplitude = curve.amplitude(shown) / unit.size
 
     figure = Figure(figsize=(PAGE, 4.4), layout="constrained")
     grid = figure.add_gridspec(2, 2, height_ratios=(1.8, 1.0))
@@ -168,11 +169,9 @@ def backbone_figure(
     stars(dampings, own[use], damping[use], yerr=damping_bars)
     above = {**CURVE, "zorder": 4}
     speeds.plot(curve.frequency, amplitude, color=IDENTIFIED, **above, label="identified curve")
-    dampings.plot(amplitude, curve.damping, color=IDENTIFIED, **above)
     sides = curve.frequency - curve.frequency_error, curve.frequency + curve.frequency_error
     speeds.fill_betweenx(amplitude, *sides, color=IDENTIFIED, **FILL, label="95 % band")
-    sides = curve.damping - curve.damping_error, curve.damping + curve.damping_error
-    dampings.fill_between(amplitude, *sides, color=IDENTIFIED, **FILL)
+    banded(dampings, amplitude, curve.damping, curve.damping_error, IDENTIFIED, band=None)
     seen, seen_damping = [*omega, *curve.frequency], [*curve.damping]
     if truth is not None:
         true = np.abs(velocity_of(truth, backbone.sensor))
@@ -342,7 +341,7 @@ def modal_damping_figure(
         raise ValueError("there is no damping to show: no series has points or a backbone.")
     figure, ((axes,),) = panels(COLUMN, 3.5, 1, 1)
     curves = [None if s.backbone is None else sample_backbone(s.backbone) for s in drawn]
-    largest = [shown.of(c.velocity, c.frequency * HERTZ) for c in curves if c]
+    largest = [c.amplitude(shown) for c in curves if c]
     largest += [usable_damping(s.points, shown)[0] for s in drawn if s.points]
     unit = unit_for(np.concatenate(largest), shown.unit)
     dots: list[float] = []
@@ -355,12 +354,9 @@ def modal_damping_figure(
             marks(axes, amplitude / unit.size, damping, style, None if curve else name)
             dots += [*damping]
         if curve is not None:
-            damping = curve.modal_damping
-            amplitude = shown.of(curve.velocity, curve.frequency * HERTZ) / unit.size
-            sides = damping - curve.modal_damping_error, damping + curve.modal_damping_error
-            axes.fill_between(amplitude, *sides, color=colour, **FILL)
-            axes.plot(amplitude, damping, color=colour, **CURVE, label=name)
-            lines += [*damping]
+            pair = curve.modal_damping, curve.modal_damping_error
+            banded(axes, curve.amplitude(shown) / unit.size, *pair, colour, name, band=None)
+            lines += [*curve.modal_damping]
     if linear is not None:
         axes.axhline(linear, color=SIMULATED, linestyle=":", linewidth=LINE, label="linear mode")
     axes.set_xlim(left=0.0)

@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from snrmjax.identify.inference.identification import Identification
+from snrmjax.identify.joint.joint_fit import NoiseEstimate
 from snrmjax.identify.pointwise.backbone import Backbone
 from snrmjax.identify.pointwise.inversion_result import STATUS_MESSAGE, PointStatus
 from snrmjax.identify.pointwise.prediction import (
@@ -21,19 +22,14 @@ from snrmjax.report.sampling import sample_backbone, velocity_of
 from snrmjax.report.style import PrintedFigure, Unit, unit_for, with_unit
 from snrmjax.simulate.solutions.forced_response import ResponseCurve
 
-LINE_THROUGH_STARS = "The line is the curve through the stars, the band its 95 % range."
 GAIN_NOT_IN_BANDS = (
     " A wrong gain of force or velocity, which scales all damping ratios alike, is not in them."
 )
-POINTWISE_BANDS = (
-    "Error bars and bands are 95 %. They hold random errors only: stated noise, or the scatter of "
-    f"the points where none was stated, and what the points of one level share.{GAIN_NOT_IN_BANDS}"
-)
 NO_SCATTER = "none found beyond the noise"
-BACKBONE_CAPTION = (
+_BACKBONE_CAPTION = (
     "Backbone. Blue dots are measured steady states. Each gives one star: (a) the natural "
     "frequency at its amplitude, (b) the phase resonance at 0°, (c) the damping ratio. "
-    f"{LINE_THROUGH_STARS} Check that the stars lie on one line "
+    "{line} Check that the stars lie on one line "
     "whatever the phase of their dots: stars that spread with phase at one amplitude mean that the "
     "method's assumptions do not hold. Grey crosses are steady states left out of the curves."
 )
@@ -48,7 +44,7 @@ TRUTH_CAPTION = (
     " The dashed black line is the true nonlinear mode of the model. Where it leaves the backbone "
     "and comes back, an internal resonance moves energy into another mode."
 )
-VALIDITY = (
+_VALIDITY = (
     "The method takes one mode as nonlinear and all others as linear. It needs a well-separated "
     "mode whose shape keeps its form, and no internal resonance in the range of the test; natural "
     "frequency and damping must depend on the amplitude alone, not on the history of the test.",
@@ -58,10 +54,52 @@ VALIDITY = (
     "the displacement amplitude, which is the velocity over the frequency of the force. A point "
     "measured at velocity v and angular frequency Ω therefore lies on the backbone at the velocity "
     "v·ω/Ω, with ω its natural frequency (unless the velocity was chosen as argument).",
-    POINTWISE_BANDS,
+    "{bands}",
     "Reference: Kwarta & Allen, Nonlinear Normal Mode Backbone Estimation with Near-Resonant "
     "Steady State Inputs.",
 )
+
+
+class CurveWords(NamedTuple):
+    """What a report says of its curves: how they are drawn, what bands hold, which errors."""
+
+    line: str
+    bands: str
+    noise: str
+    scatter: str
+    argument: str
+
+    @property
+    def caption(self) -> str:
+        """Of the figure of backbone and damping."""
+        return _BACKBONE_CAPTION.format(line=self.line)
+
+    @property
+    def validity(self) -> list[str]:
+        """How the report is read, and when it is trusted."""
+        return [text.format(bands=self.bands) for text in _VALIDITY]
+
+
+def words_of_points(identification: Identification) -> CurveWords:
+    """Of curves through the points of single states."""
+    return CurveWords(
+        line="The line is the curve through the stars, the band its 95 % range.",
+        bands="Error bars and bands are 95 %. They hold random errors only: stated noise, or the "
+        "scatter of the points where none was stated, and what the points of one level share."
+        f"{GAIN_NOT_IN_BANDS}",
+        noise=noise_in_words(identification.fit.noise, "measured phasor"),
+        scatter=_level_scatter(identification),
+        argument=f"{identification.points.argument} amplitude",
+    )
+
+
+def noise_in_words(noise: NoiseEstimate, of: str) -> str:
+    """The noise that was stated, or found in per cent `of` something."""
+    if noise.stated:
+        scale = with_error(noise.scale, noise.scale_std)
+        return f"stated; states scatter about the curves by {scale} times as much"
+    percent = with_error(100 * noise.scale, 100 * noise.scale_std)
+    return f"not stated; states scatter about the curves by {percent} % of the {of}"
 
 
 class ComparedResponses(NamedTuple):
@@ -83,17 +121,20 @@ def identification_report(
     notes: Iterable[str] = (),
     responses: ComparedResponses | None = None,
     further: Sequence[Section] = (),
+    words: CurveWords | None = None,
 ) -> Report:
     """The report of an identification: numbers, notes, backbone, predictions, validity.
 
     Arguments: `figures` by name: `backbone`, `prediction` where there are responses, and `nnm`
     where the backbone is drawn beside the true nonlinear mode; `done` names what was done (data
     file, model, options); `notes` come before those of the identification; `responses` under the
-    forces that were asked for; `further` sections before the last one.
+    forces that were asked for; `further` sections before the last one; `words` on curves that do
+    not go through the points.
     Returns a `Report` for `write_report`.
     """
     backbone = identification.backbone
-    caption = BACKBONE_CAPTION + (TRUTH_CAPTION if "nnm" in figures else "")
+    words = words or words_of_points(identification)
+    caption = words.caption + (TRUTH_CAPTION if "nnm" in figures else "")
     shown = [ReportFigure(figures["backbone"], caption)]
     sections = [Section("Backbone and damping", (), shown)]
     if responses is not None and "prediction" in figures:
@@ -105,9 +146,13 @@ def identification_report(
         title=title,
         done=[*(done or {}).items(), ("program", f"snrmjax {version('snrmjax')}")],
         result=identification_sentence(identification, modes),
-        summary=identification_summary(identification, modes),
+        summary=identification_summary(identification, modes, words),
         notes=list(dict.fromkeys([*notes, *identification.notes])),
-        sections=[*sections, *further, Section("How to read this, and when to trust it", VALIDITY)],
+        sections=[
+            *sections,
+            *further,
+            Section("How to read this, and when to trust it", words.validity),
+        ],
     )
 
 
@@ -169,8 +214,11 @@ def identification_sentence(identification: Identification, modes: LinearModes) 
     )
 
 
-def identification_summary(identification: Identification, modes: LinearModes) -> Rows:
+def identification_summary(
+    identification: Identification, modes: LinearModes, words: CurveWords | None = None
+) -> Rows:
     """The headline numbers of an identification as names and texts, ± being 95 %."""
+    words = words or words_of_points(identification)
     points = identification.points
     frequency, damping = _courses(identification)
     unit = unit_for(frequency.velocity, "m/s")
@@ -197,9 +245,9 @@ def identification_summary(identification: Identification, modes: LinearModes) -
         ("steady states used", f"{used} of {every} at sensor {points.sensor}"),
         ("left out", _left_out(identification)),
         ("phases measured", _phases(identification)),
-        ("noise", _noise(identification)),
-        ("scatter from level to level", _level_scatter(identification)),
-        ("argument of the curves", f"{points.argument} amplitude"),
+        ("noise", words.noise),
+        ("scatter from level to level", words.scatter),
+        ("argument of the curves", words.argument),
     ]
     if frequency.turns():
         rows.insert(2, ("lowest to highest frequency", extremes(frequency)))
@@ -224,15 +272,6 @@ def _phases(identification: Identification) -> str:
     phase = np.angle(np.asarray(identification.points.mode_velocity) * sign)
     phase = phase[np.isfinite(phase)] / DEGREE
     return minus(f"{phase.min():.0f}° to {phase.max():.0f}°, 0° is resonance")
-
-
-def _noise(identification: Identification) -> str:
-    noise = identification.fit.noise
-    if noise.stated:
-        scale = with_error(noise.scale, noise.scale_std)
-        return f"stated; states scatter about the curves by {scale} times as much"
-    percent = with_error(100 * noise.scale, 100 * noise.scale_std)
-    return f"not stated; states scatter about the curves by {percent} % of the measured phasor"
 
 
 def _level_scatter(identification: Identification) -> str:

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
@@ -18,7 +17,6 @@ from snrmjax.io.units import DEGREE, HERTZ
 from snrmjax.report.sampling import (
     BAND,
     VELOCITY,
-    BackboneSamples,
     ShownAmplitude,
     fit_residuals,
     sample_fit,
@@ -29,7 +27,6 @@ from snrmjax.report.style import (
     COLUMN,
     CURVE,
     DOT,
-    FILL,
     HOLLOW,
     IDENTIFIED,
     LINE,
@@ -39,8 +36,11 @@ from snrmjax.report.style import (
     SIMULATED,
     SMALL,
     TEXT,
+    amplitude_and_phase,
+    banded,
     explain_lines,
     fit_axis,
+    frequency_and_damping,
     legend,
     marks,
     name_axes,
@@ -48,7 +48,6 @@ from snrmjax.report.style import (
     phase_axis,
     plain,
     response_line,
-    share_frequencies,
     unit_for,
     with_unit,
 )
@@ -90,7 +89,8 @@ def fitted_curves_figure(
         if one.points is not None:
             reach += [*usable_damping(one.points, shown)[0]]
     top = 1.04 * max(reach) / unit.size
-    figure, ((natural, damping),) = panels(PAGE, 3.4, 1, 2)
+    level = f"{shown.name.capitalize()} amplitude ({unit.name})"
+    figure, natural, damping = frequency_and_damping(3.4, level)
     seen: tuple[list[float], list[float]] = ([], [])
     dots: tuple[list[float], list[float]] = ([], [])
     for number, (one, curve) in enumerate(zip(series, curves, strict=True)):
@@ -111,15 +111,12 @@ def fitted_curves_figure(
         if len(series) == 1 and np.any(one.fit.noise.level_std[2:] > 0):
             wide = sample_fit(one.fit, of_a_new_level=True)
             x = wide.amplitude(shown) / unit.size
-            _bands(natural, damping, x, wide, colour, "95 % band of a further level", 0.5)
+            style = {"band": "95 % band of a further level", "strength": 0.5, "linestyle": "none"}
+            for axes, y, error in zip((natural, damping), *wide.curves(), strict=True):
+                banded(axes, x, y, error, colour, **style)
         x = curve.amplitude(shown) / unit.size
-        _bands(natural, damping, x, curve, colour, "95 % band")
-        for axes, y in ((natural, curve.frequency), (damping, curve.damping)):
-            axes.plot(x, y, color=colour, zorder=4, **CURVE, label=name)
-        for kept, y, error in (
-            (seen[0], curve.frequency, curve.frequency_error),
-            (seen[1], curve.damping, curve.damping_error),
-        ):
+        for axes, kept, y, error in zip((natural, damping), seen, *curve.curves(), strict=True):
+            banded(axes, x, y, error, colour, name)
             kept += [*(y - error), *(y + error)]
     if truth is not None:
         x = np.abs(velocity_of(truth, series[0].fit.modes.sensors[series[0].fit.data.sensor]))
@@ -132,28 +129,8 @@ def fitted_curves_figure(
     for axes, kept, lines in zip((natural, damping), dots, seen, strict=True):
         axes.set_xlim(0.0, top)
         fit_axis(axes, "y", kept, lines)
-    level = f"{shown.name.capitalize()} amplitude ({unit.name})"
-    name_axes(natural, "(a) natural frequency", level, "Natural frequency (Hz)")
-    name_axes(damping, "(b) damping", level, "Damping ratio (% of critical)")
     legend(figure)
     return figure
-
-
-def _bands(
-    natural: Axes,
-    damping: Axes,
-    x: np.ndarray,
-    curve: BackboneSamples,
-    colour: str,
-    name: str,
-    strength: float = 1.0,
-) -> None:
-    fill = {**FILL, "alpha": strength * FILL["alpha"], "color": colour}
-    for axes, y, error in (
-        (natural, curve.frequency, curve.frequency_error),
-        (damping, curve.damping, curve.damping_error),
-    ):
-        axes.fill_between(x, y - error, y + error, **fill, label=name)
 
 
 PARTS = ("in phase with the force", "in quadrature with it")
@@ -259,9 +236,9 @@ def next_measurements_figure(
     if not responses:
         raise ValueError("there is no response to show: `responses` is empty.")
     forces = sorted({one.force for one in responses})
-    figure, ((speeds,), (phases,)) = panels(PAGE, 5.0, 2, 1)
     largest = max(float(np.max(np.abs(one.velocity))) for one in responses)
     unit = unit_for(largest, "m/s")
+    figure, speeds, phases = amplitude_and_phase(PAGE, 5.0, sensor, unit)
     resonant = np.concatenate(
         [one.velocity[[np.argmax(np.abs(one.velocity))]] for one in responses]
     )
@@ -293,10 +270,7 @@ def next_measurements_figure(
         speeds.set_yscale("log")
     else:
         speeds.set_ylim(0.0, 1.12 * largest / unit.size)
-    share_frequencies(speeds, phases)
     phase_axis(phases)
-    name_axes(speeds, f"(a) amplitude at {plain(sensor)}", "", f"Velocity amplitude ({unit.name})")
-    name_axes(phases, "(b) phase", "Frequency (Hz)", "Velocity phase (°)")
     explain_lines(figure)
     legend(figure)
     return figure

@@ -14,12 +14,12 @@ from snrmjax.identify.joint.notes import in_words
 from snrmjax.identify.pointwise.backbone_points import BackbonePoints
 from snrmjax.io.joint_results import summarise_fit
 from snrmjax.io.units import DEGREE, HERTZ
-from snrmjax.report.html import Report, ReportFigure, ReportTable, Section, minus, with_error
+from snrmjax.report.html import ReportFigure, ReportTable, Section, minus, with_error
 from snrmjax.report.identification_report import (
     GAIN_NOT_IN_BANDS,
-    LINE_THROUGH_STARS,
     NO_SCATTER,
-    POINTWISE_BANDS,
+    CurveWords,
+    noise_in_words,
 )
 from snrmjax.report.joint_figures import (
     FitSeries,
@@ -134,46 +134,21 @@ def curves_in_words(fit: JointFit) -> str:
     return f"natural frequency: {squared.words}; damping: {damping.words}"
 
 
-def with_joint_fit(report: Report, fit: JointFit) -> Report:
-    """The report of an identification whose curves are a joint fit's, its words with them."""
-    noise, scale = fit.noise, with_error(fit.noise.scale, fit.noise.scale_std)
-    percent = with_error(100 * noise.scale, 100 * noise.scale_std)
+def words_of_fit(fit: JointFit) -> CurveWords:
+    """What a report says of the curves of a joint fit."""
+    noise = fit.noise
     squared, damping = fit.unknowns.squared_frequency, fit.unknowns.modal_damping
-    own = {
-        "noise": f"stated; states scatter about the curves by {scale} times as much, errors of "
-        "whole levels apart"
-        if noise.stated
-        else f"not stated; states scatter about the curves by {percent} % of the velocity, errors "
-        "of whole levels apart",
-        "scatter from level to level": (
-            f"{in_words(noise.level_std)} (1σ)" if np.any(noise.level_std > 0) else NO_SCATTER
-        ),
-        "argument of the curves": f"natural frequency: {squared.argument} amplitude; damping: "
-        f"{damping.argument} amplitude",
-    }
     fitted = "force_gain" in fit.free
     gain = ", and the error of the fitted force gain." if fitted else f".{GAIN_NOT_IN_BANDS}"
-    words = {
-        LINE_THROUGH_STARS: "The line is the joint fit to all steady states, not a curve drawn "
-        "through the stars; the band is its 95 % range.",
-        POINTWISE_BANDS: "Error bars and bands are 95 %. The bands of the joint fit hold the "
-        f"noise, stated or estimated, and what the points of one level share{gain}",
-    }
-
-    def said(text: str) -> str:
-        for old, new in words.items():
-            text = text.replace(old, new)
-        return text
-
-    return report._replace(
-        summary=[(name, own.get(name, text)) for name, text in report.summary],
-        sections=[
-            one._replace(
-                text=[said(text) for text in one.text],
-                figures=[f._replace(caption=said(f.caption)) for f in one.figures],
-            )
-            for one in report.sections
-        ],
+    return CurveWords(
+        line="The line is the joint fit to all steady states, not a curve drawn through the "
+        "stars; the band is its 95 % range.",
+        bands="Error bars and bands are 95 %. The bands of the joint fit hold the noise, stated or "
+        f"estimated, and what the points of one level share{gain}",
+        noise=f"{noise_in_words(noise, 'velocity')}, errors of whole levels apart",
+        scatter=f"{in_words(noise.level_std)} (1σ)" if np.any(noise.level_std > 0) else NO_SCATTER,
+        argument=f"natural frequency: {squared.argument} amplitude; damping: {damping.argument} "
+        "amplitude",
     )
 
 

@@ -1,249 +1,151 @@
 """Which figure shows which result: what `result.plot()` draws."""
 
-import functools
+from collections.abc import Callable
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
-from snrmjax.condense.condensation import Condensation
-from snrmjax.condense.scale_study import LoadScaleStudy
-from snrmjax.diagnose.diagnosis_result import Diagnosis
-from snrmjax.identify.calibrate.calibrated_model import CalibratedModel
-from snrmjax.identify.calibrate.inverse_force import InverseForce
-from snrmjax.identify.inference.contributions import Contributions
-from snrmjax.identify.inference.fitted_response import FittedResponse
-from snrmjax.identify.inference.identification import Identification
-from snrmjax.identify.inference.optimal_design import NextMeasurements
-from snrmjax.identify.inference.refits import Profile
-from snrmjax.identify.joint.joint_fit import JointFit
-from snrmjax.identify.modal.free_decay import DecayModes
-from snrmjax.identify.modal.modal_fit import LinearModalFit
-from snrmjax.identify.pointwise.backbone import Backbone, BackboneValues
-from snrmjax.identify.pointwise.points_result import BackbonePoints
-from snrmjax.identify.pointwise.prediction_result import PredictedResponse
 from snrmjax.io.units import HERTZ
-from snrmjax.measure.equivalent_force import EquivalentForce
-from snrmjax.measure.force_calibration import ForceCalibration
-from snrmjax.measure.harmonic_fit import HarmonicFit
-from snrmjax.measure.states import SteadyStates
 from snrmjax.report import diagnosis_figures, figures, joint_figures, simulation_figures
 from snrmjax.report.condense.reduction_figures import scale_figure, static_figure
 from snrmjax.report.modal.modal_figures import decay_figure, modal_responses_figure
-from snrmjax.report.sampling import span_of
+from snrmjax.report.sampling import BAND, sensor_index, span_of
+from snrmjax.report.simulation_figures import (
+    amplitudes_figure,
+    motions_figure,
+    points_figure,
+    simulated_response_figure,
+)
+from snrmjax.report.style import unit_for
 from snrmjax.report.uncertainty import uncertainty_figures
-from snrmjax.simulate.continuation.response_curve import ResponseCurve
-from snrmjax.simulate.solutions.controlled import ControlledCurve, DampedModeBranch
-from snrmjax.simulate.solutions.forced_response import ResponseBatch
-from snrmjax.simulate.solutions.isolated_responses import IsolatedResponses
-from snrmjax.simulate.solutions.normal_modes import NormalModeBranch
-from snrmjax.simulate.solutions.periodic_motion import PeriodicMotion
-from snrmjax.simulate.solutions.time_integration import IntegratedMotion
-from snrmjax.simulate.virtual_test.phase_resonance_test import VirtualTest
-from snrmjax.study.uncertainty.propagation import Propagation
-from snrmjax.study.uncertainty.sensitivity import SobolIndices
 
 
-@functools.singledispatch
 def plot_result(result: object, **settings: Any) -> Figure:
     """The figure that shows a result.
 
     Raises `ValueError` for results that no figure shows.
     """
+    for one in type(result).__mro__:
+        if one.__name__ in _FIGURES:
+            return _FIGURES[one.__name__](result, **settings)
     raise ValueError(f"there is no figure of a `{type(result).__name__}`; see `sj.plot`.")
 
 
-@plot_result.register
-def _(result: NextMeasurements) -> Figure:
-    return joint_figures.next_measurements_figure(
-        result.responses, result.rows, sensor=result.sensor
-    )
+def _states(states: Any, *, sensor: str | None = None) -> Figure:
+    name = sensor or states.sensors[0]
+    velocity = np.asarray(states.velocity)[:, sensor_index(states.sensors, name)]
+    return motions_figure(np.asarray(states.frequency), velocity, sensor=name, joined=False)
 
 
-@plot_result.register
-def _(result: ResponseCurve, **settings: Any) -> Figure:
-    return simulation_figures.simulated_response_figure([result], **settings)
+def _motions(found: Any) -> Figure:
+    velocity = np.ravel(found.velocity[..., 1, 0])
+    return motions_figure(np.ravel(found.frequency), velocity, joined=False)
 
 
-@plot_result.register
-def _(result: IsolatedResponses, **settings: Any) -> Figure:
-    return simulation_figures.simulated_response_figure(result.curves, **settings)
-
-
-@plot_result.register
-def _(result: ResponseBatch, **settings: Any) -> Figure:
-    return simulation_figures.batch_figure(result, **settings)
-
-
-@plot_result.register
-def _(result: NormalModeBranch, **settings: Any) -> Figure:
-    return simulation_figures.normal_mode_figure(result, **settings)
-
-
-@plot_result.register
-def _(result: DampedModeBranch, **settings: Any) -> Figure:
-    return simulation_figures.damped_mode_figure(result, **settings)
-
-
-@plot_result.register
-def _(result: ControlledCurve) -> Figure:
-    velocity, sensor = result.velocity[:, 1, 0], result.sensors[0]
-    return simulation_figures.motions_figure(result.frequency, velocity, sensor=sensor, joined=True)
-
-
-@plot_result.register(PeriodicMotion)
-@plot_result.register(IntegratedMotion)
-def _(result: PeriodicMotion | IntegratedMotion) -> Figure:
-    frequency, velocity = np.ravel(result.frequency), np.ravel(result.velocity[..., 1, 0])
-    return simulation_figures.motions_figure(frequency, velocity, joined=False)
-
-
-@plot_result.register
-def _(result: VirtualTest) -> Figure:
-    states = result.steady_states
-    frequency, velocity = np.asarray(states.frequency), np.asarray(states.velocity)[:, 0]
-    sensor = states.sensors[0]
-    return simulation_figures.motions_figure(frequency, velocity, sensor=sensor, joined=False)
-
-
-@plot_result.register
-def _(result: Diagnosis, **settings: Any) -> Figure:
-    return diagnosis_figures.misfit_figure(result, **settings)
-
-
-@plot_result.register
-def _(result: Identification, **settings: Any) -> Figure:
-    return figures.backbone_figure(result.points, result.backbone, **settings)
-
-
-@plot_result.register
-def _(result: BackbonePoints) -> Figure:
-    return simulation_figures.amplitudes_figure(
-        *(result.backbone_velocity, result.natural_frequency, result.damping_ratio),
-        result.sensor,
-        stds=(result.natural_frequency_std, result.damping_ratio_std),
-        joined=False,
-    )
-
-
-@plot_result.register
-def _(result: Backbone) -> Figure:
-    return plot_result(result.sampled(), sensor=result.sensor)
-
-
-@plot_result.register
-def _(result: BackboneValues, *, sensor: str = "the sensor") -> Figure:
-    return simulation_figures.amplitudes_figure(
-        *(result.velocity, result.natural_frequency, result.damping_ratio),
-        sensor,
-        stds=(result.natural_frequency_std, result.damping_ratio_std),
-    )
-
-
-@plot_result.register
-def _(result: PredictedResponse) -> Figure:
-    figure = simulation_figures.motions_figure(
-        *(result.frequency, result.velocity),
+def _predicted(response: Any) -> Figure:
+    figure = motions_figure(
+        *(response.frequency, response.velocity),
         sensor="the backbone's sensor",
         joined=True,
-        stable=result.stable,
-        beyond=result.continued,
+        stable=response.stable,
+        beyond=response.continued,
     )
-    low, high = span_of(result, "")
+    low, high = span_of(response, "")
     figure.axes[0].set_xlim(low / HERTZ, high / HERTZ)
     return figure
 
 
-@plot_result.register
-def _(result: SteadyStates, *, sensor: str | None = None) -> Figure:
-    name = sensor or result.sensors[0]
-    if name not in result.sensors:
-        raise ValueError(f"`sensor` must be one of {result.sensors}, but is {name!r}.")
-    velocity = np.asarray(result.velocity)[:, result.sensors.index(name)]
-    frequency = np.asarray(result.frequency)
-    return simulation_figures.motions_figure(frequency, velocity, sensor=name, joined=False)
-
-
-@plot_result.register
-def _(result: JointFit, **settings: Any) -> Figure:
-    series = [joint_figures.FitSeries("joint fit", result)]
-    return joint_figures.fitted_curves_figure(series, **settings)
-
-
-@plot_result.register
-def _(result: FittedResponse) -> Figure:
-    return joint_figures.next_measurements_figure([result], [], sensor=result.sensor)
-
-
-@plot_result.register
-def _(result: Contributions, **settings: Any) -> Figure:
-    return joint_figures.contributions_figure(result.rows, **settings)
-
-
-@plot_result.register
-def _(result: Profile, **settings: Any) -> Figure:
-    return joint_figures.profile_figure(result, **settings)
-
-
-@plot_result.register
-def _(result: InverseForce) -> Figure:
-    velocity = np.asarray(result.velocity)[:, 1, 0]
-    return simulation_figures.force_velocity_points(np.asarray(result.force), velocity)
-
-
-@plot_result.register
-def _(result: CalibratedModel) -> Figure:
-    return simulation_figures.residual_columns_figure(result.residuals)
-
-
-@plot_result.register
-def _(result: HarmonicFit) -> Figure:
-    amplitude = np.abs(np.asarray(result.amplitude)).reshape(-1, len(result.harmonic_order))
-    return simulation_figures.bars_figure(
-        result.harmonic_order, amplitude, "Harmonic order", "Amplitude (unit of the record)"
+def _identified_points(points: Any) -> Figure:
+    return amplitudes_figure(
+        *(points.backbone_velocity, points.natural_frequency, points.damping_ratio),
+        points.sensor,
+        stds=(points.natural_frequency_std, points.damping_ratio_std),
+        joined=False,
     )
 
 
-@plot_result.register
-def _(result: EquivalentForce) -> Figure:
-    return simulation_figures.line_figure(
-        *map(np.asarray, (result.drive, result.force, result.force_std))
+def _curves(values: Any, *, sensor: str = "the sensor") -> Figure:
+    return amplitudes_figure(
+        *(values.velocity, values.natural_frequency, values.damping_ratio),
+        sensor,
+        stds=(values.natural_frequency_std, values.damping_ratio_std),
     )
 
 
-@plot_result.register
-def _(result: ForceCalibration, *, largest_drive: float = 1.0) -> Figure:
-    drive = jnp.asarray(np.linspace(0.0, largest_drive, 50))
-    given = map(np.asarray, (drive, result.force(drive), result.force_std(drive)))
-    return simulation_figures.line_figure(*given, joined=True)
+def _harmonics(fit: Any) -> Figure:
+    amplitude = np.abs(np.asarray(fit.amplitude)).reshape(-1, len(fit.harmonic_order))
+    good = amplitude[np.all(np.isfinite(amplitude), axis=1)]
+    words = (f"{len(good)} records", "Harmonic order", "Amplitude (unit of the record)")
+    figure = points_figure(fit.harmonic_order, np.maximum(good.T, 1e-300), *words)
+    figure.axes[0].set_yscale("log")
+    return figure
 
 
-@plot_result.register
-def _(result: Propagation) -> Figure:
-    return uncertainty_figures.propagation_figure(result)
+def _force_over_drive(drive: Any, force: Any, std: Any, *, joined: bool = False) -> Figure:
+    force, error = np.asarray(force), BAND * np.nan_to_num(np.asarray(std))
+    unit = unit_for(force[np.isfinite(force)], "N")
+    words = "force, 95 %", "Drive (V)", f"Force ({unit.name})"
+    return points_figure(
+        np.asarray(drive), force / unit.size, *words, error=error / unit.size, joined=joined
+    )
 
 
-@plot_result.register
-def _(result: SobolIndices) -> Figure:
-    return uncertainty_figures.sensitivity_figure(result)
+def _calibration(found: Any, *, largest_drive: float = 1.0) -> Figure:
+    drive = np.linspace(0.0, largest_drive, 50)
+    return _force_over_drive(drive, found.force(drive), found.force_std(drive), joined=True)
 
 
-@plot_result.register
-def _(result: Condensation) -> Figure:
-    return static_figure(result, [f"mode {number}" for number in result.basis.numbers])
+def _residuals(found: Any) -> Figure:
+    """Whitened residuals: within ±2 for 95 % where model and noise are right."""
+    rows, words = np.arange(len(found.residuals)), ("residuals", "Steady state", "Residual (1σ)")
+    return points_figure(rows, found.residuals, *words, limits=(-2.0, 2.0))
 
 
-@plot_result.register
-def _(result: LoadScaleStudy) -> Figure:
-    return scale_figure(result)
-
-
-@plot_result.register
-def _(result: LinearModalFit, **settings: Any) -> Figure:
-    return modal_responses_figure(result, **settings)
-
-
-@plot_result.register
-def _(result: DecayModes) -> Figure:
-    return decay_figure(result)
+# By the names of classes: none of them is imported before there is a result of it.
+_FIGURES: dict[str, Callable[..., Figure]] = {
+    "Backbone": lambda one: _curves(one.sampled(), sensor=one.sensor),
+    "BackbonePoints": _identified_points,
+    "BackboneValues": _curves,
+    "CalibratedModel": _residuals,
+    "Condensation": lambda one: static_figure(one, [f"mode {n}" for n in one.basis.numbers]),
+    "Contributions": lambda one: joint_figures.contributions_figure(one.rows),
+    "ControlledCurve": lambda one: motions_figure(
+        one.frequency, one.velocity[:, 1, 0], sensor=one.sensors[0], joined=True
+    ),
+    "DampedModeBranch": simulation_figures.damped_mode_figure,
+    "DecayModes": decay_figure,
+    "Diagnosis": diagnosis_figures.misfit_figure,
+    "EquivalentForce": lambda one: _force_over_drive(one.drive, one.force, one.force_std),
+    "FittedResponse": lambda one: joint_figures.next_measurements_figure(
+        [one], [], sensor=one.sensor
+    ),
+    "ForceCalibration": _calibration,
+    "HarmonicFit": _harmonics,
+    "Identification": lambda one, **settings: figures.backbone_figure(
+        one.points, one.backbone, **settings
+    ),
+    "IntegratedMotion": _motions,
+    "InverseForce": lambda one: simulation_figures.force_velocity_points(
+        np.asarray(one.force), np.asarray(one.velocity)[:, 1, 0]
+    ),
+    "IsolatedResponses": lambda one, **settings: simulated_response_figure(one.curves, **settings),
+    "JointFit": lambda one, **settings: joint_figures.fitted_curves_figure(
+        [joint_figures.FitSeries("joint fit", one)], **settings
+    ),
+    "LinearModalFit": modal_responses_figure,
+    "LoadScaleStudy": scale_figure,
+    "NextMeasurements": lambda one: joint_figures.next_measurements_figure(
+        one.responses, one.rows, sensor=one.sensor
+    ),
+    "NormalModeBranch": simulation_figures.normal_mode_figure,
+    "PeriodicMotion": _motions,
+    "PredictedResponse": _predicted,
+    "Profile": joint_figures.profile_figure,
+    "Propagation": uncertainty_figures.propagation_figure,
+    "ResponseBatch": simulation_figures.batch_figure,
+    "ResponseCurve": lambda one, **settings: simulated_response_figure([one], **settings),
+    "SobolIndices": uncertainty_figures.sensitivity_figure,
+    "SteadyStates": _states,
+    "VirtualTest": lambda one: _states(one.steady_states),
+}

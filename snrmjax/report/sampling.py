@@ -53,6 +53,10 @@ class BackboneSamples(NamedTuple):
         """The amplitude that a figure shows, in its base unit."""
         return shown.of(self.velocity, self.frequency * HERTZ)
 
+    def curves(self) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
+        """Natural frequency and damping ratio, and the errors of both."""
+        return (self.frequency, self.damping), (self.frequency_error, self.damping_error)
+
 
 def sample_backbone(backbone: Backbone, *, reach: float = 1.0) -> BackboneSamples:
     """A backbone from its smallest amplitude, zero if anchored, to `reach` times its largest."""

@@ -18,7 +18,6 @@ from snrmjax.report.style import (
     COLUMN,
     CURVE,
     DOT,
-    FILL,
     HOLLOW,
     IDENTIFIED,
     LINE,
@@ -27,8 +26,11 @@ from snrmjax.report.style import (
     SERIES,
     SIMULATED,
     Style,
+    amplitude_and_phase,
+    banded,
     explain_lines,
     fit_axis,
+    frequency_and_damping,
     legend,
     marks,
     name_axes,
@@ -36,7 +38,6 @@ from snrmjax.report.style import (
     phase_axis,
     plain,
     response_line,
-    share_frequencies,
     stars,
     unit_for,
     with_unit,
@@ -65,7 +66,7 @@ def simulated_response_figure(
     shades = colormaps["viridis"](np.linspace(0.0, 0.85, len(forces)))
     colours = dict(zip(forces, shades, strict=True))
     unit = unit_for(np.concatenate([velocity_of(c, name) for c in drawn]), "m/s")
-    figure, ((speeds,), (phases,)) = panels(PAGE, 5.4, 2, 1)
+    figure, speeds, phases = amplitude_and_phase(PAGE, 5.4, name, unit)
     markers = {"peak": "^", "fold": "s", "phase_resonance": "o"}
     for event in (None, *markers):
         for curve in drawn:
@@ -80,10 +81,7 @@ def simulated_response_figure(
                     style |= {"color": "black", "markersize": 2.0}
                 marks(axes, x[at], y[at], style, event.replace("_", " "))
     speeds.set_ylim(bottom=0.0)
-    share_frequencies(speeds, phases)
     phase_axis(phases)
-    name_axes(speeds, f"(a) amplitude at {plain(name)}", "", f"Velocity amplitude ({unit.name})")
-    name_axes(phases, "(b) phase", "Frequency (Hz)", "Velocity phase (°)")
     explain_lines(figure)
     legend(figure)
     return figure
@@ -140,7 +138,7 @@ def motions_figure(
     if not np.any(np.isfinite(speeds)):
         raise ValueError("there is no motion to show: none was found.")
     unit = unit_for(speeds[np.isfinite(speeds)], "m/s")
-    figure, ((upper,), (lower,)) = panels(COLUMN, 4.4, 2, 1)
+    figure, upper, lower = amplitude_and_phase(COLUMN, 4.4, sensor, unit)
     steady = np.ones(len(speeds), dtype=bool) if stable is None else stable
     for axes, y in ((upper, np.abs(speeds) / unit.size), (lower, np.angle(speeds) / DEGREE)):
         if joined:
@@ -148,11 +146,7 @@ def motions_figure(
         else:
             axes.plot(omega, y, **{**DOT, "color": MEASURED})
     upper.set_ylim(bottom=0.0)
-    share_frequencies(upper, lower)
     phase_axis(lower)
-    title = f"(a) amplitude at {plain(sensor)}"
-    name_axes(upper, title, "", f"Velocity amplitude ({unit.name})")
-    name_axes(lower, "(b) phase", "Frequency (Hz)", "Velocity phase (°)")
     if joined and not (np.all(steady) and beyond is None):
         explain_lines(figure)
         legend(figure)
@@ -193,7 +187,8 @@ def amplitudes_figure(
     if not np.any(np.isfinite(speeds)):
         raise ValueError("there is no mode to show: no point is finite.")
     unit = unit_for(speeds[np.isfinite(speeds)], "m/s")
-    figure, ((frequencies, dampings),) = panels(PAGE, 3.2, 1, 2)
+    level = f"Velocity amplitude ({unit.name})"
+    figure, frequencies, dampings = frequency_and_damping(3.2, level, f", at {plain(sensor)}")
     colour = SIMULATED if stds is None else IDENTIFIED
     for number, (axes, values, scale) in enumerate(
         ((frequencies, frequency, 1 / HERTZ), (dampings, damping_ratio, 100.0))
@@ -203,14 +198,9 @@ def amplitudes_figure(
         if not joined:
             stars(axes, x, y, "identified, 95 % bars" if error is not None else None, yerr=error)
         else:
-            axes.plot(x, y, color=colour, **CURVE, label=None if error is None else "curve")
-            if error is not None:
-                axes.fill_between(x, y - error, y + error, color=colour, **FILL, label="95 % band")
+            banded(axes, x, y, error, colour, None if error is None else "curve")
         axes.set_xlim(left=0.0)
         fit_axis(axes, "y", y)
-    level = f"Velocity amplitude ({unit.name})"
-    name_axes(frequencies, "(a) natural frequency", level, "Natural frequency (Hz)")
-    name_axes(dampings, f"(b) damping, at {plain(sensor)}", level, "Damping ratio (% of critical)")
     if stds is not None:
         legend(figure)
     return figure
@@ -264,53 +254,34 @@ def force_velocity_points(force: np.ndarray, velocity: np.ndarray) -> Figure:
     return figure
 
 
-def residual_columns_figure(residuals: np.ndarray) -> Figure:
-    """Whitened residuals of all steady states: within ±2 for 95 % where model and noise are right.
-
-    Arguments: `residuals` in units of 1σ, one row a state. Returns the figure.
-    """
-    figure, ((axes,),) = panels(COLUMN, 3.4, 1, 1)
-    axes.plot(np.arange(len(residuals)), residuals, **DOT)
-    for limit in (-2.0, 2.0):
-        axes.axhline(limit, color=BACKGROUND, linestyle="--")
-    name_axes(axes, "residuals", "Steady state", "Residual (1σ)")
-    return figure
-
-
-def line_figure(
-    drive: np.ndarray, force: np.ndarray, std: np.ndarray, *, joined: bool = False
+def points_figure(
+    x: np.ndarray | Sequence[int],
+    y: np.ndarray,
+    title: str,
+    below: str,
+    beside: str,
+    *,
+    error: np.ndarray | None = None,
+    joined: bool = False,
+    limits: Sequence[float] = (),
 ) -> Figure:
-    """Force against drive voltage with 95 % errors.
+    """Points with error bars, or `joined` a curve in the band of its errors; dashed `limits`.
 
-    Arguments: `drive` in V, `force` and its 1σ `std` in N; `joined` draws a line and its band.
-    Returns the figure. Raises `ValueError` without a finite force.
+    Arguments: `title` and what the axes `below` and `beside` are. Returns the figure. Raises
+    `ValueError` without a finite value.
     """
-    if not np.any(np.isfinite(force)):
-        raise ValueError("there is no force to show: none was found.")
-    newton = unit_for(force[np.isfinite(force)], "N")
+    if not np.isfinite(y).any():
+        raise ValueError(f"there is nothing to show: no {beside.split(' (')[0].lower()} was found.")
     figure, ((axes,),) = panels(COLUMN, 3.4, 1, 1)
-    wide = 1.96 * np.nan_to_num(std)
     if joined:
-        axes.plot(drive, force / newton.size, color=SIMULATED, **CURVE)
-        ends = (force - wide) / newton.size, (force + wide) / newton.size
-        axes.fill_between(drive, *ends, color=SIMULATED, **FILL)
+        banded(axes, x, y, error, SIMULATED)
+    elif error is None:
+        axes.plot(x, y, **DOT)
     else:
-        axes.errorbar(drive, force / newton.size, yerr=wide / newton.size, **DOT)
-    name_axes(axes, "force, 95 %", "Drive (V)", f"Force ({newton.name})")
-    return figure
-
-
-def bars_figure(orders: Sequence[int], amplitudes: np.ndarray, below: str, beside: str) -> Figure:
-    """Amplitudes of the harmonics of every record, on a logarithmic axis.
-
-    Returns the figure. Raises `ValueError` without a finite amplitude.
-    """
-    good = amplitudes[np.all(np.isfinite(amplitudes), axis=1)]
-    if not good.size:
-        raise ValueError("there is no harmonic to show: no record was fitted.")
-    figure, ((axes,),) = panels(COLUMN, 3.4, 1, 1)
-    axes.semilogy(orders, np.maximum(good.T, 1e-300), **DOT)
-    name_axes(axes, f"{len(good)} records", below, beside)
+        axes.errorbar(x, y, yerr=error, **DOT)
+    for limit in limits:
+        axes.axhline(limit, color=BACKGROUND, linestyle="--")
+    name_axes(axes, title, below, beside)
     return figure
 
 

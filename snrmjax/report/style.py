@@ -156,10 +156,52 @@ def share_frequencies(upper: Axes, lower: Axes) -> None:
     upper.tick_params(labelbottom=False)
 
 
+def amplitude_and_phase(
+    width: float, height: float, sensor: str, unit: Unit
+) -> tuple[Figure, Axes, Axes]:
+    """Two panels over one axis of frequency: velocity amplitude at a sensor, and its phase."""
+    figure, ((upper,), (lower,)) = panels(width, height, 2, 1)
+    share_frequencies(upper, lower)
+    level = f"Velocity amplitude ({unit.name})"
+    name_axes(upper, f"(a) amplitude at {plain(sensor)}", "", level)
+    name_axes(lower, "(b) phase", "Frequency (Hz)", "Velocity phase (°)")
+    return figure, upper, lower
+
+
+def frequency_and_damping(height: float, level: str, where: str = "") -> tuple[Figure, Axes, Axes]:
+    """Two panels over an amplitude, which `level` names: natural frequency and damping ratio."""
+    figure, ((left, right),) = panels(PAGE, height, 1, 2)
+    name_axes(left, "(a) natural frequency", level, "Natural frequency (Hz)")
+    name_axes(right, f"(b) damping{where}", level, "Damping ratio (% of critical)")
+    return figure, left, right
+
+
 def marks(axes: Axes, x: Any, y: Any, style: Style, name: str | None = None) -> None:
     """Markers, if there are any; without a point nothing enters the legend."""
     if np.size(x):
         axes.plot(x, y, **style, label=name)
+
+
+def banded(
+    axes: Axes,
+    x: Any,
+    y: Any,
+    error: Any,
+    colour: Any,
+    name: str | None = None,
+    *,
+    band: str | None = "95 % band",
+    strength: float = 1.0,
+    **style: Any,
+) -> None:
+    """A curve in the band of its errors, half as high as the band; None of both: the other alone.
+
+    Arguments: `name` and `band` in the legend; a curve without a style of its own is solid.
+    """
+    if error is not None:
+        fill = {**FILL, "alpha": strength * FILL["alpha"], "color": colour}
+        axes.fill_between(x, y - error, y + error, **fill, label=band)
+    axes.plot(x, y, **{**CURVE, "color": colour, "zorder": 4, **style}, label=name)
 
 
 def stars(axes: Axes, x: Any, y: Any, name: str | None = None, **bars: Any) -> None:

@@ -1,7 +1,6 @@
 """What the commands do with a table of steady states: identify, predict, and write all of it."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import NamedTuple
@@ -40,7 +39,7 @@ from snrmjax.report.joint_report import (
     joint_figures,
     joint_sections,
     reported_fit,
-    with_joint_fit,
+    words_of_fit,
 )
 from snrmjax.report.prediction.predictions import (
     Loads,
@@ -57,26 +56,6 @@ from snrmjax.simulate.solutions.forced_response import ResponseCurve
 from snrmjax.simulate.solutions.normal_modes import NormalModeBranch
 
 _DRAWN = 100  # amplitudes of curves that are looked at for negative damping
-
-
-@dataclass(frozen=True)
-class CurveSettings:
-    """How the points of single states are joined to curves: settings of `identify_backbone`."""
-
-    amplitude: AmplitudeArgument = "displacement"
-    measure: AmplitudeMeasure = "fundamental"
-    n_knots: int | None = None
-    anchor: bool = False
-
-
-@dataclass(frozen=True)
-class JointFitSettings:
-    """What is asked of a joint fit: families, free unknowns of the instruments, further states."""
-
-    families: str = "auto"  # BACKBONE[,DAMPING]
-    free: tuple[str, ...] = ()
-    robust: bool = False
-    further: int = 0  # measurements to advise
 
 
 class Findings(NamedTuple):
@@ -106,10 +85,18 @@ class Findings(NamedTuple):
 
 
 def identify_by_points(
-    data: SteadyStates, model: Structure, settings: CurveSettings, loads: Loads
+    data: SteadyStates,
+    model: Structure,
+    loads: Loads,
+    *,
+    amplitude: AmplitudeArgument = "displacement",
+    measure: AmplitudeMeasure = "fundamental",
+    n_knots: int | None = None,
+    anchor: bool = False,
 ) -> Findings:
     """Identify state by state, draw curves through the points, and predict responses from these.
 
+    Arguments: those of `identify_backbone`, and the `loads` of predictions.
     Raises `ValueError` where the force is known as a drive voltage only, and what
     `identify_backbone` and `predict_response` raise.
     """
@@ -119,12 +106,7 @@ def identify_by_points(
     check_force(data, "an identification state by state")
     try:
         found = identify_backbone(
-            data,
-            model,
-            amplitude=settings.amplitude,
-            measure=settings.measure,
-            n_knots=settings.n_knots,
-            anchor=settings.anchor,
+            data, model, amplitude=amplitude, measure=measure, n_knots=n_knots, anchor=anchor
         )
     except ValueError as error:
         raise with_doubt(error, data, model) from error
@@ -138,40 +120,47 @@ def identify_by_points(
         *notes_on_predictions(predictions, backbone, data),
     )
     words = {
-        "amplitude": f"{settings.amplitude}, {settings.measure}",
-        "curves": "smooth" + (", anchored at the linear mode" if settings.anchor else ""),
+        "amplitude": f"{amplitude}, {measure}",
+        "curves": "smooth" + (", anchored at the linear mode" if anchor else ""),
     }
     values = backbone.sampled(results.BACKBONE_POINTS)
     return Findings(data, model, found, predictions, notes, values, words)
 
 
 def identify_jointly(
-    data: SteadyStates, model: Structure, settings: JointFitSettings, loads: Loads
+    data: SteadyStates,
+    model: Structure,
+    loads: Loads,
+    *,
+    families: str = "auto",
+    free: Sequence[str] = (),
+    robust: bool = False,
+    further: int = 0,
 ) -> Findings:
     """Fit both curves to all states at once, predict responses from the fit, advise further states.
 
+    Arguments: `families` BACKBONE[,DAMPING]; `free` unknowns of the instruments, each entry one or
+    several with commas; how many `further` measurements to advise.
     Raises `ValueError` for more than two families, for a drive voltage where the data have a
     force, and what `fit_jointly` and `fitted_response` raise.
     """
     if loads.drives:
         require_drive(data)
-    names = settings.families.split(",")
+    names = families.split(",")
     if len(names) > 2:
-        raise ValueError(
-            f"--fit takes one or two families, but {settings.families!r} names {len(names)}."
-        )
+        raise ValueError(f"--fit takes one or two families, but {families!r} names {len(names)}.")
     fit = fit_jointly(
         data,
         model,
         backbone=names[0],
         damping=names[1] if len(names) == 2 else "auto",
-        free=[name for names in settings.free for name in names.split(",")],
-        robust=settings.robust,
+        free=[name for several in free for name in several.split(",")],
+        robust=robust,
     )
     data = corrected_states(data, fit)
     found = identification_of_fit(data, fit)
     predictions, trends = predictions_of_fit(fit, loads)
-    advice = next_measurements(fit, settings.further) if settings.further else None
+    advice = next_measurements(fit, further) if further else None
     doubts = () if "force_gain" in fit.names() else doubt(data, model, found.points)
     notes = [*doubts, *data.notes, *found.notes, *linear_damping_note(fit, model)]
     if fit.drive_known_only:
@@ -191,8 +180,7 @@ def identify_jointly(
     notes += advice.notes if advice else ()
     if advice is not None and advice.status != AdviceStatus.COMPLETE:
         notes.append(
-            f"{len(advice)} of {settings.further} further measurements are advised: "
-            f"{advice.message}."
+            f"{len(advice)} of {further} further measurements are advised: {advice.message}."
         )
     pair = (fit.unknowns.squared_frequency, fit.unknowns.modal_damping)
     words = {
@@ -311,7 +299,7 @@ def findings_report(
     if "nnm" in figures:
         shown = [ReportFigure(figures["nnm"], MODE_CAPTION)]
         further.append(Section("The nonlinear normal mode", (), shown))
-    report = identification_report(
+    return identification_report(
         found.identification,
         found.model.modes,
         figures,
@@ -323,8 +311,8 @@ def findings_report(
             [f"Resonance at {p.load}: {where_in_words(p.further)}." for p in found.predictions],
         ),
         further=further,
+        words=None if found.fitted is None else words_of_fit(found.fitted.fit),
     )
-    return report if found.fitted is None else with_joint_fit(report, found.fitted.fit)
 
 
 def write_findings(

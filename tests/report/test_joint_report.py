@@ -16,9 +16,7 @@ from snrmjax.io.units import DEGREE, HERTZ
 from snrmjax.report import joint_figures as joint_plot
 from snrmjax.report import joint_report
 from snrmjax.report import sampling as plot_data
-from snrmjax.report import style as drawing
-from snrmjax.report.html import Report, ReportFigure, Section, report_html
-from snrmjax.report.identification_report import BACKBONE_CAPTION, NO_SCATTER, VALIDITY
+from snrmjax.report.html import Report, report_html
 
 TRUE = {"backbone": "polynomial:1@displacement", "damping": "viscous_quadratic@velocity"}
 
@@ -89,23 +87,13 @@ def test_a_gain_is_a_number_with_a_unit_and_per_cent():
 @pytest.mark.parametrize("free", [(), ("force_gain",)])
 def test_a_report_of_a_joint_fit_tells_the_joint_fit(fit, free):
     fit = dataclasses.replace(fit, free=free)
-    summary = [
-        ("noise", "of points"),
-        ("scatter from level to level", NO_SCATTER),
-        ("argument of the curves", "displacement amplitude"),
-        ("left out", "none"),
-    ]
-    shown = ReportFigure(drawing.panels(1, 1, 1, 1)[0], BACKBONE_CAPTION)
-    sections = [Section("Backbone", (), [shown]), Section("How to read this", VALIDITY)]
-    whole = joint_report.with_joint_fit(Report("Fit", summary=summary, sections=sections), fit)
-    rows = dict(whole.summary)
+    words = joint_report.words_of_fit(fit)
     # The exact states' level gain is 1 %, stated; the damping of the truth is the velocity's.
-    assert rows["scatter from level to level"] == "1 % in gain (1σ)"
+    assert words.scatter == "1 % in gain (1σ)"
     argument = "natural frequency: displacement amplitude; damping: velocity amplitude"
-    assert rows["argument of the curves"] == argument
-    assert rows["noise"].startswith("stated; states scatter about the curves by")
-    assert rows["left out"] == "none"
-    text = whole.sections[0].figures[0].caption + " ".join(whole.sections[1].text)
+    assert words.argument == argument
+    assert words.noise.startswith("stated; states scatter about the curves by")
+    text = words.caption + " ".join(words.validity)
     assert "curve through the stars" not in text
     assert "joint fit to all steady states" in text
     assert ("is not in them" in text) == (not free)

@@ -46,7 +46,7 @@ def check(
     Conjugated responses, accelerations or displacements for velocities, volts for newtons, rms for
     peak, degrees for radians, clipped channels, unsettled steps, drop-out and harmonics of the
     force, drift, files of different structures, shapes of another scale, folded frequencies; each
-    with its evidence and what mends it, wherever possible as a command. Nothing is said where all
+    with its evidence and what mends it, as an import where it can. Nothing is said where all
     is well.
 
     What scales force and response alike cannot be seen: rms for peak in both, or one wrong range
@@ -56,15 +56,14 @@ def check(
     """
     from snrmjax.doctor.check import check_test
     from snrmjax.io.laboratory.checkups import read_recordings, write_checkup
-    from snrmjax.report.whole_test.mends import checked_files, with_commands
+    from snrmjax.report.whole_test.mends import FilesRead, with_imports
 
     with staged(out) as folder:
         structure = None if model is None else read_model(model)
         tables = [read_steady_states(path, structure) for path in data]
         recordings = [one for path in record or () for one in read_recordings(path)]
-        sensors = tables[0].sensors if tables else ()
-        where = checked_files(data, model, sensors, record or ())
-        found = with_commands(check_test(tables, structure, recordings), where)
+        found = check_test(tables, structure, recordings)
+        found = with_imports(found, FilesRead(tuple(data)))
         write_checkup(folder / "check.json", found)
     for note in found.notes:
         warn(note)

@@ -2,14 +2,13 @@
 
 import os
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from snrmjax.cli.console import say, staged, warn
-from snrmjax.cli.options import FILES
-
-_CHANNELS, _MEANING, _TEXT = "Channels and columns", "What the numbers are", "Text files"
+from snrmjax.cli.options import FILES, OptionRow, with_options
+from snrmjax.io.exchange.import_map import KEYS, RESPONSE_KEYS, ImportMap, MapKey
 
 
 def import_(
@@ -39,166 +38,7 @@ def import_(
             rich_help_panel=FILES,
         ),
     ] = None,
-    force: Annotated[
-        str,
-        typer.Option(
-            help="Channel or column of the force.", metavar="NAME", rich_help_panel=_CHANNELS
-        ),
-    ] = "",
-    response: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Channel or column of a response, as CH2:acceleration or CH2:acceleration:g "
-            "(repeatable, one a sensor).",
-            metavar="NAME[:KIND[:UNIT]]",
-            rich_help_panel=_CHANNELS,
-        ),
-    ] = None,
-    sensor: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Names of the sensors as the model has them, in the order of --response.",
-            metavar="NAME",
-            rich_help_panel=_CHANNELS,
-        ),
-    ] = None,
-    frequency: Annotated[
-        str,
-        typer.Option(help="Column of the frequency.", metavar="NAME", rich_help_panel=_CHANNELS),
-    ] = "",
-    phase: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Column of the phase of each response.",
-            metavar="NAME",
-            rich_help_panel=_CHANNELS,
-        ),
-    ] = None,
-    imaginary: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Column of the imaginary part of each response (lock-in Y).",
-            metavar="NAME",
-            rich_help_panel=_CHANNELS,
-        ),
-    ] = None,
-    amplitude_std: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Column of the standard deviation of each response's amplitude, in its unit "
-            "(default: by name, as R_std beside R).",
-            metavar="NAME",
-            rich_help_panel=_CHANNELS,
-        ),
-    ] = None,
-    phase_std: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Column of the standard deviation of each phase, in its unit (default: by name).",
-            metavar="NAME",
-            rich_help_panel=_CHANNELS,
-        ),
-    ] = None,
-    force_phase: Annotated[
-        str,
-        typer.Option(
-            help="Column of the force's own phase (default: phases are relative to the force).",
-            metavar="NAME",
-            rich_help_panel=_CHANNELS,
-        ),
-    ] = "",
-    drive: Annotated[
-        str,
-        typer.Option(
-            help="Channel of the generator, by which steps are recognised.",
-            metavar="NAME",
-            rich_help_panel=_CHANNELS,
-        ),
-    ] = "",
-    dataset: Annotated[
-        str,
-        typer.Option(
-            help="Which of the file's datasets.", metavar="NAME", rich_help_panel=_CHANNELS
-        ),
-    ] = "",
-    level: Annotated[
-        str,
-        typer.Option(
-            help="What numbers the levels: a column, or file, force, drive, runs, order, z.",
-            metavar="RULE",
-            rich_help_panel=_CHANNELS,
-        ),
-    ] = "",
-    unit: Annotated[
-        str,
-        typer.Option(
-            help="Unit of the responses: m/s, mm/s, g, m/s^2, mm, …; of our own table, what its "
-            "velocity columns are.",
-            metavar="UNIT",
-            rich_help_panel=_MEANING,
-        ),
-    ] = "",
-    force_unit: Annotated[
-        str,
-        typer.Option(
-            help="Unit of the force: N, lbf, …; V for a drive voltage.",
-            metavar="UNIT",
-            rich_help_panel=_MEANING,
-        ),
-    ] = "",
-    frequency_unit: Annotated[
-        str, typer.Option(help="Hz or rad/s.", metavar="UNIT", rich_help_panel=_MEANING)
-    ] = "",
-    phase_unit: Annotated[
-        str, typer.Option(help="deg or rad.", metavar="UNIT", rich_help_panel=_MEANING)
-    ] = "",
-    phase_sign: Annotated[
-        str,
-        typer.Option(
-            help="lead: a positive phase is ahead of the force; lag: behind it.",
-            metavar="SIGN",
-            rich_help_panel=_MEANING,
-        ),
-    ] = "",
-    amplitude: Annotated[
-        str,
-        typer.Option(help="peak, rms or peak_to_peak.", metavar="SIZE", rich_help_panel=_MEANING),
-    ] = "",
-    over_force: Annotated[
-        bool,
-        typer.Option(
-            "--over-force",
-            help="Responses of a table are divided by the force.",
-            rich_help_panel=_MEANING,
-        ),
-    ] = False,
-    force_amplitude: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Force in N behind frequency responses: one for all, one a set (repeatable), or "
-            "z: the z axis states it.",
-            metavar="N",
-            rich_help_panel=_MEANING,
-        ),
-    ] = None,
-    record: Annotated[
-        str,
-        typer.Option(
-            help="What a time record is: steps, sweep, decay, broadband.",
-            metavar="KIND",
-            rich_help_panel=_MEANING,
-        ),
-    ] = "",
-    separator: Annotated[
-        str,
-        typer.Option(help="comma, semicolon, tab or space.", metavar="NAME", rich_help_panel=_TEXT),
-    ] = "",
-    decimal: Annotated[
-        str, typer.Option(help="point or comma.", metavar="NAME", rich_help_panel=_TEXT)
-    ] = "",
-    header_row: Annotated[
-        int, typer.Option(help="Row of the names, from 1 (0: found).", min=0, rich_help_panel=_TEXT)
-    ] = 0,
+    **options: Any,
 ) -> None:
     """Read a laboratory's files and write steady states as identify takes them.
 
@@ -212,35 +52,7 @@ def import_(
     from snrmjax.io.exchange.listing import listed_contents, suggested_command
     from snrmjax.io.laboratory.reading import read_laboratory_file
 
-    told = map_of_options(
-        map_file,
-        response or (),
-        unit=unit,
-        sensor=sensor or (),
-        phase=phase or (),
-        imaginary=imaginary or (),
-        amplitude_std=amplitude_std or (),
-        phase_std=phase_std or (),
-        force_amplitude=force_amplitude or (),
-        words={
-            "force": force,
-            "frequency": frequency,
-            "force_phase": force_phase,
-            "drive": drive,
-            "dataset": dataset,
-            "level": level,
-            "force_unit": force_unit,
-            "frequency_unit": frequency_unit,
-            "phase_unit": phase_unit,
-            "phase_sign": phase_sign,
-            "amplitude": amplitude,
-            "record": record,
-            "separator": separator,
-            "decimal": decimal,
-        },
-        over_force=over_force,
-        header_row=header_row,
-    )
+    told = map_of_options(map_file, options)
     if told.is_empty and (map_file is None) and out is None:
         for path in files:
             held = read_laboratory_file(path, told.text_format)
@@ -259,3 +71,29 @@ def import_(
         for line in found.states.summary()[:3]:
             say(line)
     say(f"written to {out}: {', '.join(written)}")
+
+
+_RESPONSE = MapKey(
+    "channel or column of a response, as CH2:acceleration or CH2:acceleration:g; one a sensor",
+    "NAME[:KIND[:UNIT]]",
+)
+
+
+def _row(name: str, key: MapKey) -> OptionRow:
+    """The option of a key of the map: a switch, a number, a word, or repeated words."""
+    default: Any = ImportMap._field_defaults.get(name, ())
+    several = isinstance(default, tuple)
+    said = f"{key.meaning[0].upper()}{key.meaning[1:]}{' (repeatable)' * several}."
+    kind = list[str] if several else type(default)
+    least = 0 if kind is int else None
+    return OptionRow(name, kind, said, key.metavar or None, None if several else default, least)
+
+
+_OPTIONS = {"force": KEYS["force"], "response": _RESPONSE, **RESPONSE_KEYS, **KEYS}
+with_options(
+    import_,
+    {
+        group: [_row(name, key) for name, key in _OPTIONS.items() if key.group == group]
+        for group in dict.fromkeys(key.group for key in _OPTIONS.values())
+    },
+)

@@ -13,14 +13,13 @@ from snrmjax.identify.scaling.scale import (
     Scale,
     SensorMasses,
 )
-from snrmjax.io.files import file_name, read_text
+from snrmjax.io.exchange.own_tables import is_own_file
+from snrmjax.io.files import file_name
 from snrmjax.io.laboratory.reading import read_laboratory_file
 from snrmjax.io.tables import read_steady_states
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.states import SteadyStates, join_steady_states
-
-_STATES = "velocity_re_m_s"
 
 
 def read_modal_sources(
@@ -54,7 +53,7 @@ _WORDS = {
 
 
 def _read(path: Path) -> FrequencyResponses | SteadyStates | tuple[TimeRecording, ...]:
-    if path.suffix.lower() == ".csv" and _STATES in read_text(path).split("\n", 1)[0]:
+    if path.suffix.lower() == ".csv" and is_own_file(path):
         return read_steady_states(path)
     held = read_laboratory_file(path)
     if held.responses:

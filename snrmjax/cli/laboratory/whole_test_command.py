@@ -2,12 +2,12 @@
 
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from snrmjax.cli.console import say, staged, warn
-from snrmjax.cli.options import FILES, Out
+from snrmjax.cli.options import FILES, OptionRow, Out, with_options
 
 
 def whole_test(
@@ -22,29 +22,7 @@ def whole_test(
         ),
     ],
     out: Out,
-    model: Annotated[
-        Path | None,
-        typer.Option(
-            help="Linear model, in place of the folder's or of frequency responses.",
-            metavar="MODEL",
-            rich_help_panel=FILES,
-            show_default=False,
-        ),
-    ] = None,
-    drive_point: Annotated[
-        str | None,
-        typer.Option(
-            help="Sensor at the force, by which mode shapes are scaled.",
-            metavar="NAME",
-            show_default=False,
-        ),
-    ] = None,
-    go_on: Annotated[
-        bool, typer.Option("--go-on", help="Go on in spite of errors that the check finds.")
-    ] = False,
-    diagnose: Annotated[
-        bool, typer.Option(help="Look for what the model lacks, too (a minute or more).")
-    ] = True,
+    **options: Any,
 ) -> None:
     """From a folder of raw files to one report: check, linear modes, backbone, diagnosis.
 
@@ -56,19 +34,34 @@ def whole_test(
     these names.
     """
     from snrmjax.report.whole_test.folder_contents import read_test_files
-    from snrmjax.report.whole_test.mends import tested_files
+    from snrmjax.report.whole_test.mends import files_of_test
     from snrmjax.report.whole_test.stages import TestRequest, run_whole_test
 
     with staged(out) as target:
         began = time.perf_counter()
-        files = read_test_files(folder, model)
+        files = read_test_files(folder, options["model"])
         say(f"files: {time.perf_counter() - began:.1f} s")
-        place = tested_files(folder, files, model, drive_point, out)
-        request = TestRequest(drive_point, go_on=go_on, diagnose=diagnose, place=place)
+        read = files_of_test(folder, files)
+        request = TestRequest(
+            *(options["drive_point"], options["go_on"], options["diagnose"]), read=read
+        )
         name = folder.resolve().name
-        found = run_whole_test(target, files, name, request, progress=say)
-    for note in found.notes:
+        notes, lines = run_whole_test(target, files, name, request, progress=say)
+    for note in notes:
         warn(note)
-    for line in found.lines:
+    for line in lines:
         say(line)
     say(f"written to {out}: open {out / 'report.html'}")
+
+
+_MODEL = OptionRow(
+    "model", Path, "Linear model, in place of the folder's or of frequency responses.", "MODEL"
+)
+_FURTHER = (
+    OptionRow("drive_point", str, "Sensor at the force, by which mode shapes are scaled.", "NAME"),
+    OptionRow("go_on", bool, "Go on in spite of errors that the check finds.", None, False),
+    OptionRow(
+        "diagnose", bool, "Look for what the model lacks, too (a minute or more).", None, True
+    ),
+)
+with_options(whole_test, {FILES: (_MODEL,), None: _FURTHER})

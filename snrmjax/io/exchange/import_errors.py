@@ -5,14 +5,13 @@ import re
 import numpy as np
 from jaxtyping import Float
 
-from snrmjax.io.exchange.import_map import ImportMap, ResponseMap
-from snrmjax.io.exchange.import_units import Assumptions
-from snrmjax.io.files import near_miss
+from snrmjax.io.exchange.import_map import Assumption, Assumptions, ImportMap, ResponseMap
+from snrmjax.io.exchange.import_units import require_name
 from snrmjax.io.laboratory.contents import NumberTable
 from snrmjax.io.laboratory.names import role_of
 
 _DEVIATION = re.compile(r"stdev|stddev|std|sigma|deviation|dev")
-_OF_ONE_ROW = "1σ of the row, by its name (if of each of N readings: divide by √N)"
+_OF_ONE_ROW = Assumption("1σ of the row, by its name (if of each of N readings: divide by √N)")
 
 
 def with_errors_by_name(
@@ -91,12 +90,7 @@ def _deviations(
 ) -> Float[np.ndarray, " row"] | None:
     if not name:
         return None
-    if name not in table.columns:
-        near = near_miss(name, table.columns)
-        raise ValueError(
-            f"{option} names {name!r}, but {file} has the columns {', '.join(table.columns)}"
-            f"{f' (did you mean {near}?)' if near else ''}."
-        )
+    require_name(option, name, table.columns, "columns", file)
     values = np.real(np.asarray(table.columns[name])).astype(float)
     if np.nanmin(values, initial=0.0) < 0:
         row = int(np.flatnonzero(values < 0)[0]) + 1

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
-from snrmjax.io.exchange.import_units import Assumptions
+from snrmjax.io.exchange.import_map import Assumption, Assumptions
 from snrmjax.measure.recordings.velocity_states import counted_levels, number_levels
 
 
@@ -48,10 +48,9 @@ def numbered_levels(
         return np.unique(keys, return_inverse=True)[1] + 1, level
     if level == "file" or (not level and len(parts) > 1):
         if not level:
-            assumed["level"] = "one level a file, in the order in which they were named"
+            assumed["level"] = Assumption("one level a file, in the order in which they were named")
         return files, "file"
-    chosen = level or "auto"
-    number, note = number_levels(chosen, force, None, frequency)  # type: ignore[arg-type]
+    number, rule = number_levels(level or "auto", force, None, frequency)  # type: ignore[arg-type]
     if not level:
-        assumed["level"] = counted_levels(number, note)
-    return number, level or ("force" if "amplitude" in note else "runs")
+        assumed["level"] = Assumption(counted_levels(number, rule))
+    return number, rule

@@ -1,12 +1,13 @@
 """Units and quantities of an import: stated by the map, by the file, or asked for."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from snrmjax.io.exchange.import_map import ImportMap
+from snrmjax.io.exchange.import_map import Assumption, Assumptions, ImportMap
+from snrmjax.io.files import near_miss
 from snrmjax.io.laboratory.physical_units import UnitMeaning, unit_meaning
 from snrmjax.measure.recordings.channels import SI_UNIT
 
@@ -16,23 +17,23 @@ AMPLITUDE_FACTORS = {"peak": 1.0, "": 1.0, "rms": np.sqrt(2.0), "peak_to_peak": 
 _HERTZ = 2 * np.pi
 
 
-class Assumptions(dict[str, str]):
-    """What was taken for each key of the map that nobody stated, and why: "value: reason"."""
-
-    def unit(self, key: str, told: str, file_unit: str) -> None:
-        """Record where a unit comes from: the map wins over the file."""
-        if not told and file_unit:
-            self[key] = f"{file_unit}: the file says so"
-        elif told and file_unit and told != file_unit:
-            self[key] = f"{told}: stated, though the file says {file_unit}"
-
-
 class Force(NamedTuple):
     """What the numbers of a force are multiplied with."""
 
     factor: float
     is_voltage: bool
     unit: str
+
+
+def require_name(option: str, name: str, known: Iterable[str], what: str, file: str) -> None:
+    """Raise `ValueError` where an option names nothing that a file has; `what` are those there."""
+    names = list(known)
+    if name not in names:
+        near = near_miss(name, names)
+        raise ValueError(
+            f"{option} names {name!r}, but {file} has the {what} {', '.join(names)}"
+            f"{f' (did you mean {near}?)' if near else ''}."
+        )
 
 
 def force_meaning(told: ImportMap, file_unit: str, what: str) -> Force:
@@ -108,7 +109,8 @@ def amplitude_factor(told: ImportMap, units: Mapping[str, str], assumed: Assumpt
             "holds for all? --amplitude peak, rms or peak_to_peak."
         )
     size = next(iter(sizes), "peak")
-    assumed["amplitude"] = f"{size}: {'the units say so' if sizes else 'nothing is said'}"
+    why = "the units say so" if sizes else "nothing is said"
+    assumed["amplitude"] = Assumption(why, size)
     return float(AMPLITUDE_FACTORS[size])
 
 
@@ -122,7 +124,7 @@ def frequency_in_rad(
             raise ValueError(
                 f"is {told.frequency} in Hz or in rad/s? State it: --frequency-unit Hz or rad/s."
             )
-        assumed["frequency_unit"] = "Hz: nothing is said"
+        assumed["frequency_unit"] = Assumption("nothing is said", "Hz")
         return values * _HERTZ
     assumed.unit("frequency_unit", told.frequency_unit, file_unit)
     meaning = _understood(unit, "--frequency-unit")
@@ -172,9 +174,11 @@ def phase_in_rad(
         else:
             raise ValueError(f"is {column} in degrees or in radians? --phase-unit deg or rad.")
     if why:
-        assumed["phase_unit"] = f"{unit}: {why}"
+        assumed["phase_unit"] = Assumption(why, unit)
     if not told.phase_sign:
-        assumed["phase_sign"] = "lead: a positive phase is ahead of the force, e^(+iwt)"
+        assumed["phase_sign"] = Assumption(
+            "a positive phase is ahead of the force, e^(+iwt)", "lead"
+        )
     sign = -1.0 if told.phase_sign == "lag" else 1.0
     return sign * (np.radians(values) if unit == "deg" else values)
 

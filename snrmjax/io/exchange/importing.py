@@ -3,15 +3,15 @@
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
 from snrmjax.io.exchange.import_levels import MeasuredPart, numbered_levels
-from snrmjax.io.exchange.import_map import ImportMap
-from snrmjax.io.exchange.import_units import Assumptions, Force
-from snrmjax.io.exchange.layouts import (
+from snrmjax.io.exchange.import_map import Assumption, Assumptions, ImportMap
+from snrmjax.io.exchange.import_units import Force
+from snrmjax.io.exchange.own_tables import (
     is_own_table,
     restated,
     restated_in_words,
@@ -44,6 +44,7 @@ class Imported(NamedTuple):
     used: ImportMap
     assumed: Assumptions
     notes: tuple[str, ...]
+    steps: StepCounts | None = None  # of all records that are stepped sines
 
 
 class _Dataset(NamedTuple):
@@ -97,12 +98,6 @@ def _datasets(held: LaboratoryFile, told: ImportMap) -> list[_Dataset]:
     every += [_Dataset(one.name, held.name, one) for one in held.tables]
     if held.responses:
         every.append(_Dataset("responses", held.name, held.responses, held.levels))
-    if not every:
-        what = " and ".join([*["mode shapes"] * bool(held.shapes), *["nodes"] * bool(held.nodes)])
-        raise ValueError(
-            f"{held.name} holds {what} only: a model is made of mode shapes by hand, or of "
-            "frequency responses by `snrmjax modes`."
-        )
     names = [one.name for one in every]
     if told.dataset:
         alike = [one for one in every if one.name == told.dataset]
@@ -144,13 +139,16 @@ def _records(
                 kept.append(record)
             else:
                 parts.append(states)
-    if steps:
-        notes.append(f"{joined_counts(steps).words}.")
+    counted = joined_counts(steps) if steps else None
+    if counted is not None:
+        notes.append(f"{counted.words}.")
     if not parts:
         return Imported(None, tuple(kept), used, assumed, tuple(notes))
     if told.level == "file" or (len(parts) > 1 and not told.level):
         if not told.level:
-            assumed["level"] = "one level a record, in the order in which they were named"
+            assumed["level"] = Assumption(
+                "one level a record, in the order in which they were named"
+            )
         used = used._replace(level="file")
         parts = [
             dataclasses.replace(one, level=jnp.full(one.n_states, k + 1))
@@ -158,7 +156,7 @@ def _records(
         ]
     elif len(parts) > 1:
         parts = list(with_levels_apart(parts))
-    return Imported(_joined(parts), (), used, assumed, tuple(notes))
+    return Imported(_joined(parts), (), used, assumed, tuple(notes), counted)
 
 
 def _phasors(
@@ -207,12 +205,8 @@ def _stated(errors: Sequence[tuple[np.ndarray | None, np.ndarray]]) -> np.ndarra
 def _filled(used: ImportMap, assumed: Assumptions) -> ImportMap:
     """The map with choices that were assumed, so that the next test is read alike."""
     keys = ("amplitude", "phase_sign", "phase_unit")
-    words = {key: assumed[key].split(":")[0] for key in keys if key in assumed}
-    return used._replace(
-        amplitude=words.get("amplitude", used.amplitude),
-        phase_sign=words.get("phase_sign", used.phase_sign),
-        phase_unit=words.get("phase_unit", used.phase_unit),
-    )
+    words: dict[str, Any] = {key: assumed[key].value for key in keys if key in assumed}
+    return used._replace(**words)
 
 
 def _rule(used: ImportMap, parts: Sequence[MeasuredPart]) -> str:

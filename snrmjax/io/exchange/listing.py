@@ -3,15 +3,15 @@
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from snrmjax.io.exchange.layouts import is_own_table
+from snrmjax.io.exchange.own_tables import is_own_table
 from snrmjax.io.laboratory.contents import LaboratoryFile, NumberTable
 from snrmjax.io.laboratory.names import role_of
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
-from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.recordings.velocity_states import counted_levels, number_levels
 
 _HERTZ = 2 * np.pi
@@ -42,13 +42,6 @@ def listed_contents(held: LaboratoryFile) -> list[str]:
         lines += _short([f"    reference {channel}" for channel in one.references])
     if len(held.responses) > _MOST:
         lines.append(f"  … {len(held.responses) - _MOST} further sets of responses")
-    for shapes in held.shapes:
-        lines.append(
-            f"  mode shapes {shapes.name}: {len(shapes.frequency)} modes at "
-            f"{len(shapes.points)} places"
-        )
-    for nodes in held.nodes:
-        lines += [f"  {nodes.name}: {nodes.n_rows} points of the structure", *_columns(nodes)]
     return [*lines, *(f"  note: {note}" for note in held.notes[:_MOST])]
 
 
@@ -69,13 +62,13 @@ def _columns(table: NumberTable) -> list[str]:
         unit = f" in {table.units[name]}" if name in table.units else ""
         kind = ", complex" if np.iscomplexobj(values) else ""
         lines.append(f"    {name}{unit}: {span}{kind}{levels}{f' ({role}?)' if role else ''}")
-    frequency = _first(table, ("frequency",))
-    force = _first(table, ("force", "drive"))
-    if frequency and force and not _first(table, ("level",)):
+    frequency = _first(table, "frequency")
+    force = _first(table, "force") or _first(table, "drive")
+    if frequency and force and not _first(table, "level"):
         size = np.abs(table.columns[force])
         if np.all(size > 0) and np.isfinite(size).all():
-            number, note = number_levels("auto", size, None, np.real(table.columns[frequency]))
-            lines.append(f"    found: {counted_levels(number, note)}")
+            number, rule = number_levels("auto", size, None, np.real(table.columns[frequency]))
+            lines.append(f"    found: {counted_levels(number, rule)}")
     lines += [
         f"    {name}: text, {', '.join(list(dict.fromkeys(words))[:4])}"
         for name, words in table.words.items()
@@ -83,52 +76,60 @@ def _columns(table: NumberTable) -> list[str]:
     return _short(lines)
 
 
-_TO_FILL_IN = ("CHANNEL", "COLUMN", "QUANTITY", "UNIT", "NEWTONS")
-# Longer endings first: `_mm_s` ends with `_s` only.
-_UNITS_IN_NAMES = {
-    **{"mm_s2": "mm/s^2", "m_s2": "m/s^2", "mm_s": "mm/s", "m_s": "m/s", "um": "um"},
-    **{"mm": "mm", "mN": "mN", "kN": "kN", "N": "N", "n": "N", "mV": "mV", "V": "V", "v": "V"},
-    **{"mg": "mg", "g": "g", "m": "m"},
-}
+_TO_FILL_IN = ("CHANNEL", "QUANTITY", "UNIT", "NEWTONS")
 
 
-def _first(table: NumberTable, roles: Sequence[str]) -> str:
-    """The first column with one of these roles, the earlier role first."""
-    for role in roles:
-        for name in table.columns:
-            if role_of(name) == role:
-                return name
-    return ""
+class _Candidate(NamedTuple):
+    """A channel or column that may be force or response: what the file or its name says it is."""
+
+    name: str
+    kind: str
+    unit: str  # that the file states
+
+
+def _first(table: NumberTable, role: str) -> str:
+    """The first column with a role."""
+    return next((name for name in table.columns if role_of(name) == role), "")
 
 
 def suggested_command(paths: Sequence[Path], held: LaboratoryFile) -> list[str]:
     """A command line that imports the file, with what is guessed, and how to change it."""
     files = " ".join(shlex.quote(str(path)) for path in paths)
-    several = len(held.recordings) + len(held.tables) + bool(held.responses) > 1
+    tables = sorted(held.tables, key=lambda one: (not _first(one, "frequency"), -one.n_rows))
+    several = len(held.tables) + bool(held.recordings) + bool(held.responses) > 1
     words: list[str] = []
-    if held.tables:
-        table = max(held.tables, key=lambda one: (bool(_first(one, ("frequency",))), one.n_rows))
-        words = _of_table(table)
-        mixed = bool(held.recordings or held.responses) or len(held.tables) > 1
-        words = (["--dataset", table.name] if mixed else []) + words
-    if held.recordings and not any(_first(one, ("frequency",)) for one in held.tables):
-        words = _of_record(held.recordings[0])
-        mixed = bool(held.tables or held.responses)
-        words = (["--dataset", held.recordings[0].name or "record"] if mixed else []) + words
     if held.responses and not held.recordings:
-        words = _of_responses(held.responses[0], held.levels)
-        words = (["--dataset", "responses"] if several else []) + words
-    if not words and not (held.tables and is_own_table(held.tables[0])):
+        dataset, words = "responses", _of_responses(held)
+        if not held.tables and _is_linear(held):
+            return _as_linear_test(files, held, words)
+    elif held.recordings and not (tables and _first(tables[0], "frequency")):
+        record = held.recordings[0]
+        dataset, words = record.name or "record", _guessed(_of_channels(record.channels))
+    elif tables:
+        table = tables[0]
+        dataset = table.name
+        if not is_own_table(table):
+            columns = [
+                _Candidate(name, role_of(name), table.units.get(name, ""))
+                for name in table.columns
+                if role_of(name) != "frequency"
+            ]
+            words = _guessed(columns)
+    else:
         return []
-    if held.responses and not held.recordings and not held.tables and _is_linear(held):
-        return _as_linear_test(files, held, words)
-    line = " ".join(word if word.isupper() else shlex.quote(word) for word in words)
+    words = ["--dataset", dataset, *words] if several else words
+    line = _line(words)
     open_words = [one for one in _TO_FILL_IN if one in line.replace(":", " ").split()]
     fill_in = f"fill in {', '.join(open_words)}, and " if open_words else ""
     return [
         f"import it ({fill_in}check the guesses):",
-        " ".join(f"  snrmjax import {files} {line} --out imported".split("  ")).strip(),
+        f"  snrmjax import {files}{line} --out imported",
     ]
+
+
+def _line(words: Sequence[str]) -> str:
+    """Words of a command, quoted but for those to fill in."""
+    return "".join(f" {word if word.isupper() else shlex.quote(word)}" for word in words)
 
 
 def _is_linear(held: LaboratoryFile) -> bool:
@@ -145,14 +146,13 @@ def _as_linear_test(files: str, held: LaboratoryFile, words: list[str]) -> list[
     named = shlex.quote(driven or (names[0] if len(names) == 1 else "SENSOR"))
     why = "it has the force's place and axis" if driven else f"which is it, of {', '.join(names)}?"
     sensors = [] if len(names) != 1 else ["--sensor", names[0]]
-    line = " ".join(one if one.isupper() else shlex.quote(one) for one in [*words, *sensors])
     return [
         "linear modes of it, as of an impact test (the sensor at the force scales the shapes; "
         f"{why}):",
         f"  snrmjax modes {files} --drive-point {named} --out model.toml",
         "or, if it is one level of a stepped sine, import it under the sensor's name in the model "
         "(fill in NEWTONS):",
-        f"  snrmjax import {files} {line} --out imported",
+        f"  snrmjax import {files}{_line([*words, *sensors])} --out imported",
     ]
 
 
@@ -167,79 +167,46 @@ def _at_the_force(sets: Sequence[FrequencyResponses]) -> str:
     return ""
 
 
-def _of_record(record: TimeRecording) -> list[str]:
-    force = _guess(record.channels, ("force", "voltage"), ("force", "drive"))
-    others = [one for one in record.channels if one.name != (force.name if force else "")]
-    response = _guess(others, _MOTIONS, (*_MOTIONS, "amplitude"))
-    response = response or (others[0] if len(others) == 1 else None)
-    words = ["--force", force.name] if force else ["--force", "CHANNEL"]
-    if force is None or force.quantity == "unknown":
-        words += ["--force-unit", unit_in_name(force.name if force else "")]
-    return words + _response_words(response or Channel("CHANNEL"))
+def _of_channels(channels: Sequence[Channel]) -> list[_Candidate]:
+    return [
+        _Candidate(one.name, role_of(one.name), "")
+        if one.quantity == "unknown"
+        else _Candidate(one.name, one.quantity, one.unit or one.si_unit)
+        for one in channels
+    ]
 
 
-def _of_responses(one: FrequencyResponses, z: Sequence[float]) -> list[str]:
-    amplitude = "z" if z and np.isfinite(z[0]) and z[0] > 0 else "NEWTONS"
-    response = _guess(one.responses, _MOTIONS, (*_MOTIONS, "amplitude")) or one.responses[0]
-    force = next((c.name for c in one.responses if c.quantity == "force"), "")
-    if force:  # spectra, or responses over a generator
-        return ["--force", force, *_response_words(response)]
+def _of_responses(held: LaboratoryFile) -> list[str]:
+    """Options of frequency responses: spectra with a force among them, or responses over it."""
+    one, z = held.responses[0], held.levels
+    candidates = _of_channels(one.responses)
+    if any(each.kind == "force" and each.unit for each in candidates):
+        return _guessed(candidates)
     words = ["--force", one.references[0].name] if len(one.references) > 1 else []
-    return [*words, "--force-amplitude", amplitude, *_response_words(response)]
+    amplitude = "z" if z and np.isfinite(z[0]) and z[0] > 0 else "NEWTONS"
+    return [*words, "--force-amplitude", amplitude, *_response_words(candidates)]
 
 
-def _of_table(table: NumberTable) -> list[str]:
-    if is_own_table(table):
-        return []
-    force = _first(table, ("force", "drive"))
-    response = _first(table, (*_MOTIONS, "amplitude", "real"))
-    unit = table.units.get(response, unit_in_name(response))
-    role = role_of(response)
-    kind = role if role in _MOTIONS else "QUANTITY"
-    words = ["--force", force or "COLUMN"]
-    if force not in table.units:
-        words += ["--force-unit", unit_in_name(force)]
-    stated = response in table.units and kind == "QUANTITY"
-    words += ["--response", (response or "COLUMN") + ("" if stated else f":{kind}")]
-    words += [] if response in table.units else ["--unit", unit]
-    phase = _first(table, ("phase",))
-    if phase and role != "real":
-        words += ["--phase", phase]
-        if phase not in table.units and not phase.lower().endswith(("deg", "rad")):
-            words += ["--phase-unit", "deg"]
-    return words
+def _guessed(candidates: Sequence[_Candidate]) -> list[str]:
+    """Options for force and response, each the likeliest of the candidates."""
+    force = _likeliest(candidates, ("force", "voltage", "drive"))
+    words = ["--force", force.name if force else "CHANNEL"]
+    if force is None or not force.unit:
+        words += ["--force-unit", "UNIT"]
+    return words + _response_words([one for one in candidates if one is not force])
 
 
-def _response_words(one: Channel) -> list[str]:
-    if one.quantity in _MOTIONS:
-        return ["--response", f"{one.name}:{one.quantity}"]
-    role = role_of(one.name)
-    quantity = role if role in _MOTIONS else "QUANTITY"
-    return ["--response", f"{one.name}:{quantity}", "--unit", unit_in_name(one.name)]
+def _response_words(candidates: Sequence[_Candidate]) -> list[str]:
+    one = _likeliest(candidates, (*_MOTIONS, "amplitude", "real"))
+    one = one or (candidates[0] if len(candidates) == 1 else _Candidate("CHANNEL", "", ""))
+    if one.kind in _MOTIONS or not one.unit:
+        words = ["--response", f"{one.name}:{one.kind if one.kind in _MOTIONS else 'QUANTITY'}"]
+    else:
+        words = ["--response", one.name]
+    return words if one.unit else [*words, "--unit", "UNIT"]
 
 
-def unit_in_name(name: str) -> str:
-    """The unit with which a name ends, as in acc_g or velocity_mm_s; UNIT where there is none.
-
-    >>> unit_in_name("force_N"), unit_in_name("acc_m_s2"), unit_in_name("CH2")
-    ('N', 'm/s^2', 'UNIT')
-    """
-    for ending, unit in _UNITS_IN_NAMES.items():
-        if name.endswith(f"_{ending}"):
-            return unit
-    return "UNIT"
-
-
-def _guess(
-    channels: Sequence[Channel], quantities: Sequence[str], roles: Sequence[str]
-) -> Channel | None:
-    """The channel of one of these quantities or, by its name, of one of these roles."""
-    for quantity in quantities:
-        for one in channels:
-            if one.quantity == quantity:
-                return one
-    for role in roles:
-        for one in channels:
-            if one.quantity == "unknown" and role_of(one.name) == role:
-                return one
-    return None
+def _likeliest(candidates: Sequence[_Candidate], kinds: Sequence[str]) -> _Candidate | None:
+    """The first candidate of the earliest of these kinds, those that the file states first."""
+    known = sorted(candidates, key=lambda one: not one.unit)
+    return next((one for kind in kinds for one in known if one.kind == kind), None)

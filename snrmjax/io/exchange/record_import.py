@@ -4,13 +4,13 @@ import dataclasses
 
 import numpy as np
 
-from snrmjax.io.exchange.import_map import ImportMap, ResponseMap
-from snrmjax.io.exchange.import_units import Assumptions, force_meaning, motion_meaning
+from snrmjax.io.exchange.import_map import Assumption, Assumptions, ImportMap, ResponseMap
+from snrmjax.io.exchange.import_units import force_meaning, motion_meaning
 from snrmjax.measure.recordings.channels import Channel, channel_number
 from snrmjax.measure.recordings.step_counts import StepCounts
 from snrmjax.measure.recordings.stepped_sine import stepped_sine_states
 from snrmjax.measure.recordings.time_recording import TimeRecording
-from snrmjax.measure.recordings.velocity_states import Levels, counted_levels
+from snrmjax.measure.recordings.velocity_states import Levels
 from snrmjax.measure.states import UNNAMED_SENSOR, SteadyStates
 from snrmjax.measure.sweeps.slow_sweep import sweep_states
 
@@ -55,7 +55,7 @@ def told_record(
         channels[k] = old._replace(quantity=quantity, unit=unit, calibration=factor)  # type: ignore[arg-type]
         sensor = one.sensor or (UNNAMED_SENSOR[0] if len(told.responses) == 1 else one.channel)
         if not one.sensor:
-            assumed[f"response {number + 1}.sensor"] = "not stated; --sensor names it"
+            assumed[f"response {number + 1}.sensor"] = Assumption("not stated; --sensor names it")
         filled.append(ResponseMap(one.channel, quantity, one.unit, sensor))
     if told.drive:
         k = _number(record, told.drive, file, "--drive")
@@ -119,12 +119,9 @@ def import_record(
             failed.append(f"{kind}: {error}")
             continue
         if not told.record:
-            assumed["record"] = f"{kind}: recognised in the record"
+            assumed["record"] = Assumption("recognised in the record", kind)
         if not told.level:
-            found_by = [note for note in states.notes if note.startswith("levels")]
-            assumed["level"] = counted_levels(np.asarray(states.level), found_by[0])
-        if told.level != "auto":  # which is assumed or stated then
-            notes = tuple(one for one in notes if not one.startswith("levels"))
+            assumed["level"] = Assumption(f"{len(np.unique(states.level))} found")
         return states, told._replace(record=kind, level=told.level or level), notes, counts
     if told.record:
         raise ValueError(f"{file} does not read as {failed[0]}")

@@ -7,15 +7,15 @@ from jaxtyping import Complex, Float
 
 from snrmjax.io.exchange.import_errors import response_errors, with_errors_by_name
 from snrmjax.io.exchange.import_levels import MeasuredPart
-from snrmjax.io.exchange.import_map import ImportMap, ResponseMap
+from snrmjax.io.exchange.import_map import Assumption, Assumptions, ImportMap, ResponseMap
 from snrmjax.io.exchange.import_units import (
-    Assumptions,
     Force,
     amplitude_factor,
     force_meaning,
     frequency_in_rad,
     motion_meaning,
     phase_in_rad,
+    require_name,
 )
 from snrmjax.io.files import near_miss
 from snrmjax.io.laboratory.contents import NumberTable
@@ -59,7 +59,7 @@ def import_table(
             raise ValueError(
                 f"{force_name} of {file} has negative amplitudes: --force names another column."
             )
-        size = raw.astype(complex) * force.factor
+        size = _complex(raw, told, assumed) * force.factor
         if told.force_phase:
             angle = _phase(table, told.force_phase, told, file, assumed, "--force-phase")
             size = size * np.exp(1j * angle)
@@ -128,11 +128,11 @@ def _response(
     )
     assumed.unit(f"response {number}.unit", one.unit, table.units.get(one.channel, ""))
     if not one.quantity:
-        assumed[f"response {number}.quantity"] = f"the unit {unit} says so"
+        assumed[f"response {number}.quantity"] = Assumption(f"the unit {unit} says so")
     role = role_of(one.channel)
     imaginary, phase = one.imaginary, one.phase
     if np.iscomplexobj(values):
-        phasor = values.astype(complex)
+        phasor = _complex(values, told, assumed)
     else:
         if not imaginary and not phase:
             imaginary, phase = _partner(table, one.channel, role, told)
@@ -144,14 +144,16 @@ def _response(
                     f"{', '.join(table.columns)}."
                 )
             key = "imaginary" if imaginary else "phase"
-            assumed[f"response {number}.{key}"] = "by the names of the columns"
+            assumed[f"response {number}.{key}"] = Assumption("by the names of the columns")
         if imaginary:
             phasor = np.empty(len(values), dtype=complex)
             phasor.real, phasor.imag = values, _real(table, imaginary, file, "--imaginary")
             if told.phase_sign == "lag":
                 phasor = phasor.conj()
             elif not told.phase_sign:
-                assumed["phase_sign"] = "lead: a positive imaginary part is ahead of the force"
+                assumed["phase_sign"] = Assumption(
+                    "a positive imaginary part is ahead of the force", "lead"
+                )
         else:
             if np.nanmin(values, initial=0.0) < 0:
                 raise ValueError(
@@ -161,10 +163,18 @@ def _response(
             phasor = values * np.exp(1j * _phase(table, phase, told, file, assumed, "--phase"))
     sensor = one.sensor or (UNNAMED_SENSOR[0] if len(told.responses) == 1 else one.channel)
     if not one.sensor:
-        assumed[f"response {number}.sensor"] = "not stated; --sensor names it"
+        assumed[f"response {number}.sensor"] = Assumption("not stated; --sensor names it")
     turn = velocity_factors([Channel(one.channel, quantity)], [1], omega)[:, 0, 0]  # type: ignore[arg-type]
     filled = one._replace(quantity=quantity, sensor=sensor, phase=phase, imaginary=imaginary)
     return phasor * factor * turn, filled, factor * turn
+
+
+def _complex(values: np.ndarray, told: ImportMap, assumed: Assumptions) -> np.ndarray:
+    """Phasors as e^(+iwt), conjugated where the sign of their phases is said to be the other."""
+    if np.iscomplexobj(values) and not told.phase_sign:
+        assumed["phase_sign"] = Assumption("phasors are e^(+iwt)", "lead")
+    phasors = values.astype(complex)
+    return phasors.conj() if told.phase_sign == "lag" else phasors
 
 
 def _partner(table: NumberTable, channel: str, role: str, told: ImportMap) -> tuple[str, str]:
@@ -212,7 +222,7 @@ def _level(
         )
     columns = columns_by_role(table, "level")
     if len(columns) == 1 and np.isfinite(_real(table, columns[0], file, "--level")).all():
-        assumed["level"] = "the column's name says so"
+        assumed["level"] = Assumption("the column's name says so")
         return columns[0], _real(table, columns[0], file, "--level")
     return "", None
 
@@ -230,12 +240,7 @@ def _check(omega: Float[np.ndarray, " row"], force: Float[np.ndarray, " row"], f
 
 
 def _column(table: NumberTable, name: str, file: str, option: str) -> np.ndarray:
-    if name not in table.columns:
-        near = near_miss(name, table.columns)
-        raise ValueError(
-            f"{option} names {name!r}, but {file} has the columns {', '.join(table.columns)}"
-            f"{f' (did you mean {near}?)' if near else ''}."
-        )
+    require_name(option, name, table.columns, "columns", file)
     return np.asarray(table.columns[name])
 
 
@@ -259,7 +264,7 @@ def _only(
     if len(found) != 1:
         listed = ", ".join(found or table.columns)
         raise ValueError(f"which column of {file} is the {what}? {option} names it, of {listed}.")
-    assumed[what] = "the column's name says so"
+    assumed[what] = Assumption("the column's name says so")
     return found[0]
 
 

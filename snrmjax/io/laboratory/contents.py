@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Complex, Float, Num
+from jaxtyping import Num
 
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
 from snrmjax.measure.recordings.time_recording import TimeRecording
@@ -32,35 +32,6 @@ class NumberTable(NamedTuple):
         """Number of rows."""
         return len(next(iter(self.columns.values())))
 
-    def column(self, name: str) -> Num[np.ndarray, " row"]:
-        """A column by name. Raises `ValueError` that lists those there are."""
-        if name not in self.columns:
-            listed = ", ".join(self.columns)
-            raise ValueError(f"table {self.name} has no column {name!r}; it has {listed}.")
-        return self.columns[name]
-
-
-class MeasuredShapes(NamedTuple):
-    """Mode shapes of a linear test, by point and direction; see `measured_shapes`.
-
-    `modal_mass` says how the shapes are scaled (1 kg: mass-normalised); NaN where a number was not
-    stated.
-    """
-
-    frequency: Float[np.ndarray, " mode"]  # rad/s, undamped natural frequency
-    damping_ratio: Float[np.ndarray, " mode"]
-    shapes: Complex[np.ndarray, "mode place"]
-    points: tuple[str, ...]
-    directions: tuple[str, ...]  # "+x", "-z", "+ry"; "" where not stated
-    modal_mass: Float[np.ndarray, " mode"]  # kg
-    name: str = ""
-    notes: tuple[str, ...] = ()
-
-    @property
-    def is_real(self) -> bool:
-        """Whether no shape has an imaginary part."""
-        return not np.any(self.shapes.imag)
-
 
 class TextFormat(NamedTuple):
     """How a text is written; what is None is found out.
@@ -78,8 +49,7 @@ class LaboratoryFile(NamedTuple):
     """All that a file of a laboratory holds; see `read_laboratory_file`.
 
     `levels` has one number for each of `responses` (UFF: the value on the z axis), NaN where the
-    file states none. `nodes` are tables of the structure's points (number and m). `notes` say what
-    was not read, and what was taken for what.
+    file states none. `notes` say what was not read, and what was taken for what.
     """
 
     name: str
@@ -87,16 +57,13 @@ class LaboratoryFile(NamedTuple):
     recordings: tuple[TimeRecording, ...] = ()
     responses: tuple[FrequencyResponses, ...] = ()
     tables: tuple[NumberTable, ...] = ()
-    shapes: tuple[MeasuredShapes, ...] = ()
     notes: tuple[str, ...] = ()
     levels: tuple[float, ...] = ()
-    nodes: tuple[NumberTable, ...] = ()
 
     @property
     def is_empty(self) -> bool:
         """Whether nothing was found."""
-        measured = self.recordings or self.responses or self.tables or self.shapes
-        return not (measured or self.nodes)
+        return not (self.recordings or self.responses or self.tables)
 
 
 def number_table(
@@ -137,45 +104,3 @@ def number_table(
         if len(column) != n_rows or key in held:
             raise ValueError(f"column {key} of table {name} must have {n_rows} texts of its own.")
     return NumberTable(name, held, known, tuple(notes), texts)
-
-
-def measured_shapes(
-    frequency: Float[np.ndarray, " mode"],
-    damping_ratio: Float[np.ndarray, " mode"],
-    shapes: Complex[np.ndarray, "mode place"],
-    points: Sequence[str],
-    directions: Sequence[str] | None = None,
-    *,
-    modal_mass: Float[np.ndarray, " mode"] | None = None,
-    name: str = "",
-    notes: Sequence[str] = (),
-) -> MeasuredShapes:
-    """Mode shapes of a test, checked.
-
-    Arguments: `frequency` in rad/s; `damping_ratio` as a fraction of critical, NaN where unknown;
-    `shapes` real or complex, one row a mode; `points` and `directions` of its columns;
-    `modal_mass` in kg.
-    Raises `ValueError` for sizes that disagree, a place that stands twice, frequencies that are not
-    positive and finite, and shapes that are not finite.
-    """
-    omega = np.atleast_1d(np.asarray(frequency, dtype=float))
-    ratio = np.atleast_1d(np.asarray(damping_ratio, dtype=float))
-    every = np.asarray(shapes, dtype=complex)
-    places = tuple(points)
-    ways = ("",) * len(places) if directions is None else tuple(directions)
-    mass = np.full(omega.size, np.nan) if modal_mass is None else np.asarray(modal_mass, float)
-    if every.shape != (omega.size, len(places)) or not every.size:
-        raise ValueError(
-            f"`shapes` must have shape {(omega.size, len(places))} (modes, places) and not be "
-            f"empty, but have {every.shape}."
-        )
-    if ratio.shape != omega.shape or mass.shape != omega.shape or len(ways) != len(places):
-        raise ValueError(
-            "`damping_ratio` and `modal_mass` must have one number a mode, `directions` one word "
-            "a place."
-        )
-    if len(set(zip(places, ways, strict=True))) < len(places):
-        raise ValueError("each point and direction must stand once in `points`, `directions`.")
-    if not np.isfinite(omega).all() or np.any(omega <= 0) or not np.isfinite(every).all():
-        raise ValueError("frequencies must be positive and finite, shapes finite.")
-    return MeasuredShapes(omega, ratio, every, places, ways, mass, name, tuple(notes))

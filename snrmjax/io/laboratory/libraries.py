@@ -5,9 +5,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-MOST_HELD = 2**24
-"""Numbers of one file that are read into memory at once: 128 MiB of float64."""
-
 
 def library(module: str, purpose: str) -> Any:
     """A library of the extra `lab`, imported where it is first needed.
@@ -35,20 +32,3 @@ def damaged_if_it_fails(file: str, what: str) -> Iterator[None]:
         said = " ".join(str(error).split())
         why = f" ({said[:160]})" if said else f" ({type(error).__name__})"
         raise ValueError(f"{file} is damaged or is not {what}{why}.") from error
-
-
-class Budget:
-    """How many numbers of one file are still read into memory."""
-
-    def __init__(self, file: str, numbers: int = MOST_HELD) -> None:
-        self._file, self._left = file, numbers
-
-    def spend(self, numbers: int, what: str) -> None:
-        """Count numbers about to be read. Raises `ValueError` where that is too many."""
-        if numbers > self._left:
-            raise ValueError(
-                f"{what} of {self._file} has {numbers} numbers, more than a table of this size "
-                f"may hold ({MOST_HELD} in all): keep long records as time records with an even "
-                "time vector or a sampling rate."
-            )
-        self._left -= numbers

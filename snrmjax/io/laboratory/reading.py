@@ -5,15 +5,15 @@ import os
 from pathlib import Path
 
 from snrmjax.io.files import FilePath, file_name
-from snrmjax.io.laboratory.arrays.matlab4_files import begins_as_v4
+from snrmjax.io.laboratory.arrays.matlab_files import is_old_matlab
 from snrmjax.io.laboratory.contents import Kind, LaboratoryFile, TextFormat
 
 _ROOM = "snrmjax.io.laboratory"
 _READERS: dict[Kind, tuple[str, str]] = {
     "uff": ("uff.reading", "read_uff"),
     "matlab": ("arrays.matlab_files", "read_matlab"),
-    "hdf5": ("arrays.hdf5_files", "read_hdf5"),
-    "netcdf": ("arrays.hdf5_files", "read_netcdf"),
+    "hdf5": ("arrays.tree_contents", "read_hdf5"),
+    "netcdf": ("arrays.tree_contents", "read_netcdf"),
     "tdms": ("tdms_files", "read_tdms"),
     "csv": ("separated_text", "read_separated_text"),
 }
@@ -23,9 +23,9 @@ _HDF5 = b"\x89HDF\r\n\x1a\n"
 
 
 def read_laboratory_file(path: FilePath, text_format: TextFormat | None = None) -> LaboratoryFile:
-    """All recordings, frequency responses, tables and shapes of a file.
+    """All recordings, frequency responses and tables of a file.
 
-    Formats: UFF/UNV (58, 58b, 55, 15, 2411, 151, 164), MATLAB v4 to v7.3, HDF5, netCDF 4, TDMS, and
+    Formats: UFF/UNV (58, 58b), MATLAB v4 to v7.3, HDF5, netCDF 4, TDMS, and
     CSV or other separated text. Long records are not read before they are asked for (HDF5,
     netCDF, MATLAB v7.3, TDMS).
     Arguments: `text_format` says how a CSV is written where that is not found out by itself.
@@ -64,7 +64,7 @@ def _kind(path: FilePath) -> Kind:
         return "matlab" if matlab else "netcdf" if netcdf else "hdf5"
     if head.startswith(b"TDSm"):
         return "tdms"
-    if head.startswith(b"MATLAB 5") or begins_as_v4(head):
+    if is_old_matlab(head, Path(path).suffix):
         return "matlab"
     first = head.lstrip(b"\r\n").split(b"\n", 1)[0].rstrip()
     if first == b"    -1":

@@ -13,7 +13,6 @@ from snrmjax.io.files import shown
 from snrmjax.io.laboratory.arrays.structs import read_struct
 from snrmjax.io.laboratory.arrays.value_tree import Node, held
 from snrmjax.io.laboratory.contents import LaboratoryFile, TextFormat
-from snrmjax.io.laboratory.libraries import Budget
 from snrmjax.io.laboratory.physical_units import unit_meaning
 
 _LARGEST = 2**28  # bytes
@@ -64,11 +63,11 @@ def read_separated_text(path: Path, text_format: TextFormat | None = None) -> La
         tree[name] = held(column, {"unit": units[name]} if units.get(name) else {})
     marks = {mark: word for word, mark in _SEPARATORS.items()}
     notes.append(f"separator {marks[separator]}, decimal {decimal}, numbers from row {first + 1}.")
-    found = read_struct("", tree, Budget(file), entry=len(rows) == 1)
+    found = read_struct("", tree, entry=len(rows) == 1)
     stem = path.stem or "table"
     tables = tuple(table._replace(name=stem) for table in found.numbered())
     records = tuple(found.recordings)
-    return LaboratoryFile(file, "csv", records, (), tables, (), (*notes, *found.notes))
+    return LaboratoryFile(file, "csv", records, (), tables, (*notes, *found.notes))
 
 
 def _exact() -> dict[str, Any]:

@@ -1,9 +1,8 @@
 """TDMS files (LabVIEW, NI): groups of channels with properties, read piece by piece."""
 
-import logging
 import weakref
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -13,7 +12,7 @@ from jaxtyping import Num
 from snrmjax.io.laboratory.arrays.structs import read_struct
 from snrmjax.io.laboratory.arrays.value_tree import Node, Numbers, Selection, held
 from snrmjax.io.laboratory.contents import LaboratoryFile, NumberTable
-from snrmjax.io.laboratory.libraries import Budget, damaged_if_it_fails, library
+from snrmjax.io.laboratory.libraries import damaged_if_it_fails, library
 from snrmjax.io.laboratory.physical_units import channel_meaning
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.time_recording import (
@@ -24,36 +23,7 @@ from snrmjax.measure.recordings.time_recording import (
 
 _UNITS = ("unit_string", "NI_UnitDescription", "Unit", "unit", "Units")
 _MOST_CHANNELS = 4096
-_MOST_NOTES = 8  # of what the library warns of
 _ALIKE = 1e-12  # relative, of two steps in the properties of one device
-
-
-class _Said(logging.Handler):
-    """What the library warns of, once each."""
-
-    def __init__(self) -> None:
-        super().__init__(logging.WARNING)
-        self.notes: dict[str, None] = {}
-
-    def emit(self, record: logging.LogRecord) -> None:
-        """See `logging.Handler`."""
-        if len(self.notes) < _MOST_NOTES:
-            self.notes[" ".join(record.getMessage().split())[:200]] = None
-
-
-@contextmanager
-def _quietly(said: _Said) -> Iterator[None]:
-    """The library's warnings go to `said`, not to the terminal."""
-    names = [name for name in logging.root.manager.loggerDict if name.startswith("nptdms")]
-    loggers = [logging.getLogger(name) for name in names]
-    before = [(one.handlers[:], one.propagate) for one in loggers]
-    for one in loggers:
-        one.handlers[:], one.propagate = [said], False
-    try:
-        yield
-    finally:
-        for one, (handlers, propagate) in zip(loggers, before, strict=True):
-            one.handlers[:], one.propagate = handlers, propagate
 
 
 class TdmsSamples(AbstractSamples):
@@ -74,7 +44,7 @@ class TdmsSamples(AbstractSamples):
         """See `AbstractSamples.read`."""
         rows = []
         for k in channels:
-            with _quietly(_Said()), damaged_if_it_fails(self._name, "a TDMS file"):
+            with damaged_if_it_fails(self._name, "a TDMS file"):
                 rows.append(self._channels[k].read_data(start, max(0, stop - start)))
         if any(len(row) != stop - start for row in rows):
             raise ValueError(f"{self._name} is damaged: samples {start} to {stop} are not there.")
@@ -84,18 +54,10 @@ class TdmsSamples(AbstractSamples):
 def read_tdms(path: Path) -> LaboratoryFile:
     """A TDMS file. Raises `ValueError` as `read_laboratory_file` does."""
     library("nptdms", "reading TDMS")
-    said = _Said()
-    with _quietly(said):
-        found = _read(path)
-    return found._replace(notes=(*found.notes, *said.notes))
-
-
-def _read(path: Path) -> LaboratoryFile:
     size = path.stat().st_size
     recordings: list[TimeRecording] = []
     tables: list[NumberTable] = []
     notes: list[str] = []
-    budget = Budget(path.name)
     with damaged_if_it_fails(path.name, "a TDMS file"), open(path, "rb") as file:
         source = _contents(file)
         groups = [(group.name, list(group.channels())) for group in source.groups()]
@@ -133,12 +95,12 @@ def _read(path: Path) -> LaboratoryFile:
                 loose[one.name] = _numbers(path, name, one)
         for (step, start, length), alike in waves.items():
             recordings.append(_recording(path, name, alike, step, start, length))
-        found = read_struct(name, loose, budget)
+        found = read_struct(name, loose)
         recordings.extend(found.recordings)
         tables.extend(table._replace(name=name) for table in found.numbered())
         notes.extend(found.notes)
     return LaboratoryFile(
-        path.name, "tdms", tuple(recordings), (), tuple(tables), (), tuple(dict.fromkeys(notes))
+        path.name, "tdms", tuple(recordings), (), tuple(tables), tuple(dict.fromkeys(notes))
     )
 
 

@@ -1,11 +1,8 @@
 """How many steps of a stepped sine became steady states, and why the others did not."""
 
-import re
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple
-
-_WORDS = re.compile(r"(\d+) of (\d+) steps used(?:; left out: (\d+ [a-z ]+(?:, \d+ [a-z ]+)*))?")
 
 
 class StepCounts(NamedTuple):
@@ -21,7 +18,7 @@ class StepCounts(NamedTuple):
 
     @property
     def words(self) -> str:
-        """The counts as part of a sentence; `counts_in` reads them again.
+        """The counts as part of a sentence.
 
         >>> StepCounts(44, {"unsettled": 58, "too short": 2}).words
         '44 of 104 steps used; left out: 58 unsettled, 2 too short'
@@ -44,12 +41,3 @@ def joined_counts(counts: Iterable[StepCounts]) -> StepCounts:
     for one in every:
         left.update(one.left_out)
     return StepCounts(sum(one.used for one in every), dict(left))
-
-
-def counts_in(text: str) -> StepCounts | None:
-    """The counts that a text states in the words of `StepCounts`; None where it states none."""
-    found = _WORDS.search(text)
-    if found is None:
-        return None
-    parts = [one.partition(" ") for one in (found[3] or "").split(", ") if one]
-    return StepCounts(int(found[1]), {reason: int(count) for count, _, reason in parts})

@@ -128,7 +128,8 @@ def states_of_phasors(
     if noisy:
         floor = np.sqrt(np.mean((spread * np.abs(factors))[:, :, noisy] ** 2, axis=2))
     volts = chosen.force.quantity == "voltage"
-    number, note = number_levels(level, table.force, table.drive, table.frequency)
+    number, rule = number_levels(level, table.force, table.drive, table.frequency)
+    told = (*notes, *([f"levels {_LEVELS_BY[rule]}"] if rule else []))
     unknown = np.full(len(table.force), np.nan)
     states = steady_states(
         number,
@@ -145,7 +146,7 @@ def states_of_phasors(
         harmonic_std=floor,
         harmonic_order=higher,
     )
-    return dataclasses.replace(states, notes=tuple(one for one in (*notes, note) if one))
+    return dataclasses.replace(states, notes=told)
 
 
 def number_levels(
@@ -154,7 +155,7 @@ def number_levels(
     drive: Float[np.ndarray, " state"] | None,
     frequency: Float[np.ndarray, " state"],
 ) -> tuple[Int[np.ndarray, " state"], str]:
-    """The level of each state, from 1 on, and a note on how they were numbered.
+    """The level of each state, from 1 on, and the word by which they were numbered, if any.
 
     A number is the level of all; *force* and *drive* group the states by that amplitude, from the
     smallest on; *runs* begins a new level where the frequency turns back to where a run began;
@@ -170,21 +171,28 @@ def number_levels(
     if level == "drive" and drive is None:
         raise ValueError("`level='drive'` needs the channel of the drive: state `drive`.")
     if level == "drive" or (level == "auto" and drive is not None):
-        return _groups(drive)[0], "levels by amplitude of the drive"
+        return _groups(drive)[0], "drive"
     groups, spread = _groups(force)
     if level == "force" or (level == "auto" and spread < _SPREAD):
-        return groups, "levels by amplitude of the force"
-    return _runs(frequency), "levels by runs of frequency: the force of a run is not constant"
+        return groups, "force"
+    return _runs(frequency), "runs"
 
 
-def counted_levels(number: Int[np.ndarray, " state"], note: str) -> str:
-    """How many levels were found by the rule of a note of `number_levels`.
+_LEVELS_BY = {
+    "drive": "by amplitude of the drive",
+    "force": "by amplitude of the force",
+    "runs": "by runs of frequency: the force of a run is not constant",
+}
 
-    >>> counted_levels(np.array([1, 1]), "levels by amplitude of the force")
+
+def counted_levels(number: Int[np.ndarray, " state"], rule: str) -> str:
+    """How many levels were found by a rule of `number_levels`.
+
+    >>> counted_levels(np.array([1, 1]), "force")
     '1 level by amplitude of the force'
     """
     n = len(np.unique(np.asarray(number)))
-    return f"{n} {note.replace('levels', 'level', 1) if n == 1 else note}"
+    return f"{n} level{'s' if n > 1 else ''} {_LEVELS_BY[rule]}"
 
 
 def _number(recording: TimeRecording, name: str, what: str) -> int:

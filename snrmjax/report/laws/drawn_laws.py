@@ -11,11 +11,11 @@ from snrmjax.model.effect_metadata import Argument
 from snrmjax.report.html import ReportTable, number, with_error
 from snrmjax.report.style import (
     COLUMN,
-    FILL,
     IDENTIFIED,
     LINE,
     PAGE,
     Style,
+    banded,
     legend,
     name_axes,
     panels,
@@ -52,8 +52,7 @@ def _draw(axes: Axes, law: DrawnLaw) -> None:
     at, force = law.at / x.size, law.force / y.size
     error = SURE * law.force_std / y.size
     inside = np.abs(law.at) <= 1.0001 * law.largest
-    axes.fill_between(at, force - error, force + error, color=IDENTIFIED, **FILL, label="95 % band")
-    axes.plot(at, force, color=IDENTIFIED, linewidth=LINE, linestyle="--")
+    banded(axes, at, force, error, IDENTIFIED, linestyle="--", zorder=2)
     own: Style = {"color": IDENTIFIED, "linewidth": LINE, "label": "drawn law"}
     axes.plot(at[inside], force[inside], marker="x", markersize=3.0, **own)
     axes.axhline(0.0, color="0.6", linewidth=0.6, zorder=1)

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -10,18 +9,15 @@ from matplotlib.figure import Figure
 from snrmjax.io.files import write_atomically, write_summary
 from snrmjax.io.tables import write_table
 from snrmjax.io.units import HERTZ
-from snrmjax.measure.recordings.time_recording import TimeRecording
-from snrmjax.measure.states import SteadyStates
-from snrmjax.methods.comparison import METHODS, Comparison, compare_methods
+from snrmjax.methods.comparison import METHODS, Comparison
 from snrmjax.methods.record_comparison import RECORD_METHODS
 from snrmjax.methods.result import METHOD_MESSAGE, MethodResult, MethodStatus
-from snrmjax.model.structures import Structure, modes_of
 from snrmjax.report.html import Report, ReportFigure, ReportTable, Section, number, write_report
 from snrmjax.report.style import (
     COLUMN,
-    LINE,
     SERIES,
     Style,
+    banded,
     fit_axis,
     legend,
     name_axes,
@@ -58,25 +54,9 @@ _CAPTION = (
 )
 
 
-class MethodComparison(NamedTuple):
-    """What the methods found, and of which structure."""
-
-    structure: Structure
-    comparison: Comparison
-
-
-def run_methods(
-    data: SteadyStates | Sequence[SteadyStates | TimeRecording],
-    structure: Structure,
-    methods: tuple[str, ...] | None = None,
-) -> MethodComparison:
-    """Run the methods. Raises `ValueError` as `compare_methods` does."""
-    return MethodComparison(structure, compare_methods(data, modes_of(structure), methods))
-
-
-def write_comparison(folder: Path, found: MethodComparison, name: str) -> None:
-    """Write compare.csv, summary.json, compare.png and report.html."""
-    results = found.comparison.results
+def write_comparison(folder: Path, found: Comparison, name: str, model: str) -> None:
+    """Write compare.csv, summary.json, compare.png and report.html; both are names."""
+    results = found.results
     columns: dict[str, list] = {
         "method": [one.method for one in results for _ in one.status],
     }
@@ -92,7 +72,7 @@ def write_comparison(folder: Path, found: MethodComparison, name: str) -> None:
         folder / "report.html",
         Report(
             title=f"Methods compared: {name}",
-            done=_done(found),
+            done=[("model", model), *_done(found)],
             result=comparison_sentence(found),
             notes=_notes(found),
             sections=[Section(heading, (), [ReportFigure(drawn, _CAPTION)], [_table(found)])],
@@ -100,10 +80,10 @@ def write_comparison(folder: Path, found: MethodComparison, name: str) -> None:
     )
 
 
-def _done(found: MethodComparison) -> list[tuple[str, str]]:
+def _done(found: Comparison) -> list[tuple[str, str]]:
     """What was given, in the line under the title."""
-    rows = [("model", found.structure.name)]
-    data, records = found.comparison.data, found.comparison.records
+    rows = []
+    data, records = found.data, found.records
     if data is not None:
         rows.append(("steady states", str(data.n_states)))
         rows.append(("levels", str(len(np.unique(np.asarray(data.level))))))
@@ -132,15 +112,13 @@ def methods_figure(results: tuple[MethodResult, ...]) -> Figure:
             colour, label = SERIES[k % len(SERIES)], _NAMES.get(one.method, one.method)
             kept.append(y)
             if one.method in _LINES:
-                style: Style = {"linestyle": _LINES[one.method], "linewidth": LINE}
+                style: Style = {"linestyle": _LINES[one.method], "zorder": 2}
                 band = 1.96 * np.nan_to_num(spread)
                 level = np.asarray(one.level)[at]
                 for count, run in enumerate(np.unique(level)):  # a curve for each record
                     own = level == run
                     name = label if count == 0 else None
-                    axes.plot(x[own], y[own], color=colour, label=name, **style)
-                    low, high = (y - band)[own], (y + band)[own]
-                    axes.fill_between(x[own], low, high, color=colour, alpha=0.15, linewidth=0)
+                    banded(axes, x[own], y[own], band[own], colour, name, band=None, **style)
             else:
                 size = 4.0 if len(x) <= _FEW else 2.0
                 style = {"markersize": size, "linestyle": "none", "zorder": 3 - 0.01 * len(x)}
@@ -153,9 +131,9 @@ def methods_figure(results: tuple[MethodResult, ...]) -> Figure:
     return figure
 
 
-def comparison_sentence(found: MethodComparison) -> str:
+def comparison_sentence(found: Comparison) -> str:
     """The result in a plain sentence."""
-    results, stopped = found.comparison.results, found.comparison.stopped
+    results, stopped = found.results, found.stopped
     text = f"{len(results)} of {len(results) + len(stopped)} methods ran"
     own = _reference(found)
     near = [one for one in _distances(found) if own is not None and one[0] != own.method]
@@ -171,14 +149,14 @@ def comparison_sentence(found: MethodComparison) -> str:
     )
 
 
-def _reference(found: MethodComparison) -> MethodResult | None:
+def _reference(found: Comparison) -> MethodResult | None:
     """The result from which distances are taken: the inverse SNRM, else the first with points."""
-    results = [one for one in found.comparison.results if one.found.any()]
+    results = [one for one in found.results if one.found.any()]
     own = [one for one in results if one.method == "snrm"]
     return next(iter([*own, *results]), None)
 
 
-def _distances(found: MethodComparison) -> list[tuple[str, float, float, int]]:
+def _distances(found: Comparison) -> list[tuple[str, float, float, int]]:
     """Of each method: median distances from the reference in Hz and relative damping, points.
 
     At amplitudes that the reference covers; empty where nothing was found.
@@ -189,7 +167,7 @@ def _distances(found: MethodComparison) -> list[tuple[str, float, float, int]]:
     has = own.found
     at = np.asarray(own.velocity)[has]
     rows = []
-    for one in found.comparison.results:
+    for one in found.results:
         velocity = np.asarray(one.velocity)
         kept = one.found & (velocity >= at.min()) & (velocity <= at.max())
         if not kept.any():
@@ -205,11 +183,11 @@ def _distances(found: MethodComparison) -> list[tuple[str, float, float, int]]:
     return rows
 
 
-def _notes(found: MethodComparison) -> list[str]:
-    results, stopped = found.comparison.results, found.comparison.stopped
+def _notes(found: Comparison) -> list[str]:
+    results, stopped = found.results, found.stopped
     own = [f"{_NAMES.get(one.method, one.method)}: {note}" for one in results for note in one.notes]
     why_not = [f"did not run: {why}" for why in stopped.values()]
-    return [*found.comparison.records, *why_not, *notes_on_bands(results), *own]
+    return [*found.records, *why_not, *notes_on_bands(results), *own]
 
 
 def notes_on_bands(results: Sequence[MethodResult]) -> list[str]:
@@ -237,13 +215,13 @@ def notes_on_bands(results: Sequence[MethodResult]) -> list[str]:
     return notes
 
 
-def _summary(found: MethodComparison) -> dict:
-    results, stopped = found.comparison.results, found.comparison.stopped
+def _summary(found: Comparison) -> dict:
+    results, stopped = found.results, found.stopped
     reference = _reference(found)
     own = reference is not None and reference.method == "snrm"
     near = {name: (hertz, ratio) for name, hertz, ratio, _ in _distances(found) if own}
     return {
-        "records": list(found.comparison.records),
+        "records": list(found.records),
         "bands": notes_on_bands(results),
         "methods": {
             one.method: {
@@ -261,16 +239,14 @@ def _summary(found: MethodComparison) -> dict:
     }
 
 
-def _table(found: MethodComparison) -> ReportTable:
+def _table(found: Comparison) -> ReportTable:
     near = {name: (hertz, ratio) for name, hertz, ratio, _ in _distances(found)}
     rows = []
     for name in _EVERY:
-        one = next((r for r in found.comparison.results if r.method == name), None)
+        one = next((r for r in found.results if r.method == name), None)
         if one is None:
-            if name in found.comparison.stopped:
-                rows.append(
-                    (_NAMES[name], "did not run", "", "", "", found.comparison.stopped[name])
-                )
+            if name in found.stopped:
+                rows.append((_NAMES[name], "did not run", "", "", "", found.stopped[name]))
             continue
         away = near.get(name)
         gap = ("", "") if away is None else (number(away[0], 2), f"{number(100 * away[1], 2)} %")

@@ -66,11 +66,7 @@ def predictions_of_points(
     found: Identification, model: Structure, loads: Loads
 ) -> tuple[Prediction, ...]:
     """What curves through points predict."""
-    backbone, ratio, self_excited = (
-        found.backbone,
-        loads.largest_amplitude_ratio,
-        loads.self_excited,
-    )
+    backbone, ratio = found.backbone, loads.largest_amplitude_ratio
     return tuple(
         Prediction(
             force,
@@ -81,7 +77,7 @@ def predictions_of_points(
                 force,
                 largest_amplitude_ratio=ratio,
                 of=new_level(found.fit, force, day=loads.day),
-                self_excited=self_excited,
+                self_excited=loads.self_excited,
             ),
         )
         for force in dict.fromkeys(loads.forces)
@@ -101,10 +97,8 @@ def predictions_of_fit(
     found: list[Prediction] = []
     notes: list[str] = []
     for force, record, as_recorded in asked:
-        new, ratio = (
-            new_level(fit, force, as_recorded=as_recorded, day=loads.day),
-            loads.largest_amplitude_ratio,
-        )
+        new = new_level(fit, force, as_recorded=as_recorded, day=loads.day)
+        ratio = loads.largest_amplitude_ratio
         banded = fitted_response(fit, force, largest_amplitude_ratio=ratio, of=new)
         further = predicted_resonance(
             fit, force, largest_amplitude_ratio=ratio, of=new, self_excited=loads.self_excited

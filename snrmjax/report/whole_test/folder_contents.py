@@ -2,15 +2,20 @@
 
 import dataclasses
 import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from snrmjax.io.exchange.import_map import ImportMap, read_import_map
-from snrmjax.io.exchange.import_units import Assumptions
+from snrmjax.io.exchange.import_map import (
+    Assumptions,
+    ImportMap,
+    read_import_map,
+    steps_of_map,
+)
 from snrmjax.io.exchange.importing import Imported, import_files
+from snrmjax.io.exchange.own_tables import is_own_file
 from snrmjax.io.exchange.record_import import told_record
 from snrmjax.io.files import read_text
 from snrmjax.io.laboratory.contents import LaboratoryFile
@@ -18,6 +23,7 @@ from snrmjax.io.laboratory.reading import read_laboratory_file
 from snrmjax.io.models import read_model
 from snrmjax.io.tables import read_steady_states
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
+from snrmjax.measure.recordings.step_counts import StepCounts
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.states import UNNAMED_SENSOR, SteadyStates
 from snrmjax.model.structures import Structure
@@ -26,10 +32,9 @@ _MEASURED = (
     *(".csv", ".uff", ".unv", ".unv58", ".mat", ".h5", ".hdf5", ".nc", ".nc4", ".cdf"),
     *(".tdms", ".tsv", ".dat", ".asc"),
 )
-_MAP = "map.toml"
+MAP = "map.toml"
 _WRITTEN = (".txt", ".md", ".log")
 _SHOWN = 60  # lines of a text
-_OWN_COLUMNS = ({"frequency_hz", "velocity_re_m_s"}, {"frequency_hz", "velocity_m_s", "level"})
 
 
 class NamedStates(NamedTuple):
@@ -85,7 +90,8 @@ class TestFiles(NamedTuple):
     records: tuple[NamedRecord, ...]
     passed: tuple[tuple[str, str], ...]  # file and why nothing was measured in it
     notes: tuple[str, ...]  # what was assumed of a file
-    texts: tuple[tuple[str, tuple[str, ...]], ...] = ()  # file and lines of what people wrote
+    texts: tuple[tuple[str, tuple[str, ...]], ...] = ()  # lines that people wrote, and the map's
+    steps_at_import: StepCounts | None = None
 
     def rows(self) -> Iterator[tuple[str, str]]:
         """Each file, and what was found in it."""
@@ -118,7 +124,8 @@ def read_test_files(folder: Path, model: Path | None = None) -> TestFiles:
         raise ValueError(f"{folder} must be a folder with the files of a test.")
     files = sorted(one for one in folder.iterdir() if one.is_file() and one.name[0] != ".")
     models = [] if model is None else [model]
-    told, map_name = _map_in(files)
+    maps = [one for one in files if one.name == MAP]
+    told = read_import_map(maps[0]) if maps else ImportMap()
     notes: list[str] = []
     states: list[NamedStates] = []
     responses: list[NamedResponses] = []
@@ -127,9 +134,9 @@ def read_test_files(folder: Path, model: Path | None = None) -> TestFiles:
     texts: list[tuple[str, tuple[str, ...]]] = []
     for path in files:
         suffix = path.suffix.lower()
-        if suffix == ".toml" and path.name == map_name:
+        if path in maps:
             passed.append((path.name, "how files are imported"))
-            texts.append((path.name, _said_of_map(path)))
+            texts.append((path.name, _lines(path)))
         elif suffix == ".toml":
             if not _is_model(path):
                 passed.append((path.name, "not used: it has no [[mode]]"))
@@ -142,7 +149,7 @@ def read_test_files(folder: Path, model: Path | None = None) -> TestFiles:
             texts.append((path.name, _lines(path)))
         elif suffix not in _MEASURED:
             passed.append((path.name, "not used: no file of measurements, by its ending"))
-        elif suffix == ".csv" and _is_own(path):
+        elif suffix == ".csv" and is_own_file(path):
             states.append(NamedStates(path.name, read_steady_states(path), path))
         else:
             held = read_laboratory_file(path, told.text_format)
@@ -176,6 +183,7 @@ def read_test_files(folder: Path, model: Path | None = None) -> TestFiles:
         models[0].name if models else "",
         *(tuple(states), tuple(responses), tuple(records), tuple(passed), tuple(notes)),
         tuple((name, lines) for name, lines in texts if lines),
+        steps_of_map(maps[0]) if maps else None,
     )
 
 
@@ -192,16 +200,6 @@ def _lines(path: Path) -> tuple[str, ...]:
     return (*lines[:_SHOWN], *([f"… {further} further lines"] if further > 0 else []))
 
 
-def _said_of_map(path: Path) -> tuple[str, ...]:
-    """What a map says was assumed or noted when it was written: its keys with these comments."""
-    found = []
-    for line in read_text(path).splitlines():
-        key, _, comment = line.partition("#")
-        if comment.strip().startswith(("assumed:", "note:")):
-            found.append(" – ".join(filter(None, (key.strip(), comment.strip()))))
-    return tuple(found)
-
-
 def _is_model(path: Path) -> bool:
     """Whether a TOML file has modes; one that cannot be read goes on to the reader of models."""
     try:
@@ -210,23 +208,12 @@ def _is_model(path: Path) -> bool:
         return True
 
 
-def _is_own(path: Path) -> bool:
-    header = {word.strip().strip("\ufeff") for word in read_text(path).split("\n", 1)[0].split(",")}
-    return any(columns <= header for columns in _OWN_COLUMNS)
-
-
-def _map_in(files: Sequence[Path]) -> tuple[ImportMap, str]:
-    """The map of an import among the files, and its name; an empty one where there is none."""
-    maps = [one for one in files if one.name == _MAP]
-    return (read_import_map(maps[0]), _MAP) if maps else (ImportMap(), "")
-
-
 def _imported(path: Path, told: ImportMap) -> Imported:
     try:
         return import_files([path], told)
     except ValueError as error:
         raise ValueError(
-            f"{error} `snrmjax import {path}` says how; put the {_MAP} that the import writes "
+            f"{error} `snrmjax import {path}` says how; put the {MAP} that the import writes "
             "beside the file."
         ) from error
 
@@ -238,6 +225,6 @@ def _linear(held: LaboratoryFile, path: Path) -> tuple[FrequencyResponses, ...]:
         raise ValueError(
             f"are the responses of {held.name}, of {len(levels)} levels, steady states of a "
             f"stepped sine? Say so by `snrmjax import {path} --force-amplitude z --out DIR`, "
-            f"and put its {_MAP} beside the file; for linear modes keep the lowest level alone."
+            f"and put its {MAP} beside the file; for linear modes keep the lowest level alone."
         )
     return held.responses

@@ -22,7 +22,7 @@ from snrmjax.io.laboratory.checkups import write_checkup
 from snrmjax.io.models import read_model
 from snrmjax.io.tables import write_steady_states
 from snrmjax.io.units import HERTZ
-from snrmjax.measure.recordings.step_counts import StepCounts
+from snrmjax.measure.recordings.step_counts import StepCounts, joined_counts
 from snrmjax.measure.recordings.stepped_sine import SteppedSineStates, stepped_sine_states
 from snrmjax.measure.states import (
     UNNAMED_SENSOR,
@@ -44,20 +44,10 @@ from snrmjax.report.interactive.folded_records import folded_records
 from snrmjax.report.interactive.state_explorer import FoldedRecord, state_explorer
 from snrmjax.report.modal.modal_report import modal_report, modes_sentence, write_modal_tables
 from snrmjax.report.whole_test.folder_contents import NamedRecord, TestFiles
-from snrmjax.report.whole_test.mends import (
-    FilesOfTest,
-    command_to_go_on,
-    file_of_each_level,
-    is_certain,
-    with_channels,
-    with_commands,
-)
+from snrmjax.report.whole_test.mends import FilesRead, is_certain, with_imports
 from snrmjax.report.whole_test.undiagnosed import not_diagnosed
-from snrmjax.report.whole_test.used_steps import used_steps, with_steps
 from snrmjax.report.workflow import (
-    CurveSettings,
     Findings,
-    JointFitSettings,
     Loads,
     headline,
     identify_by_points,
@@ -68,6 +58,7 @@ from snrmjax.report.workflow import (
 _FEWEST_ALIKE = 3  # states of two files
 _ALIKE = 1e-5  # relative difference of frequency and velocity, below what repeated tests reach
 _TINY = 1e-300
+_MOTIONS = ("velocity", "acceleration", "displacement")
 
 
 class TestRequest(NamedTuple):
@@ -76,18 +67,7 @@ class TestRequest(NamedTuple):
     drive_point: str | None = None
     go_on: bool = False  # in spite of errors that the check finds
     diagnose: bool = True
-    place: FilesOfTest | None = None  # of the files, by which commands that mend are written
-
-
-class WholeTest(NamedTuple):
-    """What a test gave, stage by stage."""
-
-    model: Structure
-    checkup: Checkup
-    findings: Findings
-    diagnosis: Diagnosis | None
-    notes: tuple[str, ...]
-    lines: tuple[str, ...]  # the results in plain sentences
+    read: FilesRead | None = None  # of which imports that mend are written
 
 
 class _Modes(NamedTuple):
@@ -111,13 +91,14 @@ def run_whole_test(
     name: str,
     request: TestRequest,
     progress: Callable[[str], None] = lambda _: None,
-) -> WholeTest:
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Check, find linear modes, identify and diagnose a test, and write all of it into a folder.
 
     Writes model.toml and modes.csv where the linear modes were found here, measured.csv (all
     steady states), check.json, report.html, and what `identify` and `diagnose` write into folders
     of these names.
     Arguments: `progress` is told each stage when it ends, with its seconds.
+    Returns notes, and the results in plain sentences.
     Raises `ValueError`, as a question, where it would have to guess: which sensor is at the force,
     or whether to go on in spite of what the check found; and as its stages do.
     """
@@ -139,10 +120,7 @@ def run_whole_test(
     data = join_steady_states(parts)
     stage.ends(f"{data.n_states} steady states")
     checkup = check_test(parts, modes.model, [one.record for one in files.records])
-    if request.place is not None:
-        place = with_channels(request.place, files, sorted_records, modes.model)
-        place = place._replace(of_levels=file_of_each_level(names, parts))
-        checkup = with_commands(checkup, place)
+    checkup = with_imports(checkup, request.read)
     _stop_at_errors(checkup, request)
     write_steady_states(folder / "measured.csv", data)
     write_checkup(folder / "check.json", checkup)
@@ -160,7 +138,7 @@ def run_whole_test(
     live = state_explorer(data, findings.identification, folded if steps else ())
     stage.ends("backbone and damping")
     diagnosis, diagnosed = None, None
-    skipped = not_diagnosed(data, modes.model, request.place) if request.diagnose else ()
+    skipped = not_diagnosed(data, modes.model) if request.diagnose else ()
     if request.diagnose and not skipped:
         (folder / "diagnose").mkdir()
         diagnosis, diagnosed = write_diagnosis(
@@ -173,10 +151,9 @@ def run_whole_test(
         (named.file, f"{one.kind.value}: {one.why}")
         for named, one in zip(files.records, sorted_records, strict=True)
     ]
-    counts = used_steps(files, [one.counts for one in steps])
-    found = found._replace(
-        summary=with_steps(found.summary, counts, findings.identification.points)
-    )
+    counts = _used_steps(files, [one.counts for one in steps])
+    if counts is not None and counts.reasons:
+        found = found._replace(summary=[*found.summary, ("steps of the records", counts.words)])
     lines = (
         modes.sentence,
         *(() if counts is None else (f"steady states: {counts.words}",)),
@@ -197,7 +174,7 @@ def run_whole_test(
         + (" The diagnosis was left out: the first note says why." if skipped else ""),
     )
     stage.ends("report")
-    return WholeTest(modes.model, checkup, findings, diagnosis, notes, lines)
+    return notes, lines
 
 
 class _Stages:
@@ -285,11 +262,12 @@ def _sorted(named: NamedRecord, model: Structure) -> RecordedTest:
     try:
         return recorded_test(named.record, model.modes)
     except ValueError as error:
+        moves = any(one.quantity in _MOTIONS for one in named.record.channels)
         mend = (
-            f" `snrmjax import {named.file}` says what the file holds and how to "
-            "import it; put the map.toml that the import writes into the folder."
-            if "has no channel of motion" in str(error)
-            else ""
+            ""
+            if moves
+            else f" `snrmjax import {named.file}` says what the file holds and how to import it; "
+            "put the map.toml that the import writes into the folder."
         )
         raise ValueError(f"{named.file}: {str(error).lstrip(' :')}{mend}") from error
 
@@ -335,14 +313,20 @@ def _steps(named: NamedRecord, test: RecordedTest) -> _Steps:
     return _Steps(found.states, folded, found.counts, f"{named.file}: {found.counts.words}")
 
 
+def _used_steps(files: TestFiles, steps: Sequence[StepCounts]) -> StepCounts | None:
+    """The counts of the records, or those of the import of all tables; None where not all are."""
+    if steps:
+        return None if files.states else joined_counts(steps)
+    imported = files.steps_at_import
+    used = sum(one.states.n_states for one in files.states)
+    return imported if imported is not None and imported.used == used else None
+
+
 def _stop_at_errors(checkup: Checkup, request: TestRequest) -> None:
     errors = [one for one in checkup.findings if one.severity == "error"]
     if not errors or request.go_on:
         return
     first, *others = errors
-    place, go_on = request.place, "--go-on"
-    if place is not None:
-        go_on = command_to_go_on(place, diagnose=request.diagnose)
     both = [is_certain(first) and is_certain(one) for one in others]
     more = "".join(
         f" {'Besides,' if beside else 'Or'} {one.evidence} {one.mend}"
@@ -350,7 +334,7 @@ def _stop_at_errors(checkup: Checkup, request: TestRequest) -> None:
     )
     raise ValueError(
         f"is this meant? {first.name} in {first.where}: {first.evidence} To mend "
-        f"it: {first.mend}{more} To go on nevertheless: `{go_on}`."
+        f"it: {first.mend}{more} To go on nevertheless: `--go-on`."
     )
 
 
@@ -367,12 +351,12 @@ def _identified(data: SteadyStates, model: Structure) -> tuple[Findings, tuple[s
     drive_only = not np.isfinite(np.asarray(data.force)).any()
     free = ("instrument_phase",) if drive_only else ()
     try:
-        return identify_jointly(data, model, JointFitSettings(free=free), Loads()), ()
+        return identify_jointly(data, model, Loads(), free=free), ()
     except ValueError as error:
         if drive_only:
             raise
         reason = f"curves go through single points, as a joint fit was not possible: {error}"
-        return identify_by_points(data, model, CurveSettings(), Loads()), (reason,)
+        return identify_by_points(data, model, Loads()), (reason,)
 
 
 def _write_whole_report(
@@ -399,7 +383,7 @@ def _write_whole_report(
             tables=[
                 ReportTable(("file", "what was found in it"), list(files.rows())),
                 *(
-                    ReportTable((file,), [(line,) for line in lines], _caption(file))
+                    ReportTable((file,), [(line,) for line in lines], f"{file}, as it lies here.")
                     for file, lines in files.texts
                 ),
             ],
@@ -430,12 +414,6 @@ def _write_whole_report(
             sections=sections,
         ),
     )
-
-
-def _caption(file: str) -> str:
-    if file.endswith(".toml"):
-        return f"What {file} says was assumed or noted when the files were first imported."
-    return f"{file}, as it lies in the folder: read by nobody but you."
 
 
 def _check_section(checkup: Checkup) -> Section:

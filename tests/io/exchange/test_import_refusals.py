@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import scipy.io
 from truths.import_runs import run_import as run
+from truths.uff_writing import write_uff
 
-from snrmjax.io.laboratory.uff.writing import write_uff
 from snrmjax.measure import Channel
 from snrmjax.measure.recordings.frequency_responses import frequency_responses
 

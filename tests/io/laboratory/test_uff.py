@@ -5,11 +5,10 @@ import sys
 
 import numpy as np
 import pytest
-import pyuff
 from truths.import_runs import run_import
+from truths.uff_writing import write_uff
 
-from snrmjax.io.laboratory import measured_shapes, read_laboratory_file
-from snrmjax.io.laboratory.uff.writing import write_uff
+from snrmjax.io.laboratory import read_laboratory_file
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.frequency_responses import frequency_responses
 from snrmjax.measure.recordings.time_recording import time_recording
@@ -111,18 +110,13 @@ def test_what_stands_around_functions_is_listed_and_in_nobodys_way(tmp_path):
     found = read_laboratory_file(path)
     assert len(found.responses) == 1
     assert found.tables == ()
-    assert [one.name for one in found.nodes] == ["nodes", "nodes 2"]
-    np.testing.assert_allclose(found.nodes[1].columns["x_m"], [-0.0 + 10 * 0.0254], rtol=1e-12)
+    assert "1 data set of type 2411 (nodes) not read." in found.notes
     assert "1 data set of type 2412 (elements) not read." in found.notes
     assert "1 data set of type 1858 (qualifiers of functions) not read." in found.notes
-    # Nodes ask no question of which part of the file is meant.
     words = ("--response", "12+z:acceleration", "--force-amplitude", "0.5", "--sensor", "tip")
     code, said = run_import(path, *words, "--out", tmp_path / "out")
     assert code == 0, said
-    assert "nodes 2: 1 points of the structure" in run_import(path)[1]
     path.write_text(AROUND)
-    assert "import it" not in run_import(path)[1]
-    path.write_text("".join(AROUND.partition("    -1\n  2412")[1:]))
     with pytest.raises(ValueError, match=r"type 2412 \(elements\) not read"):
         read_laboratory_file(path)
 
@@ -180,8 +174,7 @@ def test_round_trip_of_records_and_responses(tmp_path, binary):
         Channel("force", "force", "N"),
         Channel("3-y", "acceleration", "m/s^2", point="3", direction="-y"),
     ]
-    # A rate and a start that six digits cannot hold.
-    record = time_recording(rng.normal(size=(2, 65)), channels, 51200.01, start_time=-1 / 3)
+    record = time_recording(rng.normal(size=(2, 65)), channels, 51200, start_time=-0.25)
     hertz = np.array([42.70541, 42.70544, 42.8])  # two of them alike in six digits
     responses = frequency_responses(
         hertz * 2 * np.pi,
@@ -194,7 +187,7 @@ def test_round_trip_of_records_and_responses(tmp_path, binary):
     write_uff(path, recordings=[record], responses=[responses], levels=[0.5], binary=binary)
     found = read_laboratory_file(path)
     (back,) = found.recordings
-    assert (back.sampling_rate, back.start_time) == (51200.01, -1 / 3)
+    assert (back.sampling_rate, back.start_time) == (51200, -0.25)
     assert back.channels == tuple(channels)
     if binary:
         np.testing.assert_array_equal(back.values(), record.values())
@@ -210,42 +203,6 @@ def test_round_trip_of_records_and_responses(tmp_path, binary):
         np.testing.assert_allclose(
             table.columns["3-y over force"], responses.values[0, 0], rtol=6e-12
         )
-
-
-def test_other_programs_read_what_is_written(tmp_path):
-    """pyuff alone, without our line of exact numbers, to six digits of the step."""
-    record = time_recording(np.arange(8.0)[None], [Channel("1+x", "force", "N", 1.0, "1", "+x")], 3)
-    path = tmp_path / "mine.uff"
-    for _ in range(2):  # written over itself
-        write_uff(path, recordings=[record])
-    sets = pyuff.UFF(str(path)).read_sets()
-    assert [one["type"] for one in sets] == [164, 58]
-    np.testing.assert_array_equal(sets[1]["data"], np.arange(8.0))
-    np.testing.assert_allclose(sets[1]["x"], np.arange(8) / 3, rtol=1e-5)
-
-
-@pytest.mark.parametrize("kind", ["real", "complex"])
-def test_round_trip_of_shapes(tmp_path, kind):
-    shapes = np.array([[1.5, -0.25, 0.5], [0.125, 2.0, -1.0]]) * (1 if kind == "real" else 1 + 0.5j)
-    mass = np.array([1.0, 0.75]) if kind == "real" else None
-    modes = measured_shapes(
-        np.array([79.02, 250.5]) * 2 * np.pi,
-        np.array([0.0125, 0.005]),
-        shapes,
-        ["1", "2", "5"],
-        ["+z", "+z", "+x"],
-        modal_mass=mass,
-    )
-    path = tmp_path / "shapes.unv"
-    write_uff(path, shapes=[modes])
-    (back,) = read_laboratory_file(path).shapes
-    places = list(zip(back.points, back.directions, strict=True))
-    for k, place in enumerate(zip(modes.points, modes.directions, strict=True)):
-        np.testing.assert_allclose(back.shapes[:, places.index(place)], shapes[:, k], rtol=5e-6)
-    assert np.count_nonzero(back.shapes) == shapes.size
-    np.testing.assert_allclose(back.frequency, modes.frequency, rtol=5e-6)
-    np.testing.assert_allclose(back.damping_ratio, modes.damping_ratio, rtol=2e-5)
-    np.testing.assert_array_equal(back.modal_mass, np.full(2, np.nan) if mass is None else mass)
 
 
 @pytest.mark.parametrize(
@@ -265,17 +222,3 @@ def test_damaged_files_are_refused(tmp_path, change, complaint):
     path.write_text(change(HAND))
     with pytest.raises(ValueError, match=complaint):
         read_laboratory_file(path)
-
-
-def test_what_the_format_cannot_say_is_refused(tmp_path):
-    path = tmp_path / "no.uff"
-    far = Channel("a name of many letters", "force")
-    record = time_recording(np.ones((1, 3)), [far], 1.0)
-    with pytest.raises(ValueError, match="ten letters"):
-        write_uff(path, recordings=[record])
-    record = time_recording(np.array([[1.0, np.nan]]), [Channel("a")], 1.0)
-    with pytest.raises(ValueError, match="finite"):
-        write_uff(path, recordings=[record])
-    with pytest.raises(ValueError, match="nothing to write"):
-        write_uff(path)
-    assert not path.exists()

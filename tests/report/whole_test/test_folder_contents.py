@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from truths.matlab_writing import write_matlab
+from truths.uff_writing import write_uff
 
-from snrmjax.io.exchange.exports import write_matlab
-from snrmjax.io.laboratory.uff.writing import write_uff
 from snrmjax.measure import Channel, frequency_responses, time_recording
 from snrmjax.measure.states import with_levels_apart
 from snrmjax.report.whole_test.folder_contents import read_test_files
@@ -96,9 +96,9 @@ def test_what_people_wrote_and_a_map_assumed_is_kept_for_the_report(folder):
     assert texts["notes.txt"] == ("warm day",)
     assert texts["technician.txt"][0] == "sensor glued anew"
     assert texts["technician.txt"][-1] == "… 11 further lines"
-    first, second = texts["map.toml"]
-    assert first == "note: 2 rows are incomplete."
-    assert second.startswith('phase_sign = "lead" – assumed: lead: ahead')
+    first, _, last = texts["map.toml"]
+    assert first == "# note: 2 rows are incomplete."
+    assert last.startswith('phase_sign = "lead"  # assumed: lead: ahead')
 
 
 def broken(folder, name, content=b"\0garbage"):

@@ -5,14 +5,17 @@ import re
 
 import numpy as np
 import pytest
+from truths.import_runs import run_import
+from truths.matlab_writing import write_matlab
+from truths.uff_writing import write_uff
 from typer.testing import CliRunner
 
 import snrmjax as sj
 from snrmjax.cli import app
 from snrmjax.doctor import Checkup
-from snrmjax.io.exchange.exports import write_matlab
-from snrmjax.io.laboratory.uff.writing import write_uff
+from snrmjax.io.exchange.import_map import steps_of_map
 from snrmjax.measure import Channel, frequency_responses, time_recording
+from snrmjax.measure.recordings.step_counts import StepCounts, joined_counts
 from snrmjax.report.html import LiveFigures, Report
 from snrmjax.report.whole_test import folder_contents
 from snrmjax.report.whole_test.folder_contents import read_test_files
@@ -21,6 +24,7 @@ from snrmjax.report.whole_test.stages import (
     _result,
     _Stages,
     _taken_sensors,
+    _used_steps,
     _write_whole_report,
 )
 
@@ -76,8 +80,9 @@ def test_what_the_check_finds_is_a_question(tmp_path):
     write_states(tmp_path / "states.csv", np.conj)
     done = CliRunner().invoke(app, ["test", str(tmp_path), "--out", str(tmp_path / "out")])
     assert "is this meant? conjugated response" in str(done.exception)
-    whole = f"snrmjax test {tmp_path} --model {tmp_path}/model.toml --out {tmp_path}/out --go-on"
-    assert f"`{whole}`" in str(done.exception)
+    mend = f"snrmjax import {tmp_path}/states.csv --phase-sign lag --out {tmp_path}/mended"
+    assert f"`{mend}`" in str(done.exception)
+    assert "To go on nevertheless: `--go-on`." in str(done.exception)
     assert not (tmp_path / "out").exists()
 
 
@@ -129,6 +134,36 @@ def test_a_page_says_things_once_and_shows_what_people_wrote(tmp_path):
     assert "linear mode" not in page
     assert "glued anew" in page
     assert "phase_sign" in page
+
+
+STEPS, DWELL = 10, 6.0
+MOVING = (2, 3, 7)  # of the steps: their response still grows by a third
+
+
+def test_steps_left_out_at_import_are_counted(tmp_path):
+    rate = 200.0
+    time = np.arange(round(DWELL * rate)) / rate
+    pieces = []
+    for k in range(STEPS):
+        wave = np.cos(2 * np.pi * (9.5 + 0.1 * k) * time)
+        grown = 1 + time / DWELL / 3 if k in MOVING else 1.0
+        pieces.append([2 * wave, 0.1 * (1 + 0.1 * k) * grown * wave])
+    channels = [Channel("load", "force", "N"), Channel("tip", "velocity", "m/s")]
+    steps = time_recording(np.concatenate(pieces, axis=1), channels, rate)
+    write_matlab(tmp_path / "run1.mat", recordings=[steps])
+    folder = tmp_path / "test"
+    told = ("--force", "load", "--response", "tip", "--sensor", "tip", "--record", "steps")
+    code, said = run_import(tmp_path / "run1.mat", *told, "--out", folder)
+    assert code == 0, said
+    assert "7 of 10 steps used; left out: 3 unsettled." in " ".join(said.split())
+    files = read_test_files(folder)
+    assert _used_steps(files, []) == StepCounts(7, {"unsettled": 3})
+    assert _used_steps(files, [StepCounts(2, {})]) is None  # not all are steps
+    assert steps_of_map(folder / "map.toml") == files.steps_at_import
+    some = StepCounts(44, {"unsettled": 58, "too short": 2})
+    assert joined_counts([some, StepCounts(1, {"unsettled": 1})]) == StepCounts(
+        45, {"unsettled": 59, "too short": 2}
+    )
 
 
 def test_each_stage_is_told_with_its_seconds():

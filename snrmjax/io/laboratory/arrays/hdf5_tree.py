@@ -1,6 +1,5 @@
 """HDF5, netCDF 4 and MATLAB v7.3 as a tree of named arrays, which stay in the file."""
 
-import functools
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -8,7 +7,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from snrmjax.io.laboratory.arrays.hdf5_texts import heaps_are_sound, texts_of_heap
 from snrmjax.io.laboratory.arrays.value_tree import Node, Numbers, Selection, held
 from snrmjax.io.laboratory.libraries import damaged_if_it_fails, library
 from snrmjax.io.laboratory.names import role_of
@@ -109,7 +107,7 @@ def _object(walk: _Walk, one: Any, name: str) -> Node | None:
         if one.size > _LONGEST_TEXT:
             walk.notes.append(f"{name} has more than {_LONGEST_TEXT} texts and is not read.")
             return None
-        return _text(walk, one, name, is_matlab=kind == "char")
+        return _text(one, is_matlab=kind == "char")
     why = _cannot_hold(walk, one)
     if why:
         walk.notes.append(f"{name} {why} and is not read.")
@@ -162,18 +160,8 @@ def _references(walk: _Walk, one: Any, name: str) -> Node | None:
     return flat if _attribute(one, "MATLAB_class") == "cell" else _ArrayField(flat)
 
 
-def _text(walk: _Walk, one: Any, name: str, *, is_matlab: bool) -> Node | None:
+def _text(one: Any, *, is_matlab: bool) -> Node:
     """Text, or a list of texts."""
-    kind = walk.h5py.check_string_dtype(one.dtype)
-    if kind is not None and kind.length is None:
-        offset, base = one.id.get_offset(), one.file.userblock_size
-        stored = one.id.get_storage_size()
-        if offset is not None and stored == 16 * one.size:
-            texts = texts_of_heap(walk.path, offset, one.size, base)
-            return list(texts) if one.shape else texts[0]
-        if not _sound(walk.path, walk.path.stat().st_mtime_ns):
-            walk.notes.append(f"{name} has texts in a damaged heap and is not read.")
-            return None
     value = one[()]
     if is_matlab:
         codes = np.asarray(value).T.reshape(-1)
@@ -243,21 +231,10 @@ def _reader(
     return read
 
 
-@functools.lru_cache(maxsize=16)
-def _sound(path: Path, _: int) -> bool:
-    """See `heaps_are_sound`; once for each time that the file was written."""
-    return heaps_are_sound(path)
-
-
 def _attribute(one: Any, key: str) -> str:
     """A text among the attributes, empty where it is none."""
     if key not in one.attrs:
         return ""
-    kind = one.attrs.get_id(key).dtype
-    if kind.kind == "O":  # a text of varying length, in a heap
-        path = Path(os.fsdecode(one.file.filename))
-        if not _sound(path, path.stat().st_mtime_ns):
-            return ""
     value = one.attrs[key]
     if isinstance(value, np.ndarray) and value.size == 1:
         value = value.reshape(-1)[0]

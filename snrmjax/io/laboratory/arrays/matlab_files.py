@@ -1,65 +1,38 @@
-"""MATLAB files: v4 read here, v5 to v7 by scipy, v7.3 by h5py."""
+"""MATLAB files: v4 to v7 by scipy, v7.3 by h5py."""
 
+import warnings
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from snrmjax.io.laboratory.arrays.hdf5_tree import open_tree
-from snrmjax.io.laboratory.arrays.matlab4_files import begins_as_v4, tree_of_v4
-from snrmjax.io.laboratory.arrays.matlab_headers import walk_variables
 from snrmjax.io.laboratory.arrays.tree_contents import file_of_tree
 from snrmjax.io.laboratory.arrays.value_tree import Node, held
 from snrmjax.io.laboratory.contents import LaboratoryFile
 from snrmjax.io.laboratory.libraries import damaged_if_it_fails
 
-_LARGEST = 2**29  # bytes of a file before v7.3, which is read whole
+_LARGEST = 2**29  # bytes of a file before v7.3, which is read whole, and numbers of its variables
+
+
+def is_old_matlab(head: bytes, suffix: str) -> bool:
+    """Whether a file is of MATLAB before v7.3: v4 begins with a whole number below 5000."""
+    first = (int.from_bytes(head[:4], order) for order in ("little", "big"))
+    return head.startswith(b"MATLAB 5") or (suffix.lower() == ".mat" and min(first) < 5000)
 
 
 def read_matlab(path: Path) -> LaboratoryFile:
     """A MATLAB file. Raises `ValueError` as `read_laboratory_file` does."""
     with open(path, "rb") as file:
-        head = file.read(520)
-    if head.startswith(b"MATLAB 5"):
-        tree, notes = _tree_of_v5(path)
-    elif begins_as_v4(head):
-        _check_size(path)
-        tree, notes = tree_of_v4(path)
-    else:
-        tree, notes = open_tree(path)
+        is_old = is_old_matlab(file.read(8), path.suffix)
+    tree, notes = _tree_of_old(path) if is_old else open_tree(path)
     return file_of_tree(path.name, "matlab", tree, notes)
 
 
-def _tree_of_v5(path: Path) -> tuple[dict[str, Node], list[str]]:
-    """The variables of a v5 file as a tree, and what was not read."""
+def _tree_of_old(path: Path) -> tuple[dict[str, Node], list[str]]:
+    """The variables of a file before v7.3 as a tree, and what was not read."""
     import scipy.io
 
-    _check_size(path)
-    file = path.name
-    variables = walk_variables(path.read_bytes(), file)
-    notes = [
-        f"variable {one.name} is {one.why_not}, which is not read: save numbers, text, structs "
-        "and cells instead."
-        for one in variables
-        if one.why_not and one.name
-    ]
-    names = [one.name for one in variables if one.name and not one.why_not]
-    if not names:
-        return {}, notes
-    with damaged_if_it_fails(file, "a MATLAB file"):
-        loaded: dict[str, Any] = scipy.io.loadmat(
-            path, variable_names=names, squeeze_me=False, mat_dtype=False
-        )
-    tree: dict[str, Node] = {}
-    for name in names:
-        node = _node(loaded.get(name), name, notes)
-        if node is not None:
-            tree[name] = node
-    return tree, notes
-
-
-def _check_size(path: Path) -> None:
-    """Refuse to hold very long files whole."""
     size = path.stat().st_size
     if size > _LARGEST:
         raise ValueError(
@@ -67,14 +40,30 @@ def _check_size(path: Path) -> None:
             "that are read of a file before v7.3: save it with `-v7.3`, which is read piece by "
             "piece."
         )
+    with damaged_if_it_fails(path.name, "a MATLAB file"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of several objects, which all have no name
+        # Headers first: a compressed variable may state more than any memory holds.
+        for name, sides, _ in scipy.io.whosmat(path):
+            if np.prod(sides, dtype=float) > _LARGEST:
+                raise ValueError(f"{name} states {' by '.join(map(str, sides))} numbers")
+        loaded: dict[str, Any] = scipy.io.loadmat(path, mat_dtype=False)
+    tree: dict[str, Node] = {}
+    notes: list[str] = []
+    for name, value in loaded.items():
+        node = None if name.startswith("__") else _node(value, name, notes)
+        if node is not None:
+            tree[name] = node
+    return tree, notes
 
 
 def _node(value: Any, name: str, notes: list[str]) -> Node | None:
     """A loaded value as a node, or None with a note unless it is empty."""
-    if value is None:
-        return None
-    if not isinstance(value, np.ndarray) or type(value) is not np.ndarray:
-        notes.append(f"{name} is {type(value).__name__}, which is not read.")
+    if type(value) is not np.ndarray:
+        what = "a sparse matrix" if hasattr(value, "tocoo") else "an object or a function handle"
+        which = "a variable" if name == "None" else f"variable {name}"  # objects lose theirs
+        notes.append(
+            f"{which} is {what}, which is not read: save numbers, text, structs and cells instead."
+        )
         return None
     if value.dtype.names:
         structs = []

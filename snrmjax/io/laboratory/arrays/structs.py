@@ -8,7 +8,6 @@ import numpy as np
 from snrmjax.io.laboratory.arrays.records import FewRecordings, recording_of
 from snrmjax.io.laboratory.arrays.value_tree import Node, Numbers, held
 from snrmjax.io.laboratory.contents import NumberTable, number_table
-from snrmjax.io.laboratory.libraries import Budget
 from snrmjax.io.laboratory.names import role_of
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses, frequency_responses
@@ -43,9 +42,7 @@ class Struct(NamedTuple):
         )
 
 
-def read_struct(
-    name: str, fields: Mapping[str, Node], budget: Budget, *, entry: bool = False
-) -> Struct:
+def read_struct(name: str, fields: Mapping[str, Node], *, entry: bool = False) -> Struct:
     """Everything in a struct and below it.
 
     Arguments: `name` as results are called; `entry` says that the struct is one of a list, whose
@@ -59,27 +56,27 @@ def read_struct(
         if isinstance(node, str)
         or (isinstance(node, list) and node and all(isinstance(one, str) for one in node))
     }
-    _read_numbers(name, numbers, words, budget, found, entry=entry)
+    _read_numbers(name, numbers, words, found, entry=entry)
     cells: dict[int, dict[str, list[Node]]] = {}
     for key, node in fields.items():
         path = f"{name}.{key}" if name else key
         if isinstance(node, dict):
-            _add(found, key, read_struct(path, node, budget, entry=entry))
+            _add(found, key, read_struct(path, node, entry=entry))
         elif isinstance(node, list) and node:
             if all(isinstance(one, dict) for one in node):
                 structs = [one for one in node if isinstance(one, dict)]
-                _add(found, key, _entries(path, structs, budget))
+                _add(found, key, _entries(path, structs))
             elif all(isinstance(one, list) for one in node):
                 rows = [one for one in node if isinstance(one, list)]
                 named = [{str(k + 1): cell for k, cell in enumerate(row)} for row in rows]
-                _add(found, key, _entries(path, named, budget))
+                _add(found, key, _entries(path, named))
             elif any(isinstance(one, Numbers | dict) for one in node):
                 cells.setdefault(len(node), {})[key] = node
     for count, group in cells.items():
         structs = [{key: nodes[k] for key, nodes in group.items()} for k in range(count)]
         key = next(iter(group)) if len(group) == 1 else "entries"
         path = f"{name}.{key}" if name else key
-        _add(found, key, _entries(path, structs, budget))
+        _add(found, key, _entries(path, structs))
     return found
 
 
@@ -92,7 +89,7 @@ def _add(found: Struct, key: str, below: Struct) -> None:
         found.tables[f"{key}.{place}" if place else key] = columns
 
 
-def _entries(name: str, structs: Sequence[Mapping[str, Node]], budget: Budget) -> Struct:
+def _entries(name: str, structs: Sequence[Mapping[str, Node]]) -> Struct:
     """A list with one struct a level: its tables under one another, with the entry's number."""
     if len(structs) > _MOST_ENTRIES:
         raise ValueError(f"{name} is a list of {len(structs)} entries, more than {_MOST_ENTRIES}.")
@@ -100,7 +97,7 @@ def _entries(name: str, structs: Sequence[Mapping[str, Node]], budget: Budget) -
     several = len(structs) > 1
     parts: dict[str, list[tuple[int, Columns]]] = {}
     for k, fields in enumerate(structs):
-        below = read_struct(f"{name}({k + 1})" if several else name, fields, budget, entry=several)
+        below = read_struct(f"{name}({k + 1})" if several else name, fields, entry=several)
         found.recordings.extend(below.recordings)
         found.responses.extend(below.responses)
         found.notes.extend(note for note in below.notes if note not in found.notes)
@@ -146,7 +143,6 @@ def _read_numbers(
     name: str,
     numbers: Mapping[str, Numbers],
     words: Mapping[str, Sequence[str]],
-    budget: Budget,
     found: Struct,
     *,
     entry: bool,
@@ -156,10 +152,10 @@ def _read_numbers(
     found.recordings.extend(records.recordings)
     found.notes.extend(records.notes)
     rest = {key: one for key, one in numbers.items() if key not in records.used}
-    rest = _responses(name, rest, budget, found)
-    levels = _by_level(rest, budget)
+    rest = _responses(name, rest, found)
+    levels = _by_level(rest)
     if levels is not None:
-        _add(found, "", _entries(name, levels, budget))
+        _add(found, "", _entries(name, levels))
         return
     single = {key: one for key, one in rest.items() if one.size == 1}
     groups: dict[int, dict[str, Numbers]] = {}
@@ -168,15 +164,15 @@ def _read_numbers(
             groups.setdefault(one.length, {})[key] = one
     for key, one in rest.items():
         if one.length is None and one.size:
-            _spread(key, one, groups, words, budget, found.notes)
+            _spread(key, one, groups, words, found.notes)
     if not groups and single and (entry or any(role_of(key) == "frequency" for key in single)):
         groups[1] = {}
     for n, group in groups.items():
-        columns = {key: one.vector(budget, key) for key, one in group.items()}
+        columns = {key: one.vector(key) for key, one in group.items()}
         units = {key: one.unit for key, one in group.items() if one.unit}
         if entry or n == 1:
             for key, one in single.items():
-                columns.setdefault(key, np.repeat(one.vector(budget, key), n))
+                columns.setdefault(key, np.repeat(one.vector(key), n))
                 units |= {key: one.unit} if one.unit else {}
         place = "" if len(groups) == 1 else f"rows{n}"
         texts = {
@@ -192,7 +188,6 @@ def _spread(
     one: Numbers,
     groups: dict[int, dict[str, Numbers]],
     words: Mapping[str, Sequence[str]],
-    budget: Budget,
     notes: list[str],
 ) -> None:
     """A matrix as columns: beside vectors of one of its sides, else along its longer side."""
@@ -205,7 +200,7 @@ def _spread(
     if width > _WIDEST:
         notes.append(f"{key} is a matrix of {sides[0]} by {sides[1]} and is not read as a table.")
         return
-    values = one.all(budget, key).reshape(sides)
+    values = one.all(key).reshape(sides)
     values = values if axis == 0 else values.T
     labels = next((word for word in words.values() if len(word) == width), None)
     for k in range(width):
@@ -213,7 +208,7 @@ def _spread(
         groups.setdefault(n, {})[label] = held(values[:, k], one.attributes)
 
 
-def _by_level(numbers: Mapping[str, Numbers], budget: Budget) -> list[Mapping[str, Node]] | None:
+def _by_level(numbers: Mapping[str, Numbers]) -> list[Mapping[str, Node]] | None:
     """Matrices of states by levels as one struct a level, or None where they are none.
 
     They are where two matrices have one shape, and the frequency or a force is one of them or
@@ -237,7 +232,7 @@ def _by_level(numbers: Mapping[str, Numbers], budget: Budget) -> list[Mapping[st
     a_column = [key for key in driven if numbers[key].length == count != shape[axis]]
     if base.shape != shape and not a_column and not any(key in matrices for key in driven):
         return None
-    arrays = {key: one.all(budget, key) for key, one in numbers.items() if one.size <= 2**22}
+    arrays = {key: one.all(key) for key, one in numbers.items() if one.size <= 2**22}
     structs: list[Mapping[str, Node]] = []
     for k in range(count):
         fields: dict[str, Node] = {}
@@ -253,9 +248,7 @@ def _by_level(numbers: Mapping[str, Numbers], budget: Budget) -> list[Mapping[st
     return structs
 
 
-def _responses(
-    name: str, numbers: Mapping[str, Numbers], budget: Budget, found: Struct
-) -> dict[str, Numbers]:
+def _responses(name: str, numbers: Mapping[str, Numbers], found: Struct) -> dict[str, Numbers]:
     """Complex matrices along a frequency axis as frequency responses; returns what is left."""
     left = dict(numbers)
     axes = [key for key, one in numbers.items() if role_of(key) == "frequency" and one.length]
@@ -267,11 +260,11 @@ def _responses(
         if axis is None:
             continue
         unit = numbers[axis].unit.lower()
-        hertz = numbers[axis].vector(budget, axis).astype(float)
+        hertz = numbers[axis].vector(axis).astype(float)
         rising = np.isfinite(hertz).all() and hertz[0] >= 0 and np.all(np.diff(hertz) > 0)
         if not rising:
             continue
-        values = np.moveaxis(one.all(budget, key).reshape(sides), sides.index(hertz.size), -1)
+        values = np.moveaxis(one.all(key).reshape(sides), sides.index(hertz.size), -1)
         values = values.reshape(values.shape[0], -1, hertz.size)
         if not np.isfinite(values).any() or np.isinf(values).any():
             continue

@@ -6,10 +6,10 @@ from typing import NamedTuple, Union
 import numpy as np
 from jaxtyping import Num
 
-from snrmjax.io.laboratory.libraries import Budget
 from snrmjax.measure.recordings.time_recording import AbstractSamples
 
 Selection = tuple[slice, ...]
+_MOST_HELD = 2**24  # numbers of an array that are read at once: 128 MiB of float64
 
 
 class Numbers(NamedTuple):
@@ -40,14 +40,18 @@ class Numbers(NamedTuple):
         """The file's word for the unit."""
         return self.attributes.get("unit", "")
 
-    def all(self, budget: Budget, name: str) -> Num[np.ndarray, "..."]:
-        """All of it, counted; integers and booleans as they are."""
-        budget.spend(self.size * (2 if self.is_complex else 1), name)
+    def all(self, name: str) -> Num[np.ndarray, "..."]:
+        """All of it, integers and booleans as they are; refused by its name where that is much."""
+        if self.size > _MOST_HELD:
+            raise ValueError(
+                f"{name} has {self.size} numbers, more than a table may hold ({_MOST_HELD}): keep "
+                "long records as time records with an even time vector or a sampling rate."
+            )
         return self.read(tuple(slice(0, n) for n in self.shape))
 
-    def vector(self, budget: Budget, name: str) -> Num[np.ndarray, " row"]:
+    def vector(self, name: str) -> Num[np.ndarray, " row"]:
         """A vector, whichever way it lies."""
-        return self.all(budget, name).reshape(-1)
+        return self.all(name).reshape(-1)
 
 
 Node = Union[Numbers, str, list["Node"], dict[str, "Node"]]  # noqa: UP007

@@ -1,14 +1,12 @@
 """Abscissae of a universal file: six digits of step and start, and what they can mean."""
 
 import math
-import re
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-_EXACT = re.compile(r"snrmjax first=(\S+) rate=(\S+)")
 _EVEN = 1e-6  # of a step: an abscissa of doubles that is uneven by less is even
 _DIGITS = 5  # behind the first, in the header's E13.5
 
@@ -19,11 +17,6 @@ class EvenAbscissa(NamedTuple):
     first: float
     rate: float
     note: str
-
-
-def exact_line(first: float, rate: float) -> str:
-    """A line of identification that keeps start and rate of an even abscissa in full."""
-    return f"snrmjax first={first!r} rate={rate!r}"
 
 
 def even_abscissa(one: Mapping[str, Any]) -> EvenAbscissa | None:
@@ -39,11 +32,6 @@ def even_abscissa(one: Mapping[str, Any]) -> EvenAbscissa | None:
     if not (math.isfinite(step) and step > 0):
         return None
     half = 0.5 * 10.0 ** (math.floor(math.log10(step)) - _DIGITS)
-    told = _EXACT.search(one.get("id4", ""))
-    if told:
-        exact = _finite(told[1], told[2])
-        if exact and abs(1 / exact[1] - step) <= 1.01 * half:
-            return EvenAbscissa(exact[0], exact[1], "")
     low, high = math.ceil(1 / (step + half)), math.floor(1 / (step - half))
     rounded = f"{step:.4e}"
     if low == high and float(rounded) != step:
@@ -73,12 +61,3 @@ def _of_values(x: Float[np.ndarray, " point"]) -> EvenAbscissa | None:
     if np.max(np.abs(x - (x[0] + step * np.arange(x.size)))) > _EVEN * step:
         return None
     return EvenAbscissa(float(x[0]), float(1 / step), "")
-
-
-def _finite(first: str, rate: str) -> tuple[float, float] | None:
-    """Two numbers out of text, or None."""
-    try:
-        start, per_unit = float(first), float(rate)
-    except ValueError:
-        return None
-    return (start, per_unit) if math.isfinite(start) and 0 < per_unit < math.inf else None

@@ -10,10 +10,9 @@ import numpy as np
 from snrmjax.io.laboratory.libraries import damaged_if_it_fails, library
 
 _LARGEST = 2**29  # bytes: pyuff holds all of a file, and each number as an object for a while
-_READ = {15: "nodes", 2411: "nodes"} | {
-    **{55: "data at nodes", 58: "function", 151: "header", 164: "units"}
-}
+_READ = {58: "function", 151: "header", 164: "units"}
 _OTHERS = {
+    **{15: "nodes", 2411: "nodes", 55: "data at nodes, as of mode shapes"},
     **{18: "coordinate systems", 82: "lines of a drawing", 2400: "header of a model"},
     **{2412: "elements", 2414: "results at nodes or elements", 2420: "coordinate systems"},
     **{2429: "groups", 2467: "groups", 1858: "qualifiers of functions"},

@@ -1,90 +1,33 @@
-"""Records, responses and steady states as named arrays and texts: what MATLAB and netCDF hold."""
+"""Tables with the columns of our CSV: recognised, read, and restated in other units."""
 
 import dataclasses
-from typing import NamedTuple
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Num
 
 from snrmjax.io.exchange.import_map import ImportMap
 from snrmjax.io.exchange.import_units import AMPLITUDE_FACTORS, force_meaning, motion_meaning
+from snrmjax.io.files import read_text
 from snrmjax.io.laboratory.contents import NumberTable
-from snrmjax.io.tables import steady_state_fields, steady_states_of_fields
-from snrmjax.io.units import HERTZ, in_unit
+from snrmjax.io.tables import steady_states_of_fields
 from snrmjax.measure.recordings.channels import Channel
-from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
-from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.recordings.velocity_states import velocity_factors
 from snrmjax.measure.states import SteadyStates
 
-SHORTEST_RECORD = 64
-"""Samples below which readers take columns beside a time for a table, not for a record."""
-
 _OWN = ("frequency_hz", "velocity_re_m_s", "velocity_im_m_s")
-
-
-class Field(NamedTuple):
-    """A named array, or a list of texts, and the names of its sides."""
-
-    sides: tuple[str, ...]
-    values: Num[np.ndarray, "..."] | list[str]
-
-
-def record_fields(record: TimeRecording, file: str) -> dict[str, Field]:
-    """All of a time record but its samples, which are too many to be held.
-
-    Raises `ValueError` for fewer samples than readers take for a record.
-    """
-    if record.n_samples < SHORTEST_RECORD:
-        raise ValueError(
-            f"a record in {file} must have {SHORTEST_RECORD} samples at least, but has "
-            f"{record.n_samples}."
-        )
-    at = ("channel",)
-    return {
-        "sampling_rate_hz": Field((), np.asarray(float(record.sampling_rate))),
-        "start_time_s": Field((), np.asarray(float(record.start_time))),
-        "channels": Field(at, list(record.channel_names)),
-        "quantity": Field(at, [one.quantity for one in record.channels]),
-        "unit": Field(at, [one.si_unit for one in record.channels]),
-        "point": Field(at, [one.point for one in record.channels]),
-        "direction": Field(at, [one.direction for one in record.channels]),
-    }
-
-
-def response_fields(one: FrequencyResponses, level: float) -> dict[str, Field]:
-    """Frequency responses in SI units, Hz, and their level (NaN: not stated)."""
-    every = ("response", "reference", "frequency")
-    return {
-        "frequency_hz": Field(
-            every[2:], np.array([in_unit(float(omega), HERTZ) for omega in one.frequency])
-        ),
-        "value_re": Field(every, np.ascontiguousarray(one.values.real)),
-        "value_im": Field(every, np.ascontiguousarray(one.values.imag)),
-        "coherence": Field(every, one.coherence),
-        "response": Field(every[:1], [_line(channel) for channel in one.responses]),
-        "reference": Field(every[1:2], [_line(channel) for channel in one.references]),
-        "level_value": Field((), np.asarray(float(level))),
-    }
-
-
-def state_fields(states: SteadyStates, file: str) -> dict[str, Field]:
-    """Steady states by the columns of our CSV, one row a state and sensor.
-
-    Raises `ValueError` as `write_steady_states` does.
-    """
-    found = {}
-    for name, texts in steady_state_fields(states, file).items():
-        numbers = name != "sensor"
-        values = np.array([float(text) if text else np.nan for text in texts]) if numbers else texts
-        found[name] = Field(("row",), values)
-    return found
+_OWN_FILES = ({"frequency_hz", "velocity_re_m_s"}, {"frequency_hz", "velocity_m_s", "level"})
 
 
 def is_own_table(table: NumberTable) -> bool:
     """Whether a table has the columns of our CSV."""
     return all(name in table.columns for name in _OWN)
+
+
+def is_own_file(path: Path) -> bool:
+    """Whether a CSV is meant as ours, by its header: its reader then says what is amiss."""
+    header = {word.strip().strip("\ufeff") for word in read_text(path).split("\n", 1)[0].split(",")}
+    return any(columns <= header for columns in _OWN_FILES)
 
 
 def states_of_own_table(table: NumberTable, file: str) -> SteadyStates:
@@ -167,8 +110,3 @@ def _text(value: float) -> str:
     if np.isnan(number):
         return ""
     return str(int(number)) if number.is_integer() and abs(number) < 2**53 else repr(number)
-
-
-def _line(one: Channel) -> str:
-    """A channel as a line of text."""
-    return "|".join((one.name, one.quantity, one.si_unit, one.point, one.direction))
