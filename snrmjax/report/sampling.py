@@ -160,7 +160,7 @@ def phase_of(velocity: Any, backbone: Backbone) -> np.ndarray:
 def sensor_index(sensors: tuple[str, ...], name: str) -> int:
     """Place of a sensor among all, or a `ValueError` that names these."""
     if name not in sensors:
-        raise ValueError(f"the sensor must be one of {list(sensors)}, but is {name!r}.")
+        raise ValueError(f"`sensor` must be one of {', '.join(sensors)}, but is {name!r}.")
     return sensors.index(name)
 
 

@@ -9,9 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from truths.balanced_sets import HERE, KEYS, balanced, files, linear_model, quadratic
+from typer.testing import CliRunner
 
 import snrmjax as sj
-from snrmjax.cli import diagnose
+from snrmjax.cli import app
 from snrmjax.diagnose.misfit.candidates import candidate, parameter_labels
 from snrmjax.diagnose.misfit.effect_fit import at_phases_of, fit_effect, unfitted
 from snrmjax.diagnose.misfit.noise_model import Sizes, sizes_of
@@ -205,7 +206,9 @@ def test_a_table_of_amplitudes_is_diagnosed(tmp_path):
             size = np.hypot(float(row["velocity_re_m_s"]), float(row["velocity_im_m_s"]))
             writer.writerow(row | {"velocity_m_s": repr(float(size))})
     out = tmp_path / "out"
-    diagnose([table], HERE / "blind" / "blind_03.toml", out)
+    words = ["diagnose", table, "--model", HERE / "blind" / "blind_03.toml", "--out", out]
+    done = CliRunner().invoke(app, [str(word) for word in words])
+    assert done.exit_code == 0, done.output
     told = json.loads((out / "diagnosis.json").read_text())
     assert told["verdict"] == "none"
     assert told["effects"] == []

@@ -7,9 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from truths.balanced_sets import balanced, linear_model, quadratic
+from typer.testing import CliRunner
 
 import snrmjax as sj
-from snrmjax.cli import diagnose
+from snrmjax.cli import app
 from snrmjax.io.models import write_model
 from snrmjax.io.tables import write_steady_states
 
@@ -71,7 +72,10 @@ def test_command_and_verb_agree(tmp_path, of_volts):
     data, found = driven(balanced(quadratic)), of_volts
     write_steady_states(tmp_path / "driven.csv", data)
     write_model(tmp_path / "linear.toml", linear_model())
-    diagnose([tmp_path / "driven.csv"], tmp_path / "linear.toml", tmp_path / "out", responses=False)
+    data_and_model = [tmp_path / "driven.csv", "--model", tmp_path / "linear.toml"]
+    words = ["diagnose", *data_and_model, "--out", tmp_path / "out", "--no-responses"]
+    done = CliRunner().invoke(app, [str(word) for word in words])
+    assert done.exit_code == 0, done.output
     told = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
     assert told["effects"] == list(found.effects)
     assert told["notes"] == list(found.notes)
