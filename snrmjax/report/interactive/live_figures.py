@@ -29,11 +29,16 @@ def live_figures(layout: "UIElement") -> LiveFigures:
     return LiveFigures(Resources(mode="inline", components=["bokeh"]).render(), place + script)
 
 
-def require_bokeh() -> None:
-    """Raises `ValueError` with what to install where Bokeh is missing."""
+def has_bokeh() -> bool:
+    """Whether Bokeh is installed."""
     from importlib.util import find_spec
 
-    if find_spec("bokeh") is None:
+    return find_spec("bokeh") is not None
+
+
+def require_bokeh() -> None:
+    """Raises `ValueError` with what to install where Bokeh is missing."""
+    if not has_bokeh():
         raise ValueError(f"{NEEDED}.")
 
 

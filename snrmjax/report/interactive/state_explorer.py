@@ -63,10 +63,10 @@ def state_explorer(
     sensor of `found` or the first.
     Raises `ValueError` where Bokeh is missing or `records` are not as many as the states.
     """
+    require_bokeh()
     from bokeh.layouts import column
     from bokeh.models import ColumnDataSource
 
-    require_bokeh()
     if len(records) not in (0, data.n_states):
         raise ValueError(f"`records` must be one a state, {data.n_states}, but are {len(records)}.")
     at = sensor if sensor is not None else 0

@@ -41,6 +41,7 @@ from snrmjax.report.html import (
     write_report,
 )
 from snrmjax.report.interactive.folded_records import folded_records
+from snrmjax.report.interactive.live_figures import NEEDED, has_bokeh
 from snrmjax.report.interactive.state_explorer import FoldedRecord, state_explorer
 from snrmjax.report.modal.modal_report import modal_report, modes_sentence, write_modal_tables
 from snrmjax.report.whole_test.folder_contents import NamedRecord, TestFiles
@@ -59,6 +60,7 @@ _FEWEST_ALIKE = 3  # states of two files
 _ALIKE = 1e-5  # relative difference of frequency and velocity, below what repeated tests reach
 _TINY = 1e-300
 _MOTIONS = ("velocity", "acceleration", "displacement")
+_TAPPED = "A state that is tapped shows its record, where there is one."
 
 
 class TestRequest(NamedTuple):
@@ -135,7 +137,9 @@ def run_whole_test(
     )
     folded: list[FoldedRecord | None] = [None] * sum(one.n_states for one in tables)
     folded += [shown for one in steps for shown in one.folded]
-    live = state_explorer(data, findings.identification, folded if steps else ())
+    live = None
+    if has_bokeh():
+        live = state_explorer(data, findings.identification, folded if steps else ())
     stage.ends("backbone and damping")
     diagnosis, diagnosed = None, None
     skipped = not_diagnosed(data, modes.model) if request.diagnose else ()
@@ -365,7 +369,7 @@ def _write_whole_report(
     files: TestFiles,
     sorted_records: Sequence[tuple[str, str]],
     checkup: Checkup,
-    live: LiveFigures,
+    live: LiveFigures | None,
     stages: Sequence[tuple[str, Report | None]],
     notes: Sequence[str],
     result: str,
@@ -389,9 +393,7 @@ def _write_whole_report(
             ],
         ),
         _check_section(checkup),
-        Section(
-            "States", ["A state that is tapped shows its record, where there is one."], live=live
-        ),
+        Section("States", [_TAPPED if live is not None else f"{NEEDED}."], live=live),
     ]
     for stage, report in told:
         sections += [
