@@ -46,7 +46,7 @@ def test_simulated_responses_mark_folds_peaks_and_resonances(virtual):
 def test_simulated_responses_refuse_nothing(virtual):
     with pytest.raises(ValueError, match="no curve has a point"):
         plot.simulated_response_figure([])
-    with pytest.raises(ValueError, match="the sensor must be one of"):
+    with pytest.raises(ValueError, match="`sensor` must be one of"):
         plot.simulated_response_figure(virtual.curves, sensor="quarter")
 
 
