@@ -135,6 +135,6 @@ def maximised(
         jac=True,
         method="L-BFGS-B",
         bounds=bounds,
-        options={"maxiter": _STEPS, "ftol": 1e-7, "gtol": 1e-2},
+        options={"maxiter": _STEPS, "ftol": 1e-9, "gtol": 1e-3},
     )
     return np.asarray(found.x)
