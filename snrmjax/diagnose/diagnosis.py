@@ -228,15 +228,6 @@ def diagnose_model(
 def _with_law(diagnosis: Diagnosis, law: LawAnswer) -> Diagnosis:
     """A diagnosis with a drawn law in place of effects that do not explain the data."""
     misfit, nothing = law.misfit, baseline_fit(law.misfit)
-    # A law has its share of what is outside the library, and of effects in whose place it stands.
-    kept = {
-        name: p
-        for name, p in diagnosis.probabilities.items()
-        if name != Verdict.UNKNOWN.value and len(name.split("+")) <= _FEW
-    }
-    outside = 1 - sum(kept.values())
-    kept |= {"+".join(law.kinds): law.share * outside}
-    kept |= {Verdict.UNKNOWN.value: (1 - law.share) * outside}
     answer = diagnosis.answer._replace(
         effects=law.kinds,
         candidates=((law.kinds[0], *law.rivals), *((kind,) for kind in law.kinds[1:])),
@@ -245,7 +236,7 @@ def _with_law(diagnosis: Diagnosis, law: LawAnswer) -> Diagnosis:
         completed=law.completed,
         completed_status=CompletedStatus.COMPLETED,
         laws=law.laws,
-        probabilities=dict(sorted(kept.items(), key=lambda pair: -pair[1])),
+        probabilities=_with_probability_of_law(diagnosis.probabilities, law),
     )
     checks = diagnosis.checks._replace(
         p_value=law.p_value,

@@ -30,6 +30,7 @@ from snrmjax.identify.test_model.priors import (
     UNSTATED_NOISE,
     FlatSize,
     HalfNormalSize,
+    JointDensity,
 )
 from snrmjax.model.effect_metadata import MotionScales
 from snrmjax.model.effects import EFFECTS, effect_parameters
@@ -216,7 +217,7 @@ def log_evidence(model: Marginal, sizes: _Sizes) -> Evidence:
     """
     used = np.unique(model.group[model.group >= 0])
     member = model.group[:, None] == used
-    densities = [sizes.densities[place] for place in used]
+    prior_of_sizes = JointDensity.of([None, *(sizes.densities[place] for place in used)])
 
     def likelihood(point: np.ndarray) -> tuple[float, np.ndarray]:
         variance = np.exp(2 * (member @ point[1:]))
@@ -225,18 +226,15 @@ def log_evidence(model: Marginal, sizes: _Sizes) -> Evidence:
 
     def with_priors(point: np.ndarray) -> tuple[float, np.ndarray]:
         value, slopes = likelihood(point)
-        for k, density in enumerate(densities, 1):
-            if density is not None:
-                own, slope = density.log_density(point[k])
-                value, slopes[k] = value + own, slopes[k] + slope
-        return value, slopes
+        own, slope = prior_of_sizes.log_density(point)
+        return value + own, slopes + slope
 
     ends = float(sizes.noise[0]), float(sizes.noise[-1])
     bounds = [ends, *(sizes.bounds[place] for place in used)]
     found = maximised(with_priors, np.zeros(len(bounds)), bounds)
     others = precision_at(with_priors, found)[1:, 1:]
     volume = 0.5 * (len(others) * np.log(2 * np.pi) - np.linalg.slogdet(others)[1])
-    top = with_priors(found)[0] - likelihood(found)[0]
+    top = prior_of_sizes.log_density(found)[0]
     variance = np.exp(2 * (member @ found[1:]))
     logs = _over_noise(model.rows, np.exp(sizes.noise), variance) + volume + top - model.penalty
     return Evidence(*(float(logsumexp(logs + prior)) for prior in (sizes.right, sizes.wrong)))
@@ -323,7 +321,8 @@ def _sizes_of(misfit: WeightedMisfit) -> _Sizes:
     else:
         taken = ASSUMED_ERROR * predictions.error_scale
         unstated = UNSTATED_NOISE._replace(median=UNSTATED_NOISE.median / taken)
-        right = np.array([unstated.log_density(one)[0] for one in noise])
+        joint = JointDensity.of([unstated])
+        right = np.array([joint.log_density(one)[0] for one in noise[:, None]])
         wrong = np.full(len(noise), -np.inf)
     right = right - logsumexp(right)
     every = (*levels, FlatSize(low, high)), (*ends, (low, high))

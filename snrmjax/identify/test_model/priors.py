@@ -19,32 +19,17 @@ class LogNormalSize(NamedTuple):
     median: float
     spread: float  # 1σ of the logarithm
 
-    def log_density(self, log_value: float) -> tuple[float, float]:
-        """ln p of the logarithm, and its slope."""
-        step = (log_value - np.log(self.median)) / self.spread
-        return -0.5 * step**2 - np.log(self.spread) - _LOG_ROOT, -step / self.spread
-
 
 class HalfNormalSize(NamedTuple):
     """A positive number: a normal one without its sign."""
 
     scale: float
 
-    def log_density(self, log_value: float) -> tuple[float, float]:
-        """ln p of the logarithm, and its slope."""
-        square = np.exp(2 * (log_value - np.log(self.scale)))
-        return log_value - np.log(self.scale) - 0.5 * square + np.log(2) - _LOG_ROOT, 1.0 - square
-
 
 class NormalNumber(NamedTuple):
     """Any number about zero."""
 
     std: float
-
-    def log_density(self, value: float) -> tuple[float, float]:
-        """ln p, and its slope."""
-        step = value / self.std
-        return -0.5 * step**2 - np.log(self.std) - _LOG_ROOT, -step / self.std
 
 
 class FlatSize(NamedTuple):
@@ -53,12 +38,8 @@ class FlatSize(NamedTuple):
     low: float  # of the logarithm
     high: float
 
-    def log_density(self, log_value: float) -> tuple[float, float]:
-        """ln p of the logarithm, and its slope."""
-        return -float(np.log(self.high - self.low)), 0.0
 
-
-Density = LogNormalSize | HalfNormalSize | NormalNumber
+Density = LogNormalSize | HalfNormalSize | NormalNumber | FlatSize
 
 
 class JointDensity(NamedTuple):
@@ -80,6 +61,8 @@ class JointDensity(NamedTuple):
             if isinstance(one, HalfNormalSize):
                 half.append((place, np.log(one.scale)))
                 constant += np.log(2) - _LOG_ROOT
+            elif isinstance(one, FlatSize):
+                constant -= np.log(one.high - one.low)
             elif one is not None:
                 pair = (
                     (np.log(one.median), one.spread)
