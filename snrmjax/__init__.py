@@ -41,9 +41,13 @@ import lazy_loader
 # Before anything else is imported: arrays made earlier would be float32.
 jax.config.update("jax_enable_x64", True)
 
-from snrmjax.numerics.result import draw_with  # noqa: E402 - after the setting above
+from snrmjax.numerics.rendering import shown_by  # noqa: E402 - after the setting above
 
-draw_with("snrmjax.report.plots")
+shown_by(
+    sentences="snrmjax.report.sentences",
+    printed="snrmjax.report.printed",
+    figures="snrmjax.report.plots",
+)
 
 __version__ = "0.1.0"
 

@@ -10,7 +10,6 @@ from snrmjax.cli.console import say, staged, warn
 from snrmjax.cli.options import Harmonics, Model, Out, require_positive
 from snrmjax.io.models import read_model
 from snrmjax.io.units import HERTZ
-from snrmjax.simulate.continuation.continuation import STATUS_MESSAGE
 
 
 def simulate(
@@ -77,7 +76,7 @@ def simulate(
                 curves += further
         for curve in curves:
             if curve.branch == "main" and curve.status != sj.simulate.CurveStatus.UPPER_END:
-                warn(f"force {curve.force:g} N: {STATUS_MESSAGE[curve.status]}.")
+                warn(f"force {curve.force:g} N: {curve.status.message}.")
             if curve.not_located:
                 warn(f"force {curve.force:g} N: not located: {', '.join(curve.not_located)}.")
             unknown = int(np.sum(curve.stability == sj.simulate.Stability.NOT_COMPUTED))
@@ -145,7 +144,7 @@ def nnm(
             sj.simulate.CurveStatus.UPPER_END,
             sj.simulate.CurveStatus.LOWER_END,
         ):
-            warn(f"the mode {STATUS_MESSAGE[branch.status]}.")
+            warn(f"the mode {branch.status.message}.")
         sensor = _sensor(structure)
         results.write_normal_mode(folder / "nnm.csv", branch, sensor=sensor)
         save_figure(folder / "nnm.png", normal_mode_figure(branch, sensor=sensor))

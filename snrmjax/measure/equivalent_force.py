@@ -1,7 +1,6 @@
 """The force of a low-level test that is known in volts only, from the linear response."""
 
 import dataclasses
-from enum import IntEnum
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -14,31 +13,27 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.modes import LinearModes, linear_response
 from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.status import Status
 
 _HERTZ = 2 * np.pi
 
 
-class ForceStatus(IntEnum):
+class ForceStatus(Status):
     """How the search for the equivalent force of one level ended."""
 
-    SUCCESSFUL = 0
-    TOO_FEW = 1  # fewer measured numbers than unknowns
-    NOT_CONVERGED = 2  # no fit, or the measured numbers do not determine the unknowns
-    NEGATIVE = 3  # the best force is negative: a sensor or the force is wired the other way round
-
-
-FORCE_MESSAGE: dict[ForceStatus, str] = {
-    ForceStatus.SUCCESSFUL: "found",
-    ForceStatus.TOO_FEW: "fewer measured numbers than unknowns; adjust less, or measure more",
-    ForceStatus.NOT_CONVERGED: (
+    SUCCESSFUL = 0, "found"
+    TOO_FEW = 1, "fewer measured numbers than unknowns; adjust less, or measure more"
+    NOT_CONVERGED = (
+        2,
         "the linear response does not fit, or the states do not determine what is adjusted; check "
-        "the modes and the band, or adjust something else"
-    ),
-    ForceStatus.NEGATIVE: (
+        "the modes and the band, or adjust something else",
+    )
+    NEGATIVE = (
+        3,
         "the best force is negative; turn the sign of the sensor or of its mode shape, or adjust "
-        "the phase"
-    ),
-}
+        "the phase",
+    )
+
 
 ADJUSTABLE = ("natural_frequency", "damping_ratio", "phase")
 
@@ -79,7 +74,7 @@ class EquivalentForce(AbstractResult):
             *(
                 f"level {level}: {drive:.4g} V, {force:.4g} ± {std:.2g} N (1σ)"
                 if status == ForceStatus.SUCCESSFUL
-                else f"level {level}: {drive:.4g} V, {FORCE_MESSAGE[ForceStatus(int(status))]}"
+                else f"level {level}: {drive:.4g} V, {ForceStatus(int(status)).message}"
                 for level, drive, force, std, status in rows
             ),
         )
@@ -129,7 +124,7 @@ def equivalent_force(
     Arguments: `data`, whose `level` groups the states of equal `drive` (V); `modes`, the linear
     model; `adjust`, any of "natural_frequency" (ω_j), "damping_ratio" (ζ_j), both of the mode of
     interest, and "phase" (ψ, common to the level).
-    Returns `EquivalentForce`, with a status per level: see `FORCE_MESSAGE` for what to try.
+    Returns `EquivalentForce`, with a status per level: its `message` says what to try.
     Not differentiable: the starting point is scanned for and states are checked on the host.
     Raises `ValueError` for an unknown name in `adjust`, a sensor that the model lacks, or a level
     whose drives differ.

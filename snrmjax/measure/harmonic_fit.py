@@ -1,6 +1,5 @@
 """Harmonics of measured time records: their least-squares fit and its errors."""
 
-from enum import IntEnum
 from typing import ClassVar
 
 import equinox as eqx
@@ -13,33 +12,29 @@ from jaxtyping import Array, Bool, Complex, Float, Int, Shaped
 from snrmjax.measure.signals import checked_amplitudes, require_orders
 from snrmjax.numerics.finite_slopes import safe_root
 from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.status import Status
 
 _SHOWN = 8
 
 
-class HarmonicFitStatus(IntEnum):
+class HarmonicFitStatus(Status):
     """How the harmonic fit of one record ended."""
 
-    SUCCESSFUL = 0
-    NOT_FINITE = 1  # a sample or the frequency is NaN or infinite, or the frequency not positive
-    RANK_DEFICIENT = 2  # the samples cannot tell the harmonics apart
-    FREQUENCY_NOT_FOUND = 3  # the refined frequency is not held by the record
-
-
-FIT_MESSAGE: dict[HarmonicFitStatus, str] = {
-    HarmonicFitStatus.SUCCESSFUL: "fitted",
-    HarmonicFitStatus.NOT_FINITE: (
-        "a sample is not finite, or the frequency is not finite and positive; remove such samples"
-    ),
-    HarmonicFitStatus.RANK_DEFICIENT: (
+    SUCCESSFUL = 0, "fitted"
+    NOT_FINITE = (
+        1,
+        "a sample is not finite, or the frequency is not finite and positive; remove such samples",
+    )
+    RANK_DEFICIENT = (
+        2,
         "the samples cannot tell the harmonics apart; record longer (a period or more), sample "
-        "faster than twice the highest harmonic, or fit fewer harmonics"
-    ),
-    HarmonicFitStatus.FREQUENCY_NOT_FOUND: (
+        "faster than twice the highest harmonic, or fit fewer harmonics",
+    )
+    FREQUENCY_NOT_FOUND = (
+        3,
         "the record does not hold a frequency near the given one (within 2/duration in Hz and a "
-        "quarter of it); start closer, or record longer if the tone is lost in noise"
-    ),
-}
+        "quarter of it); start closer, or record longer if the tone is lost in noise",
+    )
 
 
 class HarmonicFit(AbstractResult):
@@ -77,7 +72,7 @@ class HarmonicFit(AbstractResult):
             f"{int(np.sum(status == 0))} fitted"
             + (f" at {found.min():.6g} to {found.max():.6g} Hz" if found.size else ""),
             *(f"fundamental amplitude {size:.4g}" for size in fundamental[:_SHOWN]),
-            *(f"{int(np.sum(status == one))}: {FIT_MESSAGE[one]}" for one in failed),
+            *(f"{int(np.sum(status == one))}: {one.message}" for one in failed),
         )
 
     def variables(self) -> dict[str, Variable]:
@@ -171,7 +166,7 @@ def fit_harmonics(
     Returns `HarmonicFit`; `status` is RANK_DEFICIENT for too short or too coarse records,
     FREQUENCY_NOT_FOUND when the refined frequency is farther off than 4π/duration or a quarter,
     or the tone stands out by less than five standard deviations, NOT_FINITE for NaN;
-    `FIT_MESSAGE` says what to try.
+    the status's `message` says what to try.
     Raises `ValueError` for wrong shapes, orders or a frequency that is not positive.
     Differentiable by time, signal and frequency; a record without a fit leaves the derivatives of
     the others as they are. `condition` has no derivative.

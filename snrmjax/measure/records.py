@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, Shaped
 
 from snrmjax.measure.harmonic_fit import (
-    FIT_MESSAGE,
     HarmonicFit,
     HarmonicFitStatus,
     checked_frequency,
@@ -163,7 +162,7 @@ def steady_state_from_records(
     ):
         if not good:
             raise ValueError(
-                f"`{name}` cannot be fitted: {FIT_MESSAGE[HarmonicFitStatus(int(status))]}."
+                f"`{name}` cannot be fitted: {HarmonicFitStatus(int(status)).message}."
             )
     higher = tuple(int(order) for order in harmonic_order if order != 1)
     state = {name: np.asarray(value)[None] for name, value in _state_of(fit, higher).items()}

@@ -13,7 +13,6 @@ from snrmjax.measure.states import SteadyStates, join_steady_states, with_levels
 from snrmjax.methods.record_comparison import RECORD_METHODS, run_record_method, states_of
 from snrmjax.methods.records.recorded_test import RecordedTest, RecordKind, recorded_test
 from snrmjax.methods.result import (
-    METHOD_MESSAGE,
     MethodPoint,
     MethodResult,
     MethodStatus,
@@ -132,7 +131,7 @@ def compare_methods(
         own = reason if reason.startswith(first) else f"{first}: {reason}"
         raise ValueError(f"no method could run; {own}")
     if not any(one.found.any() for one in results):
-        why = METHOD_MESSAGE[MethodStatus(int(results[0].status[0]))]
+        why = MethodStatus(int(results[0].status[0])).message
         raise ValueError(f"no method found anything; {results[0].method}: {why}.")
     left_out = [f"left out: {why}" for why in (*unread, *unsteady)]
     return Comparison(tuple(results), stopped | absent, states, (*_kinds(tests, read), *left_out))

@@ -1,7 +1,6 @@
 """What every result can do: say itself on one screen, become a labelled data set, be drawn."""
 
-import abc
-import importlib
+import dataclasses
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
@@ -9,12 +8,18 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from snrmjax.numerics import rendering
+from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.status import Status
+
 if TYPE_CHECKING:
     import matplotlib.figure
     import pandas
     import xarray
 
-_drawing_module: str | None = None
+_ENDINGS = {"Hz": "_hz", "m/s": "_m_s", "m": "_m", "N": "_n", "V": "_v", "J": "_j", "deg": "_deg"}
+# What a field holds over what its unit in files is.
+_SIZES = {"Hz": 2 * np.pi, "deg": np.pi / 180}
 
 
 class Variable(NamedTuple):
@@ -26,35 +31,89 @@ class Variable(NamedTuple):
     meaning: str  # a few words that an engineer reads beside the axis
 
 
+class _Quantity(NamedTuple):
+    """What a field of a result says of itself."""
+
+    dimensions: tuple[str, ...]
+    unit: str
+    meaning: str
+    name: str
+    of: type[Status] | None
+
+    def variable(self, name: str, values: Any) -> tuple[str, Variable]:
+        """The field's values in units of files, under the name that files have."""
+        values = np.asarray(values)
+        if self.of is not None:
+            names = [self.of(int(one)).name.lower() for one in values.ravel()]
+            values = np.array(names, dtype=np.str_).reshape(values.shape)
+        elif self.unit in _SIZES:
+            values = values / _SIZES[self.unit]
+        elif not self.unit:
+            values = values.astype(np.str_)
+        named = self.name or name + _ENDINGS.get(self.unit, "")
+        return named, Variable(self.dimensions, values, self.unit, self.meaning)
+
+
+def quantity(
+    dimensions: str,
+    unit: str,
+    meaning: str,
+    *,
+    name: str = "",
+    of: type[Status] | None = None,
+    **settings: Any,
+) -> Any:
+    """A field that is a variable of the result's data set, in place of `equinox.field`.
+
+    Arguments: `dimensions` by name, separated by spaces, "" for a single number; `unit` that files
+    and data sets have ("1" for none, "" for text): a field in "Hz" holds rad/s and one in "deg"
+    rad; `meaning` in a few words; `name` of the variable, where it is not the field's with the
+    unit's ending; `of` the status that whole numbers stand for, which the data set names; others
+    as `equinox.field`.
+    """
+    about = _Quantity(tuple(dimensions.split()), unit, meaning, name, of)
+    return eqx.field(metadata={"quantity": about}, **settings)
+
+
+def setting(**settings: Any) -> Any:
+    """A static field that is an attribute of the data set: a method, a number of states, a status.
+
+    Statuses and enumerations are written by name there, facts as sentences.
+    """
+    return eqx.field(static=True, metadata={"setting": True}, **settings)
+
+
 class AbstractResult(eqx.Module):
     """Base of results: a repr of one screen, `to_xarray()`, `to_pandas()` and `plot()`.
 
-    A result states its `summary()` (what, how many, range, status) and its `variables()`, named
-    as the columns of the files are (`frequency_hz`, `velocity_m_s`); those in `coordinates`
-    label the others.
+    Fields say by `quantity` and `setting` what a data set has of them; a result with computed
+    quantities adds them to `variables`. Names in `coordinates` label the others.
     """
 
     coordinates: ClassVar[tuple[str, ...]] = ()
 
-    @abc.abstractmethod
-    def summary(self) -> tuple[str, ...]:
-        """Lines of text: the first says what it is, the others how many, range and status."""
-
-    @abc.abstractmethod
     def variables(self) -> Mapping[str, Variable]:
         """Quantities by name, in units of files (Hz, m/s)."""
+        return dict(
+            field.metadata["quantity"].variable(field.name, getattr(self, field.name))
+            for field in dataclasses.fields(self)
+            if "quantity" in field.metadata
+        )
 
     def attributes(self) -> Mapping[str, str | float | int]:
-        """What holds for the whole result: settings, verdicts, notes."""
-        return {}
+        """What holds for the whole result: settings, statuses, notes."""
+        return {
+            field.name: _attribute(getattr(self, field.name))
+            for field in dataclasses.fields(self)
+            if "setting" in field.metadata
+        }
 
     def __repr__(self) -> str:
-        """The summary; within `jax.jit`, where nothing has a value yet, the fields' shapes."""
+        """One screen; within `jax.jit`, where nothing has a value yet, the fields' shapes."""
         valueless = (jax.core.Tracer, jax.ShapeDtypeStruct)
         if any(isinstance(leaf, valueless) for leaf in jax.tree.leaves(self)):
             return eqx.tree_pformat(self)
-        first, *others = self.summary()
-        return "\n".join([first, *(f"  {line}" for line in others)])
+        return rendering.on_one_screen(self)
 
     def to_xarray(self) -> "xarray.Dataset":
         """The result as an `xarray.Dataset`, with a unit and a meaning on every variable."""
@@ -84,12 +143,15 @@ class AbstractResult(eqx.Module):
 
     def plot(self, **settings: Any) -> "matplotlib.figure.Figure":
         """The figure that shows this result; `settings` are those of its function in `sj.plot`."""
-        if _drawing_module is None:
-            raise ValueError("no figures are registered: `import snrmjax` registers them.")
-        return importlib.import_module(_drawing_module).plot_result(self, **settings)
+        return rendering.drawn(self, **settings)
 
 
-def draw_with(module: str) -> None:
-    """Names the module whose `plot_result` draws results; it is imported with the first figure."""
-    global _drawing_module
-    _drawing_module = module
+def _attribute(value: Any) -> str | float | int:
+    """A setting as a data set's attribute: a number, or text."""
+    if isinstance(value, Status):
+        return value.name.lower()
+    if isinstance(value, str | int | float):
+        return value
+    if isinstance(value, Fact):
+        return str(value)
+    return "\n".join(str(one) for one in value)

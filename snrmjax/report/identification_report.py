@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from snrmjax.identify.inference.identification import Identification
 from snrmjax.identify.joint.joint_fit import NoiseEstimate
 from snrmjax.identify.pointwise.backbone import Backbone
-from snrmjax.identify.pointwise.inversion_result import STATUS_MESSAGE, PointStatus
+from snrmjax.identify.pointwise.inversion_result import PointStatus
 from snrmjax.identify.pointwise.prediction import (
     PredictedResponse,
     Resonance,
@@ -261,7 +261,7 @@ def _left_out(identification: Identification) -> str:
     """How many points the curves leave out and why; nothing where all are used."""
     status = np.asarray(identification.points.status)
     return ", ".join(
-        f"{int(np.sum(status == kind))} ({STATUS_MESSAGE[kind]})"
+        f"{int(np.sum(status == kind))} ({kind.message})"
         for kind in PointStatus
         if kind is not PointStatus.OK and np.any(status == kind)
     )

@@ -1,6 +1,5 @@
 """Static solutions under dead loads: Newton's method with load steps from the stress-free shape."""
 
-import enum
 from typing import NamedTuple
 
 import equinox as eqx
@@ -15,6 +14,7 @@ from snrmjax.condense.elements.strain_energy import (
     tangent_stiffness,
 )
 from snrmjax.numerics.blocks import mapped
+from snrmjax.numerics.status import Status
 
 _ITERATIONS = 25
 _TOLERANCE = 1e-16  # of the work of the load, in one correction; its error is squared once more
@@ -23,20 +23,16 @@ _JUMP = 2.0  # times as far as the tangent predicts
 _LIMIT_STIFFNESS = 0.1  # smallest stiffness over that at rest which tells a limit point
 
 
-class StaticStatus(enum.IntEnum):
-    """How a static solution ended; `STATIC_MESSAGE` says each in a sentence."""
+class StaticStatus(Status):
+    """How a static solution ended; `.message` says it in a sentence."""
 
-    CONVERGED = 0
-    DIVERGED = 1
-    SNAPPED_THROUGH = 2
-
-
-STATIC_MESSAGE = {
-    StaticStatus.CONVERGED: "in equilibrium, on the stable path from rest",
-    StaticStatus.DIVERGED: "Newton's method found no equilibrium: check the model, or load less",
-    StaticStatus.SNAPPED_THROUGH: "the path from rest loses its stability before the load is "
-    "reached (limit point or buckling): load less",
-}
+    CONVERGED = 0, "in equilibrium, on the stable path from rest"
+    DIVERGED = 1, "Newton's method found no equilibrium: check the model, or load less"
+    SNAPPED_THROUGH = (
+        2,
+        "the path from rest loses its stability before the load is "
+        "reached (limit point or buckling): load less",
+    )
 
 
 class StaticSolutions(eqx.Module):

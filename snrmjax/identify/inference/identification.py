@@ -20,7 +20,6 @@ from snrmjax.identify.pointwise.backbone_points import (
     peak_ratio,
 )
 from snrmjax.identify.pointwise.inversion_result import (
-    STATUS_MESSAGE,
     PointStatus,
     reasons_in_words,
 )
@@ -305,9 +304,7 @@ def notes_on_points(points: BackbonePoints, modes: LinearModes, consequence: str
     for kind in PointStatus:
         count = int(np.sum(status == kind))
         if kind != PointStatus.OK and count:
-            notes.append(
-                f"{count} of {len(status)} steady states {consequence}: {STATUS_MESSAGE[kind]}."
-            )
+            notes.append(f"{count} of {len(status)} steady states {consequence}: {kind.message}.")
     other = int(np.sum(np.isfinite(np.asarray(points.alternative_natural_frequency))))
     if other:
         notes.append(

@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Sequence
-from enum import IntEnum
 from typing import Literal, NamedTuple
 
 import equinox as eqx
@@ -30,6 +29,7 @@ from snrmjax.identify.test_model.states import LEVEL_ERRORS
 from snrmjax.numerics.blocks import padded
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.result import Variable
+from snrmjax.numerics.status import Status
 
 Target = Literal["curves", "frequency", "damping", "resonance", "fold"]
 
@@ -44,22 +44,16 @@ _FROM_FOLD = 0.002  # relative frequency by which a state must keep away from a 
 _FARTHEST = np.radians(70.0)  # from resonance: beyond it other errors rule
 
 
-class AdviceStatus(IntEnum):
+class AdviceStatus(Status):
     """How the search for the next measurements ended."""
 
-    COMPLETE = 0  # as many states as were asked for
-    FEWER_STATES = 1  # all states that a test can reach, fewer than were asked for
-    NO_STATE = 2  # no state that a test can reach
-
-
-ADVICE_MESSAGE: dict[AdviceStatus, str] = {
-    AdviceStatus.COMPLETE: "as many states as were asked for",
-    AdviceStatus.FEWER_STATES: "fewer candidate states than were asked for",
-    AdviceStatus.NO_STATE: (
+    COMPLETE = 0, "as many states as were asked for"
+    FEWER_STATES = 1, "fewer candidate states than were asked for"
+    NO_STATE = (
+        2,
         "no stable state of the fitted responses within 70° of resonance can be measured in this "
-        "range of forces, frequencies and measured amplitudes"
-    ),
-}
+        "range of forces, frequencies and measured amplitudes",
+    )
 
 
 class NextMeasurement(NamedTuple):
@@ -97,7 +91,7 @@ class NextMeasurements(AbstractTable[NextMeasurement]):
     @property
     def message(self) -> str:
         """The status in words."""
-        return ADVICE_MESSAGE[self.status]
+        return self.status.message
 
     def summary(self) -> tuple[str, ...]:
         """See `AbstractResult`."""

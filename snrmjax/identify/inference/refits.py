@@ -1,7 +1,6 @@
 """What refits say of a joint fit's unknowns: profiles of its cost, and resampled states."""
 
 from collections.abc import Callable
-from enum import IntEnum
 
 import equinox as eqx
 import jax
@@ -17,25 +16,19 @@ from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.joint.residuals import corrected_residuals
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.status import Status
 
 _PIN = 1e4  # weight, in its own 1σ, with which a profile holds an unknown
 _MOST_STEPS = 200  # of a refit
 _RISE = 3.84  # of χ² at the ends of a 95 % interval
 
 
-class IntervalEnd(IntEnum):
+class IntervalEnd(Status):
     """How an end of a profile's 95 % interval is known."""
 
-    BRACKETED = 0  # between two values whose refits converged
-    BEYOND_REACH = 1  # χ² rises by less than 3.84 up to the last value tried: farther away
-    NOT_COMPUTED = 2  # the refits that would bracket it failed
-
-
-END_MESSAGE: dict[IntervalEnd, str] = {
-    IntervalEnd.BRACKETED: "between two computed values",
-    IntervalEnd.BEYOND_REACH: "beyond the values tried: ask for a larger `reach`",
-    IntervalEnd.NOT_COMPUTED: "not computed: the refits that would bracket it failed",
-}
+    BRACKETED = 0, "between two computed values"
+    BEYOND_REACH = 1, "beyond the values tried: ask for a larger `reach`"
+    NOT_COMPUTED = 2, "not computed: the refits that would bracket it failed"
 
 
 class Profile(AbstractResult):
@@ -62,8 +55,8 @@ class Profile(AbstractResult):
         return (
             f"Profile of {self.name} ({self.unit}): {len(self.values)} values from "
             f"{self.values[0]:.6g} to {self.values[-1]:.6g}, {self.n_failed} refits failed",
-            f"lower end of the 95 % interval {self.lower:.6g} ({END_MESSAGE[self.lower_status]})",
-            f"upper end {self.upper:.6g} ({END_MESSAGE[self.upper_status]})",
+            f"lower end of the 95 % interval {self.lower:.6g} ({self.lower_status.message})",
+            f"upper end {self.upper:.6g} ({self.upper_status.message})",
         )
 
     def variables(self) -> dict[str, Variable]:
@@ -80,8 +73,8 @@ class Profile(AbstractResult):
             "parameter": self.name,
             "lower": self.lower,
             "upper": self.upper,
-            "lower_status": END_MESSAGE[self.lower_status],
-            "upper_status": END_MESSAGE[self.upper_status],
+            "lower_status": self.lower_status.message,
+            "upper_status": self.upper_status.message,
         }
 
 

@@ -1,7 +1,6 @@
 """Families of curves by name, fitted to the exact force balance by Levenberg–Marquardt."""
 
 import dataclasses
-from enum import IntEnum
 from typing import NamedTuple
 
 import jax
@@ -19,6 +18,7 @@ from snrmjax.identify.joint.posterior_view import LEAST_LEFT
 from snrmjax.identify.joint.residuals import corrected_residuals
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.least_squares import degrees_spent, root_of_inverse
+from snrmjax.numerics.status import Status
 
 SOLVER: optx.AbstractLeastSquaresSolver = optx.LevenbergMarquardt(
     rtol=1e-10, atol=1e-10, linear_solver=lx.QR()
@@ -33,23 +33,16 @@ _SETTLED = 0.01  # relative change of the noise, in the last of them
 _TRUST = 100.0  # columns' size to the solver: its damping, one at first, is 1e-4 of theirs
 
 
-class FitStatus(IntEnum):
+class FitStatus(Status):
     """How a joint fit ended."""
 
-    CONVERGED = 0
-    STEP_LIMIT = 1  # the solver used up its steps
-    NOT_SETTLED = 2  # the rounds of estimating the noise were used up while the cost still fell
-    NOT_FINITE = 3  # residuals that are not finite numbers
-
-
-FIT_MESSAGE: dict[FitStatus, str] = {
-    FitStatus.CONVERGED: "converged",
-    FitStatus.STEP_LIMIT: f"not converged: the solver used up its {MOST_STEPS} steps",
-    FitStatus.NOT_SETTLED: (
-        "not converged: fit and noise estimate still changed one another in the last round"
-    ),
-    FitStatus.NOT_FINITE: "failed: the residuals became infinite or undefined",
-}
+    CONVERGED = 0, "converged"
+    STEP_LIMIT = 1, f"not converged: the solver used up its {MOST_STEPS} steps"
+    NOT_SETTLED = (
+        2,
+        "not converged: fit and noise estimate still changed one another in the last round",
+    )
+    NOT_FINITE = 3, "failed: the residuals became infinite or undefined"
 
 
 class FamilyFit(NamedTuple):
@@ -94,7 +87,7 @@ def fit_families(
         answer = _linearised(vector, *given)
         jacobian = np.asarray(answer.jacobian)[:, program.own]
         if not (np.all(np.isfinite(answer.residuals)) and np.all(np.isfinite(jacobian))):
-            raise ValueError(f"{FIT_MESSAGE[FitStatus.NOT_FINITE]}: try other families.")
+            raise ValueError(f"{FitStatus.NOT_FINITE.message}: try other families.")
         problem = problem.with_data(correction=answer.correction[:n])
         residuals = np.asarray(answer.residuals)[:n] / np.sqrt(share)
         level, frequency = (np.asarray(a) for a in (problem.data.level, problem.data.frequency))

@@ -15,7 +15,7 @@ from snrmjax.identify.checks.residual_autocorrelation import (
 )
 from snrmjax.identify.curves.families import parse_family
 from snrmjax.identify.curves.splines import SmoothingSpline
-from snrmjax.identify.joint.family_fit import FIT_MESSAGE, FamilyFit, FitStatus, fit_families
+from snrmjax.identify.joint.family_fit import FamilyFit, FitStatus, fit_families
 from snrmjax.identify.joint.force_balance import (
     BalanceData,
     BalanceProblem,
@@ -190,7 +190,7 @@ class JointFit(AbstractResult):
             f"natural frequency {omega.min() / _HERTZ:.6g} to {omega.max() / _HERTZ:.6g} Hz, "
             f"damping ratio {100 * ratio.min():.3g} to {100 * ratio.max():.3g} %",
             f"residuals: {noise}",
-            f"status: {FIT_MESSAGE[self.status]}",
+            f"status: {self.status.message}",
             *(f"note: {note}" for note in self.notes),
         )
 
@@ -220,7 +220,7 @@ class JointFit(AbstractResult):
             "backbone": self.unknowns.squared_frequency.label,
             "damping": self.unknowns.modal_damping.label,
             "noise_scale": self.noise.scale,
-            "status": FIT_MESSAGE[self.status],
+            "status": self.status.message,
             "notes": "\n".join(self.notes),
         }
 
@@ -350,7 +350,7 @@ def _notes(fit: JointFit, wandering: float, stated: Float[np.ndarray, " error"])
     """
     notes: tuple[str, ...] = ()
     if not fit.converged:
-        notes = (f"the fit has {FIT_MESSAGE[fit.status]}; try a simpler family.",)
+        notes = (f"the fit has {fit.status.message}; try a simpler family.",)
     level, n_levels = np.asarray(fit.data.level), fit.data.n_levels
     notes += notes_on_noise(fit.noise, wandering, stated, n_levels)
     if np.any((stated == 0) & (fit.noise.level_std > 0)):

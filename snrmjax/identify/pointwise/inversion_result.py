@@ -1,39 +1,27 @@
 """What an inversion answers: a natural frequency and a damping ratio, or the reason for none."""
 
-from enum import IntEnum
 from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.status import Status
 
 _HERTZ = 2 * np.pi
 
 
-class PointStatus(IntEnum):
+class PointStatus(Status):
     """What became of one inversion."""
 
-    OK = 0
-    TWO_ROOTS = 1  # two answers fit equally; the other one is in `alternative_…`
-    NEGATIVE_DAMPING = 2  # solved, but the phase says that the force takes energy out
-    NO_ROOT = 3  # no response of the mode fits amplitude and phase
-    NO_REAL_FREQUENCY = 4  # the measurement asks for a negative ω̃²
-    ZERO_FORCE = 5  # no force or no participation: nothing to divide by
-    NOT_FINITE = 6  # NaN or infinity in the measurement, or a zero response
-    NOT_CONVERGED = 7  # Newton's method did not reach its tolerance
-
-
-STATUS_MESSAGE: dict[PointStatus, str] = {
-    PointStatus.OK: "ok",
-    PointStatus.TWO_ROOTS: "two roots: the residual response exceeds the measured one",
-    PointStatus.NEGATIVE_DAMPING: "negative damping: phase beyond 90° of resonance",
-    PointStatus.NO_ROOT: "no root: amplitude and phase contradict the residual modes",
-    PointStatus.NO_REAL_FREQUENCY: "no real natural frequency",
-    PointStatus.ZERO_FORCE: "zero force or participation",
-    PointStatus.NOT_FINITE: "measurement is zero or not finite",
-    PointStatus.NOT_CONVERGED: "Newton's method did not converge",
-}
+    OK = 0, "ok"
+    TWO_ROOTS = 1, "two roots: the residual response exceeds the measured one"
+    NEGATIVE_DAMPING = 2, "negative damping: phase beyond 90° of resonance"
+    NO_ROOT = 3, "no root: amplitude and phase contradict the residual modes"
+    NO_REAL_FREQUENCY = 4, "no real natural frequency"
+    ZERO_FORCE = 5, "zero force or participation"
+    NOT_FINITE = 6, "measurement is zero or not finite"
+    NOT_CONVERGED = 7, "Newton's method did not converge"
 
 
 _TOO_LARGE = (
@@ -63,7 +51,7 @@ def reasons_in_words(status: Int[np.ndarray | Array, " state"]) -> str:
     kinds, counts = np.unique(np.asarray(status), return_counts=True)
     order = [k for k in np.argsort(-counts, kind="stable") if kinds[k] != PointStatus.OK]
     found = [(PointStatus(int(kinds[k])), int(counts[k])) for k in order]
-    listed = "; ".join(f"{count} have {STATUS_MESSAGE[kind]}" for kind, count in found)
+    listed = "; ".join(f"{count} have {kind.message}" for kind, count in found)
     causes = [_USUAL_CAUSE[kind] for kind, _ in found[:1] if kind in _USUAL_CAUSE]
     return ". ".join([listed, *causes])
 

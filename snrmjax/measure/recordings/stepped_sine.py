@@ -1,7 +1,6 @@
 """Steady states of a stepped sine from its time record."""
 
 from collections.abc import Sequence
-from enum import IntEnum
 from typing import ClassVar, NamedTuple
 
 import equinox as eqx
@@ -30,6 +29,7 @@ from snrmjax.measure.recordings.velocity_states import (
 )
 from snrmjax.measure.states import SteadyStates
 from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.status import Status
 
 _HERTZ = 2 * np.pi
 _FEWEST_CYCLES = 10
@@ -42,27 +42,16 @@ _TRIES = 5  # starts of the part that is used
 _QUIET = 1e-3  # of the largest force: a pause
 
 
-class StepStatus(IntEnum):
+class StepStatus(Status):
     """Whether a step of a record became a steady state, or why it did not."""
 
-    SETTLED = 0
-    UNSETTLED = 1
-    TOO_SHORT = 2
-    NOT_FINITE = 3
-    CLIPPED = 4
-    NOT_FOUND = 5  # the frequency that a table states
-    NO_FORCE = 6
-
-
-STEP_MESSAGE: dict[StepStatus, str] = {
-    StepStatus.SETTLED: "settled",
-    StepStatus.UNSETTLED: "amplitude or phase still move at its end; dwell longer",
-    StepStatus.TOO_SHORT: f"fewer than {_FEWEST_CYCLES} cycles are left",
-    StepStatus.NOT_FINITE: "samples are missing or not finite",
-    StepStatus.CLIPPED: "a channel stays at its largest value: it is clipped",
-    StepStatus.NOT_FOUND: "the force has another frequency than the table says",
-    StepStatus.NO_FORCE: "the force is a thousandth of the largest or less: a pause",
-}
+    SETTLED = 0, "settled"
+    UNSETTLED = 1, "amplitude or phase still move at its end; dwell longer"
+    TOO_SHORT = 2, f"fewer than {_FEWEST_CYCLES} cycles are left"
+    NOT_FINITE = 3, "samples are missing or not finite"
+    CLIPPED = 4, "a channel stays at its largest value: it is clipped"
+    NOT_FOUND = 5, "the force has another frequency than the table says"
+    NO_FORCE = 6, "the force is a thousandth of the largest or less: a pause"
 
 
 class SteppedSineStates(AbstractResult):
@@ -97,7 +86,7 @@ class SteppedSineStates(AbstractResult):
         """See `AbstractResult`."""
         hertz = self.frequency / _HERTZ
         failed = [
-            f"{np.sum(self.status == int(kind))} left out: {STEP_MESSAGE[kind]}"
+            f"{np.sum(self.status == int(kind))} left out: {kind.message}"
             for kind in StepStatus
             if kind is not StepStatus.SETTLED and np.any(self.status == int(kind))
         ]
@@ -113,7 +102,7 @@ class SteppedSineStates(AbstractResult):
         """See `AbstractResult`; the table of steps."""
         at = ("step",)
         names = np.array([StepStatus(int(k)).name.lower() for k in self.status], dtype=str)
-        reasons = np.array([STEP_MESSAGE[StepStatus(int(k))] for k in self.status], dtype=str)
+        reasons = np.array([StepStatus(int(k)).message for k in self.status], dtype=str)
         return {
             "step": Variable(at, np.arange(len(self.status)), "1", "step"),
             "start_s": Variable(at, self.start, "s", "its start"),
@@ -393,7 +382,7 @@ def _result(
     good = [one for one in measured if one.status is StepStatus.SETTLED]
     if not good:
         reasons = "; ".join(
-            f"{np.sum(status == int(kind))} because {STEP_MESSAGE[kind]}"
+            f"{np.sum(status == int(kind))} because {kind.message}"
             for kind in StepStatus
             if np.any(status == int(kind))
         )

@@ -1,7 +1,6 @@
 """Steady states from slow sweeps, the bias of the sweep taken out."""
 
 from collections.abc import Sequence
-from enum import IntEnum
 from typing import ClassVar, NamedTuple
 
 import equinox as eqx
@@ -38,6 +37,7 @@ from snrmjax.measure.sweeps.swept_table import (
     table_of,
 )
 from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.status import Status
 
 _HERTZ = 2 * np.pi
 _START = 60  # states a sweep before the grid is made finer where the response changes
@@ -47,23 +47,13 @@ _MUCH = 0.3  # of the force that may be taken to move the phasor
 _BLURRED = 0.1  # relative error of a phasor from which on the window is too wide for it
 
 
-class SweepStatus(IntEnum):
+class SweepStatus(Status):
     """Whether a moment of a sweep became a steady state, or why it did not."""
 
-    FOUND = 0
-    OUTSIDE = 1
-    TOO_FAST = 2
-    CLIPPED = 3
-
-
-SWEEP_MESSAGE: dict[SweepStatus, str] = {
-    SweepStatus.FOUND: "found",
-    SweepStatus.OUTSIDE: "the window leaves the sweep, or samples are missing",
-    SweepStatus.TOO_FAST: (
-        "the phasor changes too fast for a steady state (a jump, or too fast a sweep)"
-    ),
-    SweepStatus.CLIPPED: "a channel stays at its largest value: it is clipped",
-}
+    FOUND = 0, "found"
+    OUTSIDE = 1, "the window leaves the sweep, or samples are missing"
+    TOO_FAST = 2, "the phasor changes too fast for a steady state (a jump, or too fast a sweep)"
+    CLIPPED = 3, "a channel stays at its largest value: it is clipped"
 
 
 class SweptStates(AbstractResult):
@@ -106,7 +96,7 @@ class SweptStates(AbstractResult):
 
     def _left_out_in_words(self) -> tuple[str, ...]:
         return tuple(
-            f"{count} left out: {SWEEP_MESSAGE[kind]}"
+            f"{count} left out: {kind.message}"
             for kind, count in zip(SweepStatus, self.left_out, strict=True)
             if count and kind is not SweepStatus.FOUND
         )
@@ -307,7 +297,7 @@ def _result(
         left_out[int(SweepStatus.TOO_FAST)] += int(np.sum(~slow))
     if not moments or not slow.any():
         reasons = "; ".join(
-            f"{count} because {SWEEP_MESSAGE[kind]}"
+            f"{count} because {kind.message}"
             for kind, count in zip(SweepStatus, left_out, strict=True)
             if count
         )

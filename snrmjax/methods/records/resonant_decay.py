@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Float
 
 from snrmjax.methods.result import MethodPoint, MethodResult, MethodStatus, method_result
+from snrmjax.numerics.facts import Fact
 
 Reading = Literal["peaks", "zero_crossings", "hilbert"]
 
@@ -90,7 +91,7 @@ def resonant_decay(
     window = _window(trace, end) if window is None else window
     lines = _local_lines(trace, end, window)
     bias = np.zeros_like(lines)
-    notes = [f"read by {reading}"]
+    notes = [Fact("decay_read_by", reading=reading)]
     if band is not None:
         # The decay that was read, read with and without the filter: nothing else differs.
         decay = _fitted_decay(lines, every)
@@ -99,7 +100,7 @@ def resonant_decay(
             for one in (_filtered(decay, step, band)[0], decay)
         )
         bias = with_filter - without
-        notes.append(_in_words(bias, lines))
+        notes.append(_of_bias(bias, lines))
     fundamental = band is not None or reading == "hilbert"
     return method_result("resonant_decay", _points(lines, bias, fundamental), 0, notes)
 
@@ -358,13 +359,10 @@ def _at_times(
     )
 
 
-def _in_words(bias: Float[np.ndarray, "line 5"], lines: Float[np.ndarray, "line 5"]) -> str:
+def _of_bias(bias: Float[np.ndarray, "line 5"], lines: Float[np.ndarray, "line 5"]) -> Fact:
     omega = np.abs(bias[:, _OMEGA] / lines[:, _OMEGA]).max()
     decay = np.abs(bias[:, _SLOPE] / lines[:, _SLOPE]).max()
-    return (
-        f"bias of the filter, estimated: up to {100 * omega:.2g} % of the frequency and "
-        f"{100 * decay:.2g} % of the damping"
-    )
+    return Fact("bias_of_filter", frequency=omega, damping=decay)
 
 
 def _scatter(values: np.ndarray, amplitude: np.ndarray) -> np.ndarray:

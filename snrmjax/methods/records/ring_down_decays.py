@@ -15,6 +15,7 @@ from snrmjax.measure.recordings.ring_down import find_ring_downs
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.methods.records.resonant_decay import Reading, resonant_decay
 from snrmjax.methods.result import MethodPoint, MethodResult, MethodStatus, method_result
+from snrmjax.numerics.facts import Fact
 
 _HERTZ = 2 * np.pi
 _POWER = {"displacement": 1, "velocity": 0, "acceleration": -1}
@@ -85,10 +86,10 @@ def ring_down_decays(
             window=window,
             least_amplitude=least,
         )
+        begins = float(recording.time(start, start + 1)[0])
         notes = (
-            f"ring-down {k} from {recording.time(start, start + 1)[0]:.6g} s, read down to "
-            f"{least:.3g} {unit}",
-            *((f"one shape holds {100 * share:.4g} % of the power",) if len(names) > 1 else ()),
+            Fact("ring_down_read", number=k, start_s=begins, least=least, unit=unit),
+            *((Fact("power_in_one_shape", share=share),) if len(names) > 1 else ()),
             *found.notes,
         )
         results.append(_as_velocity(found, power, notes))
@@ -127,7 +128,7 @@ def above_noise(
     return signal[: (int(quiet[0]) + 1) * cycle + beyond]
 
 
-def _as_velocity(found: MethodResult, power: int, notes: Sequence[str]) -> MethodResult:
+def _as_velocity(found: MethodResult, power: int, notes: Sequence[Fact]) -> MethodResult:
     """Amplitudes of a displacement or acceleration as those of the velocity: times ω^±1."""
     size = np.asarray(found.velocity)
     omega = np.asarray(found.natural_frequency)

@@ -24,6 +24,7 @@ from scipy.signal import decimate
 from snrmjax.methods.records.normal_form import NormalForm, form_of, seen, unknowns_of
 from snrmjax.methods.records.resonant_decay import even_record, require_cycles
 from snrmjax.methods.result import MethodPoint, MethodResult, MethodStatus, method_result
+from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.levenberg_marquardt import Minimum, StepRule, minimise
 
 _DELAYS = 5  # 2·2 + 1: enough for a plane, by Takens' theorem
@@ -96,9 +97,8 @@ def ssm(
     ]
     degree = 2 * len(found.form.decay) - 1
     notes = (
-        f"normal form of degree {degree}, fitted to the trajectory (noise of a sample "
-        f"{found.noise_std:.2g} m/s)",
-        f"the record is {100 * found.manifold_misfit:.2g} % (rms) off a two-dimensional manifold",
+        Fact("normal_form_fitted", degree=degree, noise_std=found.noise_std),
+        Fact("off_the_manifold", misfit=found.manifold_misfit),
     )
     return method_result("ssm", points, 0, notes)
 

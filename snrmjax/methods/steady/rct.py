@@ -15,6 +15,7 @@ from snrmjax.methods.one_sensor import sensor_states
 from snrmjax.methods.result import MethodPoint, MethodResult, MethodStatus, method_result
 from snrmjax.methods.steady.equal_amplitude import CONTROLLED, AmplitudeSection, sections_of
 from snrmjax.model.modes import LinearModes
+from snrmjax.numerics.facts import Fact
 
 _UNKNOWNS = 2  # complex: 1/C and λ/C
 _NEAR = 3.0  # half-power widths about resonance that a section keeps
@@ -35,12 +36,7 @@ def rct(data: SteadyStates, modes: LinearModes) -> MethodResult:
     """
     states = sensor_states(data, modes, "rct", any_scale=True)
     sections, held = sections_of(states)
-    notes: tuple[str, ...] = ()
-    if not held:
-        notes = (
-            f"no level holds its displacement within ±{100 * CONTROLLED:.0f} %: sections of equal "
-            "displacement are interpolated between levels",
-        )
+    notes = () if held else (Fact("sections_between_levels", spread=CONTROLLED),)
     points = [_mode_of(one) for one in sections]
     if not points:
         points = [MethodPoint(MethodStatus.ONE_SIDE, level) for level, _ in states.levels()]

@@ -11,7 +11,7 @@ from snrmjax.io.tables import write_table
 from snrmjax.io.units import HERTZ
 from snrmjax.methods.comparison import METHODS, Comparison
 from snrmjax.methods.record_comparison import RECORD_METHODS
-from snrmjax.methods.result import METHOD_MESSAGE, MethodResult, MethodStatus
+from snrmjax.methods.result import MethodResult, MethodStatus
 from snrmjax.report.html import Report, ReportFigure, ReportTable, Section, number, write_report
 from snrmjax.report.style import (
     COLUMN,
@@ -231,7 +231,7 @@ def _summary(found: Comparison) -> dict:
                 "record_s": one.test_seconds,
                 "median_distance_from_snrm_hz": near.get(one.method, (None, None))[0],
                 "median_relative_damping_distance_from_snrm": near.get(one.method, (None, None))[1],
-                "notes": list(one.notes),
+                "notes": [str(note) for note in one.notes],
             }
             for one in results
         },
@@ -251,7 +251,7 @@ def _table(found: Comparison) -> ReportTable:
         away = near.get(name)
         gap = ("", "") if away is None else (number(away[0], 2), f"{number(100 * away[1], 2)} %")
         kinds = {MethodStatus(int(k)) for k in np.asarray(one.status)[~one.found]}
-        why = "; ".join(METHOD_MESSAGE[kind] for kind in sorted(kinds))
+        why = "; ".join(kind.message for kind in sorted(kinds))
         used = str(one.n_states)
         if np.isfinite(one.test_seconds):
             used = f"{number(one.test_seconds, 3)} s"

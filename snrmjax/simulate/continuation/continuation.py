@@ -1,7 +1,6 @@
 """Pseudo-arclength continuation of curves of solutions, with steps chosen by curvature."""
 
 from collections.abc import Callable
-from enum import IntEnum
 from typing import NamedTuple
 
 import equinox as eqx
@@ -10,41 +9,31 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from snrmjax.numerics.status import Status
+
 _FARTHEST = 3.0  # steps over the last one, beyond which the cubic is no guess
 Point = Float[Array, " unknown"]
 Number = float | Array | np.ndarray
 Linearised = Callable[[Point], tuple[Float[Array, " equation"], Float[Array, "equation unknown"]]]
 
 
-class CurveStatus(IntEnum):
+class CurveStatus(Status):
     """How a curve ended."""
 
-    UPPER_END = 0  # left the range of the last unknown at its upper end
-    LOWER_END = 1  # left it at its lower end
-    POINT_LIMIT = 2  # used up the points it was given
-    STEP_TOO_SMALL = 3  # Newton's method failed even for the smallest step
-    NO_START = 4  # no solution was found to start from
-    AMPLITUDE_LIMIT = 5  # grew past the largest amplitude asked for
-    CLOSED = 6  # came back to its first point: an isolated loop
-    INVALID = 7  # asked for with numbers that are no structure or no force
-
-
-STATUS_MESSAGE: dict[CurveStatus, str] = {
-    CurveStatus.UPPER_END: "traced to the upper end of the frequency range",
-    CurveStatus.LOWER_END: "came back to the lower end of the frequency range",
-    CurveStatus.POINT_LIMIT: "stopped at the largest number of points; raise `max_points`",
-    CurveStatus.STEP_TOO_SMALL: (
-        "stopped early: Newton's method fails at the smallest step; use more harmonics or samples"
-    ),
-    CurveStatus.NO_START: (
-        "no solution at the start; start farther from resonance or lower the force"
-    ),
-    CurveStatus.AMPLITUDE_LIMIT: "stopped at the largest amplitude asked for",
-    CurveStatus.INVALID: (
-        "not traced: the force or a parameter of the model is not finite, or the force is zero"
-    ),
-    CurveStatus.CLOSED: "came back to where it started: an isolated loop",
-}
+    UPPER_END = 0, "traced to the upper end of the frequency range"
+    LOWER_END = 1, "came back to the lower end of the frequency range"
+    POINT_LIMIT = 2, "stopped at the largest number of points; raise `max_points`"
+    STEP_TOO_SMALL = (
+        3,
+        "stopped early: Newton's method fails at the smallest step; use more harmonics or samples",
+    )
+    NO_START = 4, "no solution at the start; start farther from resonance or lower the force"
+    AMPLITUDE_LIMIT = 5, "stopped at the largest amplitude asked for"
+    CLOSED = 6, "came back to where it started: an isolated loop"
+    INVALID = (
+        7,
+        "not traced: the force or a parameter of the model is not finite, or the force is zero",
+    )
 
 
 class StepControl(eqx.Module):

@@ -15,7 +15,7 @@ from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, truncatio
 from snrmjax.simulate.balance.harmonics import velocity_along
 from snrmjax.simulate.balance.labelled import HERTZ, counted, motion_variables, range_text
 from snrmjax.simulate.continuation.bifurcations import with_bifurcations
-from snrmjax.simulate.continuation.continuation import STATUS_MESSAGE, CurveStatus, StepControl
+from snrmjax.simulate.continuation.continuation import CurveStatus, StepControl
 from snrmjax.simulate.continuation.events import CurvePoints, with_events
 from snrmjax.simulate.continuation.stability import (
     Stability,
@@ -99,7 +99,7 @@ class ResponseCurve(AbstractResult):
             ]
         if self.not_located:
             lines.append(f"not located: {counted(self.not_located)}")
-        return (*lines, f"status: {STATUS_MESSAGE[self.status]}")
+        return (*lines, f"status: {self.status.message}")
 
     def variables(self) -> dict[str, Variable]:
         """Frequency, velocity, stability and events, by the names of `response.csv`."""

@@ -22,7 +22,6 @@ from snrmjax.simulate.balance.harmonic_balance import (
 from snrmjax.simulate.balance.harmonics import harmonic_basis, velocity_along, velocity_phasors
 from snrmjax.simulate.balance.labelled import HERTZ, motion_variables, range_text
 from snrmjax.simulate.continuation.continuation import (
-    STATUS_MESSAGE,
     Curve,
     CurveRange,
     CurveStatus,
@@ -53,7 +52,7 @@ class DampedModeBranch(AbstractResult):
             f"natural frequency {range_text(self.frequency, 'Hz', HERTZ)}",
             f"damping ratio {range_text(self.damping_ratio, 'of critical')}",
             f"velocity fundamental {range_text(velocity, 'm/s')}, sensor {self.sensors[0]}",
-            f"status: {STATUS_MESSAGE[self.status]}",
+            f"status: {self.status.message}",
         )
 
     def variables(self) -> dict[str, Variable]:
@@ -89,7 +88,7 @@ class ControlledCurve(AbstractResult):
             f"force {range_text(self.force, 'N')}",
             f"frequency {range_text(self.frequency, 'Hz', HERTZ)}",
             f"velocity fundamental {range_text(velocity, 'm/s')}, sensor {self.sensors[0]}",
-            f"status: {STATUS_MESSAGE[self.status]}",
+            f"status: {self.status.message}",
         )
 
     def variables(self) -> dict[str, Variable]:

@@ -14,7 +14,7 @@ from snrmjax.numerics.blocks import as_arrays, padded, taken
 from snrmjax.numerics.result import AbstractResult, Variable
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, linear_coefficients
 from snrmjax.simulate.balance.labelled import HERTZ, range_text
-from snrmjax.simulate.continuation.continuation import STATUS_MESSAGE, CurveStatus, StepControl
+from snrmjax.simulate.continuation.continuation import CurveStatus, StepControl
 from snrmjax.simulate.continuation.curve_tracing import response_balances, trace_through
 from snrmjax.simulate.continuation.response_curve import ResponseCurve, TracedCurve, assembled
 from snrmjax.simulate.solutions.controlled import phase_controlled
@@ -74,14 +74,14 @@ class IsolatedResponses(AbstractResult):
         for curve in self.curves:
             span = range_text(curve.frequency, "Hz", HERTZ)
             points = f"{len(curve.frequency)} points, {span}"
-            lines.append(f"{curve.branch}: {points}, {STATUS_MESSAGE[curve.status]}")
+            lines.append(f"{curve.branch}: {points}, {curve.status.message}")
         lines.append(
             f"starts: {self.n_starts}, of which {self.n_failed} did not converge, {self.n_known}"
             f" led to known motions or out of the range, {self.n_not_traced} to motions through"
             " which no curve was traced"
         )
         whole = self.backbone_status == CurveStatus.UPPER_END
-        text = f"force-appropriated backbone: {STATUS_MESSAGE[self.backbone_status]}"
+        text = f"force-appropriated backbone: {self.backbone_status.message}"
         return tuple(lines) if whole else (*lines, text)
 
     def variables(self) -> dict[str, Variable]:

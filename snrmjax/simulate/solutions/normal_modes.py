@@ -17,7 +17,6 @@ from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, harmonic_
 from snrmjax.simulate.balance.harmonics import velocity_phasors, with_sines
 from snrmjax.simulate.balance.labelled import HERTZ, motion_variables, range_text
 from snrmjax.simulate.continuation.continuation import (
-    STATUS_MESSAGE,
     Curve,
     CurveRange,
     CurveStatus,
@@ -69,7 +68,7 @@ class NormalModeBranch(AbstractResult):
                 f" {one.from_frequency / HERTZ:.4g} to {one.to_frequency / HERTZ:.4g} Hz"
                 for one in self.tongues
             ),
-            f"status: {STATUS_MESSAGE[self.status]}",
+            f"status: {self.status.message}",
         )
 
     def variables(self) -> dict[str, Variable]:

@@ -3,7 +3,6 @@
 Needs diffrax: pip install 'snrmjax[integrate]'.
 """
 
-from enum import IntEnum
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -15,6 +14,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.numerics.compiled import jitted
 from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.status import Status
 from snrmjax.simulate.balance.harmonics import harmonic_basis, velocity_phasors
 from snrmjax.simulate.balance.labelled import HERTZ, range_text
 from snrmjax.simulate.solutions.hysteresis_cycles import (
@@ -29,26 +29,17 @@ LEAST_CYCLES = 2 * _WINDOW  # fewer cannot show that a motion has settled
 _SLOWEST = 0.9995  # decay per cycle that a transient is credited with at least
 
 
-class MotionStatus(IntEnum):
+class MotionStatus(Status):
     """How an integration towards a steady motion ended."""
 
-    SETTLED = 0  # repeats from cycle to cycle
-    STILL_SETTLING = 1  # changes ever less, but ran out of cycles
-    NOT_PERIODIC = 2  # keeps changing: quasi-periodic, subharmonic or chaotic
-    FAILED = 3  # grew without bound, or needed too many steps
-
-
-MOTION_MESSAGE: dict[MotionStatus, str] = {
-    MotionStatus.SETTLED: "settled: repeats from cycle to cycle",
-    MotionStatus.STILL_SETTLING: "still settling; allow more cycles",
-    MotionStatus.NOT_PERIODIC: (
+    SETTLED = 0, "settled: repeats from cycle to cycle"
+    STILL_SETTLING = 1, "still settling; allow more cycles"
+    NOT_PERIODIC = (
+        2,
         "does not repeat after one cycle of the force: a quasi-periodic, subharmonic or chaotic "
-        "motion, or one that is about to jump; allow more cycles to be sure"
-    ),
-    MotionStatus.FAILED: (
-        "grew without bound, or friction holds it so fast that too many steps are needed"
-    ),
-}
+        "motion, or one that is about to jump; allow more cycles to be sure",
+    )
+    FAILED = 3, "grew without bound, or friction holds it so fast that too many steps are needed"
 
 
 class IntegratedMotion(AbstractResult):
@@ -76,7 +67,7 @@ class IntegratedMotion(AbstractResult):
             f"frequency {range_text(np.asarray(self.frequency), 'Hz', HERTZ)}",
             f"velocity fundamental {range_text(velocity, 'm/s')}, first sensor",
             f"cycles {range_text(np.asarray(self.n_cycles), 'of the force')}",
-            *(f"status: {n} {MOTION_MESSAGE[kind]}" for kind, n in ends if n),
+            *(f"status: {n} {kind.message}" for kind, n in ends if n),
         )
 
     def variables(self) -> dict[str, Variable]:
@@ -141,7 +132,7 @@ def settled_motion(
     `vmap` over forces, frequencies and starts; other numbers do not compile anew.
     Returns an `IntegratedMotion`: where `converged`, a stable periodic motion, which is a start
     for other solvers and a seed of isolated branches. Its `status` says why not: see
-    `MOTION_MESSAGE`. Which of several stable motions is found depends on `start`.
+    `MotionStatus.message`. Which of several stable motions is found depends on `start`.
     Raises `ValueError` for a force or a frequency that is not positive, fewer than eight cycles
     and a start of another shape, `ImportError` without diffrax.
     Validity: a transient e^(−ζωt) takes about 2/ζ cycles to fall to 1e-5. Motions that friction

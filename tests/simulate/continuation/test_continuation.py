@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from snrmjax.simulate.continuation.continuation import (
-    STATUS_MESSAGE,
     CurveRange,
     CurveStatus,
     StepControl,
@@ -292,11 +291,6 @@ def test_a_start_may_be_corrected_at_fixed_amplitude():
     assert points[0, 0] == pytest.approx(0.3, abs=1e-14)
     assert points[0, 1] == pytest.approx(np.sqrt(1 - 0.09), abs=STEPS.tolerance)
     assert tangents[0, 0] > 0
-
-
-def test_every_status_has_a_message():
-    assert set(STATUS_MESSAGE) == set(CurveStatus)
-    assert all(len(message) > 10 for message in STATUS_MESSAGE.values())
 
 
 @pytest.mark.parametrize("max_points", [-1, 0, 1])

@@ -14,7 +14,6 @@ from snrmjax.model.potential import polynomial_potential
 from snrmjax.model.structures import simulated_structure, structure
 from snrmjax.simulate.solutions.forced_response import forced_response, solve_at_frequency
 from snrmjax.simulate.solutions.time_integration import (
-    MOTION_MESSAGE,
     IntegrationAccuracy,
     MotionStatus,
     settled_motion,
@@ -248,10 +247,6 @@ def test_a_motion_without_bounds_fails():
     motion = settled_motion(oscillator(cubic=-20.0), 1.0, OMEGA, max_cycles=300)
     assert motion.status == MotionStatus.FAILED
     assert motion.n_cycles < 300
-
-
-def test_every_end_has_a_message():
-    assert set(MOTION_MESSAGE) == set(MotionStatus)
 
 
 # ------------------------------------------------------------------------------ transformations

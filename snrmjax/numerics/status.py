@@ -1,0 +1,23 @@
+"""How a computation ended: one family of statuses, each with a message that says what to try."""
+
+from enum import IntEnum
+
+
+class Status(IntEnum):
+    """Base of statuses: a member is a whole number, as arrays hold it, and its `message`.
+
+    >>> class SolverStatus(Status):
+    ...     CONVERGED = 0, "converged"
+    ...     STEP_LIMIT = 1, "not converged: raise `max_steps`"
+    >>> SolverStatus(1).message
+    'not converged: raise `max_steps`'
+    """
+
+    message: str
+
+    def __new__(cls, value: int, message: str = "") -> "Status":
+        """A member from its number and its message."""
+        member = int.__new__(cls, value)
+        member._value_ = value
+        member.message = message
+        return member

@@ -1,0 +1,81 @@
+"""Every sentence that a fact becomes, a file a subject, each a table `SENTENCES` by kind.
+
+An entry is a template with the fact's values by name, or a function of them. Beside Python's own
+formats, templates know `{n:#state}` (1 state, 2 states), `{share:%.3g}` (of 0.05: 5 %) and lists
+("1, 2 and 5").
+"""
+
+import importlib
+import pkgutil
+import string
+from collections.abc import Callable, Sequence
+from functools import cache
+from typing import Any
+
+from snrmjax.numerics.facts import Fact
+
+Wording = str | Callable[..., str]
+
+
+class _Words(string.Formatter):
+    """Python's formats, numbers with a noun, shares in per cent, and lists."""
+
+    def format_field(self, value: Any, format_spec: str) -> str:
+        """See `string.Formatter`."""
+        if isinstance(value, list | tuple | set | frozenset):
+            return enumerated([self.format_field(one, format_spec) for one in value])
+        if format_spec.startswith("#"):
+            return number_of(value, format_spec[1:])
+        if format_spec.startswith("%"):
+            return f"{100 * value:{format_spec[1:]}} %"
+        return super().format_field(value, format_spec)
+
+
+_WORDS = _Words()
+
+
+def sentence(fact: Fact) -> str:
+    """The sentence that tells a fact.
+
+    >>> sentence(Fact("power_in_one_shape", share=0.987))
+    'one shape holds 98.7 % of the power'
+    """
+    wording = wordings()[fact.kind]
+    return wording(**fact) if callable(wording) else _WORDS.format(wording, **fact)
+
+
+def sentences(facts: Sequence[Fact]) -> list[str]:
+    """The sentences of several facts, each once."""
+    return list(dict.fromkeys(map(str, facts)))
+
+
+@cache
+def wordings() -> dict[str, Wording]:
+    """The wording of every kind of fact; no kind stands in two subjects."""
+    every: dict[str, Wording] = {}
+    for subject in pkgutil.iter_modules(__path__):
+        table = importlib.import_module(f"{__name__}.{subject.name}").SENTENCES
+        twice = every.keys() & table.keys()
+        if twice:
+            raise ValueError(f"worded twice: {enumerated(sorted(twice))}.")
+        every |= table
+    return every
+
+
+def enumerated(words: Sequence[Any]) -> str:
+    """Words as a list.
+
+    >>> enumerated([1, 2, 5])
+    '1, 2 and 5'
+    """
+    words = [str(word) for word in words]
+    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
+
+
+def number_of(number: int, noun: str) -> str:
+    """A number with its noun.
+
+    >>> number_of(1, "state"), number_of(3, "state")
+    ('1 state', '3 states')
+    """
+    return f"{number} {noun}{'' if number == 1 else 's'}"

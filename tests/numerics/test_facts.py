@@ -1,0 +1,77 @@
+"""Facts, their sentences, and statuses: every kind is worded, every message says something."""
+
+import ast
+import importlib
+import inspect
+import pkgutil
+import string
+from pathlib import Path
+
+import pytest
+
+import snrmjax
+from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.status import Status
+from snrmjax.report.sentences import sentence, wordings
+
+PACKAGE = Path(snrmjax.__file__).parent
+
+
+def stated_facts():
+    """Every `Fact("kind", name=…)` of the package: place, kind, names of values."""
+    for path in sorted(PACKAGE.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "Fact":
+                place = f"{path.relative_to(PACKAGE)}:{node.lineno}"
+                assert isinstance(node.args[0], ast.Constant), f"{place}: a kind is a constant"
+                yield place, node.args[0].value, {one.arg for one in node.keywords}
+
+
+def test_every_fact_is_worded_from_values_that_it_has():
+    stated, words = list(stated_facts()), wordings()
+    assert stated
+    for place, kind, names in stated:
+        assert kind in words, f"{place}: {kind!r} stands in no table of report/sentences"
+        if None in names:  # values given as a mapping
+            continue
+        wording = words[kind]
+        if callable(wording):
+            inspect.signature(wording).bind(**dict.fromkeys(names))
+            continue
+        fields = {
+            piece.partition(".")[0].partition("[")[0]
+            for _, piece, _, _ in string.Formatter().parse(wording)
+            if piece is not None
+        }
+        assert fields <= names, f"{place}: {kind!r} is worded with {fields - names}"
+
+
+def test_no_sentence_without_a_fact():
+    assert set(wordings()) == {kind for _, kind, _ in stated_facts()}
+
+
+def test_templates_count_share_and_list(monkeypatch):
+    table = {"example": "{n:#state} of levels {levels}, {share:%.2g}"}
+    monkeypatch.setattr("snrmjax.report.sentences.wordings", lambda: table)
+    fact = Fact("example", n=1, levels=(1, 2, 5), share=0.0512)
+    assert sentence(fact) == str(fact) == "1 state of levels 1, 2 and 5, 5.1 %"
+
+
+def test_facts_compare_and_hash_by_kind_and_values():
+    assert Fact("a", level=1) == Fact("a", level=1) != Fact("a", level=2)
+    assert len({Fact("a", level=1), Fact("a", level=1), Fact("b", level=1)}) == 2
+    assert Fact("a", level=1) != "a"
+
+
+def test_every_status_has_a_message_of_its_own():
+    for module in pkgutil.walk_packages(snrmjax.__path__, "snrmjax."):
+        if not any(part in module.name for part in (".report", ".cli", "__main__")):
+            importlib.import_module(module.name)
+    kinds = Status.__subclasses__()
+    assert len(kinds) >= 11
+    for kind in kinds:
+        messages = [member.message for member in kind]
+        assert all(messages)
+        assert len(set(messages)) == len(messages), kind
+    with pytest.raises(ValueError, match="is not a valid"):
+        kinds[0](99)
