@@ -114,7 +114,7 @@ def import_record(
                     sensors=sensors,
                     drive=drive,
                 )
-                states, notes, counts = swept.states, swept.remarks, None
+                states, notes, counts = swept.states, swept.notes, None
         except ValueError as error:
             failed.append(f"{kind}: {error}")
             continue
