@@ -19,7 +19,7 @@ COMMANDS = {
     "wrong": ("check", "conjugated.csv", "--model", "model.toml"),
     "diagnose": ("diagnose", "states.csv", "--model", "model.toml", "--no-responses"),
     "compare": ("compare", "states.csv", "--model", "model.toml"),
-    "modes": ("modes", "states.csv", "--drive-point", "tip"),
+    "modes": ("modes", "states.csv", "--unscaled", "--poles", "60"),
     "simulate": ("simulate", "model.toml", "--force", "1", "--from-hz", "45", "--to-hz", "55"),
     "test": ("test", "raw", "--no-diagnose"),
     "stopped": ("test", "stopped"),
