@@ -19,8 +19,7 @@ if TYPE_CHECKING:
     import xarray
 
     from snrmjax.report.study.summary import ScalarSummary
-    from snrmjax.study.compute import Progress, ProgressReport
-    from snrmjax.study.run import Shard, StudyRun
+    from snrmjax.study.run import Progress, ProgressReport, StudyRun
     from snrmjax.study.study import Study
 
 _QUIET_SECONDS = 30.0  # between lines of progress in a log
@@ -89,20 +88,25 @@ def run(
 
     Writes the data set OUT. Stopped at any moment, it loses only what was being computed then.
     """
-    from snrmjax.study.run import RunSettings, run_study
+    from snrmjax.study.execution import ClusterGone
+    from snrmjax.study.run import run_study
     from snrmjax.study.study_file import read_study
-    from snrmjax.study.workers import ClusterGone
 
     asked = asked_for(StudyOptions, options)
     quiet = asked.quiet
-    part = None if asked.shard is None else _shard(asked.shard)
+    part = (1, 1) if asked.shard is None else _shard(asked.shard)
     study = read_study(file)
     if not quiet:
         _say_study(study)
     try:
         with _progress(quiet) as progress:
-            settings = RunSettings(asked.processes, asked.scheduler, part, progress)
-            done = run_study(study, out, settings)
+            done = run_study(
+                *(study, out),
+                processes=asked.processes,
+                scheduler=asked.scheduler,
+                shard=part,
+                progress=progress,
+            )
     except KeyboardInterrupt:
         warn("stopped; the same command continues.")
         sys.exit(_INTERRUPTED)
@@ -139,13 +143,11 @@ def report(
     say(f"written to {out}")
 
 
-def _shard(text: str) -> "Shard":
-    from snrmjax.study.run import Shard
-
+def _shard(text: str) -> tuple[int, int]:
     part, slash, parts = text.partition("/")
     if not (slash and part.isdecimal() and parts.isdecimal()):
         raise ValueError(f"`--shard` must be I/N, such as 2/8, but is {text!r}.")
-    return Shard(int(part), int(parts))
+    return int(part), int(parts)
 
 
 def _say_study(study: "Study") -> None:
