@@ -14,6 +14,7 @@ from snrmjax.io.tables import steady_states_of_fields
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.velocity_states import velocity_factors
 from snrmjax.measure.states import SteadyStates
+from snrmjax.numerics.facts import Fact
 
 _OWN = ("frequency_hz", "velocity_re_m_s", "velocity_im_m_s")
 _OWN_FILES = ({"frequency_hz", "velocity_re_m_s"}, {"frequency_hz", "velocity_m_s", "level"})
@@ -90,17 +91,14 @@ def _with_force(states: SteadyStates, told: ImportMap) -> SteadyStates:
     return dataclasses.replace(states, force=newtons, drive=drive, force_std=std)
 
 
-def restated_in_words(told: ImportMap) -> str:
-    """What of our table is told to be otherwise; empty where nothing is."""
-    return ", ".join(
-        words
-        for said, words in (
-            (told.unit, f"velocity columns in {told.unit}"),
-            (told.force_unit, f"forces in {told.force_unit}"),
-            (told.amplitude not in ("", "peak"), f"amplitudes {told.amplitude}"),
-            (told.phase_sign == "lag", "phasors conjugated"),
-        )
-        if said
+def restated_how(told: ImportMap) -> Fact:
+    """What of our table is told to be otherwise."""
+    return Fact(
+        "our_own_table",
+        unit=told.unit,
+        force_unit=told.force_unit,
+        amplitude="" if told.amplitude == "peak" else told.amplitude,
+        conjugated=told.phase_sign == "lag",
     )
 
 
