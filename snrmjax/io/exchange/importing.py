@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from snrmjax.io.columns import is_ours
 from snrmjax.io.exchange.import_levels import MeasuredPart, numbered_levels
 from snrmjax.io.exchange.import_map import Assumptions, ImportMap
 from snrmjax.io.exchange.import_units import Force
 from snrmjax.io.exchange.own_tables import (
-    is_own_table,
     restated,
     restated_how,
     states_of_own_table,
@@ -79,7 +79,9 @@ def import_files(paths: Sequence[Path], told: ImportMap) -> Imported:
     if isinstance(chosen[0].content, TimeRecording):
         return _records(chosen, told, assumed, notes)
     own = [
-        one for one in chosen if isinstance(one.content, NumberTable) and is_own_table(one.content)
+        one
+        for one in chosen
+        if isinstance(one.content, NumberTable) and is_ours(one.content.columns)
     ]
     if own and not told.responses:
         parts = [

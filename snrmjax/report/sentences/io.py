@@ -52,6 +52,22 @@ SENTENCES: dict[str, Wording] = {
     "record_recognised": "recognised in the record",
     "spectra_of_one_reference": "spectra or responses over one reference, of amplitude 1",
     "reference_without_unit": "the file states none of the reference",
+    # Notes on our own tables.
+    "column_without_name": "column {number} of {file} has no name and is not used.",
+    "column_not_used": lambda name, file, near: (
+        f"the column `{name}` of {file} is not used{f' (did you mean `{near}`?)' if near else ''}."
+    ),
+    "column_partly_stated": (
+        "`{name}` is not stated in {n} of {of} rows of {file} (first in row {first_row})."
+    ),
+    "error_of_no_harmonics": (
+        "`harmonic_std_m_s` of {file} is not used: the table has no harmonics."
+    ),
+    "error_of_no_phases": "`phase_std_deg` of {file} is not used: the table has no phases.",
+    "amplitudes_without_phases": (
+        "{file} has the amplitude of the velocity alone: its phase is unknown, and that of "
+        "harmonics is not used."
+    ),
     # Notes on an import.
     "note_of_file": "{file}: {note}",
     "rows_incomplete": "{n} of {of} rows of {file} are incomplete, left out.",
