@@ -328,7 +328,8 @@ def write_findings(
     and damping, of which the tables then have a column. Returns the report.
     """
     done = done | found.settings
-    results.write_points(folder / "points.csv", found.identification)
+    added = (shown.column, shown.power)
+    results.write_points(folder / "points.csv", found.identification, added=added)
     if found.predictions:
         drives = [one.drive for one in found.predictions for _ in one.responses]
         stds = [b.velocity_std for one in found.predictions for b in one.banded]
@@ -336,16 +337,12 @@ def write_findings(
         results.write_prediction(*given, drives=drives, velocity_stds=stds)
     summary: dict[str, object] = {"program": "snrmjax", "version": version("snrmjax"), **done}
     if found.fitted is None:
-        results.write_backbone(folder / "backbone.csv", found.identification)
+        results.write_backbone(folder / "backbone.csv", found.identification, added=added)
     else:
-        _write_fit(folder, found, found.fitted)
+        _write_fit(folder, found, found.fitted, added)
         banded = [response for one in found.predictions for response in one.banded]
         fit = joint_results.summarise_fit(found.fitted.fit, banded, found.fitted.shares)
         summary["joint_fit"] = fit
-    for name, of in (("points", "backbone_velocity_m_s"), ("backbone", "velocity_m_s")):
-        if shown.power:
-            added = of.replace(VELOCITY.column, shown.column)
-            results.with_amplitude(folder / f"{name}.csv", of, added, shown.power)
     summary |= results.summarise(found.identification, found.values)
     summary["resonances"] = [
         results.summarise_resonance(each) | ({} if one.drive is None else {"drive_v": one.drive})
@@ -367,9 +364,9 @@ def write_findings(
     return report
 
 
-def _write_fit(folder: Path, found: Findings, fitted: ReportedFit) -> None:
+def _write_fit(folder: Path, found: Findings, fitted: ReportedFit, added: tuple[str, int]) -> None:
     """Write the files that a joint fit adds, and its curves."""
-    joint_results.write_fitted_backbone(folder / "backbone.csv", fitted.fit)
+    joint_results.write_fitted_backbone(folder / "backbone.csv", fitted.fit, added=added)
     joint_results.write_joint_fit(folder / "fit.json", fitted.fit)
     if found.advice is not None:
         joint_results.write_next(folder / "next.csv", found.advice)
