@@ -50,7 +50,7 @@ def import_(
     next test. Records of free decays and broadband tests are written as record.csv.
     """
     from snrmjax.io.exchange.exports import write_import
-    from snrmjax.io.exchange.import_options import map_of_options
+    from snrmjax.io.exchange.import_map import map_of_options
     from snrmjax.io.exchange.importing import import_files
     from snrmjax.io.exchange.listing import listed_contents, suggested_command
     from snrmjax.io.laboratory.reading import read_laboratory_file

@@ -131,7 +131,7 @@ def run_whole_test(
         *left_out,
         *files.notes,
         *_taken_sensors(files, model),
-        *(Fact("steps_used", file=each.file, counts=each.steps.counts) for each in stepped),
+        *(_note_on_steps(each) for each in stepped),
         *by_points,
     )
     counts = _used_steps(files, stepped)
@@ -162,6 +162,12 @@ def not_diagnosed(data: SteadyStates, model: Structure) -> tuple[Note, ...]:
     """
     doubts = (*wrong_phases(data, model), *doubt(data, model))
     return (Fact("diagnosis_left_out", why=str(doubts[0])),) if doubts else ()
+
+
+def _note_on_steps(record: SteppedRecord) -> Note:
+    counts = record.steps.counts
+    used = Fact("steps_used", used=counts.used, left_out=tuple(counts.left_out.items()))
+    return Fact("note_of_file", file=record.file, note=used)
 
 
 def _taken_sensors(files: TestFiles, model: Structure) -> tuple[Note, ...]:

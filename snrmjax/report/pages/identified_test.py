@@ -181,7 +181,8 @@ def write(
     """
     shown = SHOWN_AMPLITUDES[axis]
     done = {"data": data, "model": model or found.model.name} | settings_in_words(found)
-    results.write_points(folder / "points.csv", found.identification)
+    added = (shown.column, shown.power)
+    results.write_points(folder / "points.csv", found.identification, added=added)
     if found.predictions:
         drives = [one.drive for one in found.predictions for _ in one.responses]
         stds = [b.velocity_std for one in found.predictions for b in one.banded]
@@ -189,16 +190,12 @@ def write(
         results.write_prediction(*given, drives=drives, velocity_stds=stds)
     summary: dict[str, object] = {"program": "snrmjax", "version": version("snrmjax"), **done}
     if found.joint is None:
-        results.write_backbone(folder / "backbone.csv", found.identification)
+        results.write_backbone(folder / "backbone.csv", found.identification, added=added)
     else:
-        _write_fit(folder, found.joint)
+        _write_fit(folder, found.joint, added)
         banded = [response for one in found.predictions for response in one.banded]
         details = found.joint
         summary["joint_fit"] = joint_results.summarise_fit(details.fit, banded, details.shares)
-    for name, of in (("points", "backbone_velocity_m_s"), ("backbone", "velocity_m_s")):
-        if shown.power:
-            added = of.replace(VELOCITY.column, shown.column)
-            results.with_amplitude(folder / f"{name}.csv", of, added, shown.power)
     summary |= results.summarise(found.identification, found.values)
     summary["resonances"] = [
         results.summarise_resonance(each) | ({} if one.drive is None else {"drive_v": one.drive})
@@ -220,9 +217,9 @@ def write(
     return report
 
 
-def _write_fit(folder: Path, details: FitDetails) -> None:
+def _write_fit(folder: Path, details: FitDetails, added: tuple[str, int]) -> None:
     """Write the files that a joint fit adds, and its curves."""
-    joint_results.write_fitted_backbone(folder / "backbone.csv", details.fit)
+    joint_results.write_fitted_backbone(folder / "backbone.csv", details.fit, added=added)
     joint_results.write_joint_fit(folder / "fit.json", details.fit)
     if details.advice is not None:
         joint_results.write_next(folder / "next.csv", details.advice)

@@ -1,12 +1,7 @@
 """What pipelines have to tell beside what their parts tell."""
 
-from snrmjax.measure.recordings.step_counts import StepCounts
 from snrmjax.numerics.status import Status
 from snrmjax.report.sentences import Wording, enumerated
-
-
-def _steps_used(file: str, counts: StepCounts) -> str:
-    return f"{file}: {counts.words}"
 
 
 def _ended(force: float, status: Status) -> str:
@@ -64,7 +59,6 @@ SENTENCES: dict[str, Wording] = {
         "no sensor is named in {files}: taken for the model's only one, {sensor}. A column "
         "`sensor`, or `--sensor` of the import, states it."
     ),
-    "steps_used": _steps_used,
     "no_joint_fit": ("curves go through single points, as a joint fit was not possible: {why}"),
     "isolated_searched": (
         "{n} further branches found at {force:g} N, of {n_starts} starts ({n_failed} failed)"
