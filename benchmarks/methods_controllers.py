@@ -32,7 +32,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import snrmjax as sj
-from snrmjax.methods import FeedbackSettings, Instruments, LoopGains, MethodStatus, Shaker
+from snrmjax.methods import MethodStatus
+from snrmjax.simulate import FeedbackSettings, Instruments, LoopGains, Shaker
 
 HERTZ = 2 * np.pi
 PHASES = np.radians([55, 40, 25, 10, 0, -15, -30, -40, -50, -60, -70, -78])
@@ -43,7 +44,7 @@ class Case(NamedTuple):
     """A structure in its laboratory and what is asked of it."""
 
     model: sj.model.Structure
-    laboratory: sj.methods.Laboratory
+    laboratory: sj.simulate.Laboratory
     largest_force: float  # N, of the true backbone
     voltages: np.ndarray  # V, of the loop
     gains: tuple[LoopGains, LoopGains]
@@ -67,7 +68,7 @@ def stop() -> Case:
     instruments = Instruments(force_noise=1e-3, velocity_noise=1e-4)
     return Case(
         model,
-        sj.methods.Laboratory(model, shaker, instruments, 4000.0, substeps=4),
+        sj.simulate.Laboratory(model, shaker, instruments, 4000.0, substeps=4),
         1.5,
         np.array([6.0, 10.0, 15.0, 20.0, 25.0, 30.0, 40.0]),
         (LoopGains(120.0, 16.0), LoopGains(160.0, 22.0)),
@@ -91,7 +92,7 @@ def flat() -> Case:
     feedback = FeedbackSettings(40.0, filter_rate=150.0)
     return Case(
         model,
-        sj.methods.Laboratory(model, shaker, instruments, 10000.0, substeps=4),
+        sj.simulate.Laboratory(model, shaker, instruments, 10000.0, substeps=4),
         1.6e-2,
         np.array([0.5, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0]),
         (LoopGains(100.0, 40.0), LoopGains(200.0, 60.0)),
@@ -156,10 +157,10 @@ def open_loop(case: Case):
     steps = HERTZ * np.linspace(*case.ends, 29)
     found = []
     for way in (steps, steps[::-1]):
-        test = sj.methods.stepped_sine_test(
+        test = sj.simulate.stepped_sine_test(
             case.laboratory, case.voltage, way, settle_cycles=case.settle
         )
-        states = sj.methods.steady_states_of(case.laboratory, test)
+        states = sj.simulate.steady_states_of(case.laboratory, test)
         found.append(np.abs(np.asarray(states.velocity)[:, 0])[np.argsort(way)])
     return steps, *found
 
@@ -305,12 +306,12 @@ def run(name: str, case: Case, axes) -> None:
 
     began = time.time()
     sweeps = [
-        sj.methods.phase_sweep(
+        sj.simulate.phase_sweep(
             case.laboratory, case.voltage, PHASES, gains=gains, settle_cycles=case.settle
         )
         for gains in case.gains
     ]
-    held = [np.array([s is MethodStatus.FOUND for s in one.status]) for one in sweeps]
+    held = [one.held for one in sweeps]
     true = np.array(
         [
             [
@@ -362,7 +363,7 @@ def run(name: str, case: Case, axes) -> None:
     began = time.time()
     omega = HERTZ * case.frequency
     curves = [
-        sj.methods.s_curve(case.laboratory, omega, case.amplitudes, settings)
+        sj.simulate.s_curve(case.laboratory, omega, case.amplitudes, settings)
         for settings in case.feedback
     ]
     ok = np.isfinite(curves[0].force)
@@ -407,7 +408,7 @@ def run(name: str, case: Case, axes) -> None:
         pll=[MethodStatus(int(s)).name.lower() for s in lost.status],
         cbc_filter_too_fast=int(
             np.isnan(
-                sj.methods.s_curve(case.laboratory, omega, case.amplitudes[:2], blown).force
+                sj.simulate.s_curve(case.laboratory, omega, case.amplitudes[:2], blown).force
             ).sum()
         ),
         of=2,
