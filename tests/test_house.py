@@ -73,7 +73,6 @@ SUB_ROOMS = {
     "identify.scaling": {"identify.modal"},
     "methods.steady": {"methods.result", "methods.one_sensor"},
     "methods.records": {"methods.result", "methods.one_sensor"},
-    "methods.bench": {"methods.result", "methods.one_sensor"},
     "identify.test_model": {"identify.checks", "identify.curves"},
     "diagnose.misfit": set(),
     "diagnose.search": {"diagnose.misfit", "diagnose.priors"},

@@ -6,7 +6,7 @@ import pytest
 from scipy.signal import butter, freqz
 
 import snrmjax as sj
-from snrmjax.methods import Instruments, Laboratory, Playback, Shaker, run_test
+from snrmjax.simulate import Instruments, Laboratory, Playback, Shaker, run_test
 
 REST, RATIO, MASS = 2 * np.pi * 40.0, 0.01, 0.8
 SHAPE = 1 / np.sqrt(MASS)
@@ -128,13 +128,13 @@ def test_microslip_settles_where_the_steady_cycle_is():
         structure(joint), shaker, Instruments(), 6000.0, largest_displacement=6e-4
     )
     frequencies = 2 * np.pi * np.array([38.0, 38.8, 39.6])
-    test = sj.methods.stepped_sine_test(laboratory, 60.0, frequencies)
-    states = sj.methods.steady_states_of(laboratory, test)
+    test = sj.simulate.stepped_sine_test(laboratory, 60.0, frequencies)
+    states = sj.simulate.steady_states_of(laboratory, test)
     for k, omega in enumerate(frequencies):
         truth = sj.simulate.settled_motion(structure(joint), float(states.force[k]), omega)
         np.testing.assert_allclose(states.velocity[k, 0], truth.velocity[1, 0], rtol=5e-4)
     with pytest.raises(ValueError, match=r"beyond `largest_displacement`, 0\.0006 m"):
-        sj.methods.stepped_sine_test(laboratory, 600.0, frequencies[1:2])
+        sj.simulate.stepped_sine_test(laboratory, 600.0, frequencies[1:2])
 
 
 def test_what_cannot_stand_in_the_laboratory_is_refused():

@@ -10,6 +10,7 @@ References: for response control, T. Karaağaçlı & H. N. Özgüven, Mech. Syst
 Trans. Inf. Theory 16 (1970) 85, doi:10.1109/TIT.1970.1054411.
 """
 
+import dataclasses
 from typing import Literal, NamedTuple, get_args
 
 import equinox as eqx
@@ -17,21 +18,24 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from snrmjax.identify.pointwise.snrm import reference_sensor
 from snrmjax.measure.records import steady_state_from_records
 from snrmjax.measure.states import SteadyStates, join_steady_states
-from snrmjax.methods.bench.equipment import positive
-from snrmjax.methods.bench.fourier_filter import FourierState, followed, nothing_followed
-from snrmjax.methods.bench.laboratory import (
+from snrmjax.model.modes import reference_sensor
+from snrmjax.simulate.balance.given_numbers import positive
+from snrmjax.simulate.virtual_test.laboratory import (
     AbstractController,
     Laboratory,
     Sample,
     TestRecord,
-    detached,
     run_test,
 )
-from snrmjax.methods.bench.pll import LoopGains, lock_in
-from snrmjax.methods.result import MethodPoint
+from snrmjax.simulate.virtual_test.phase_loop import LoopGains, locked_motions
+from snrmjax.simulate.virtual_test.record_phasors import (
+    FourierState,
+    HeldMotion,
+    followed,
+    nothing_followed,
+)
 
 Held = Literal["voltage", "force", "velocity", "displacement"]
 
@@ -61,11 +65,15 @@ class DecayTest(NamedTuple):
 
     record: TestRecord  # from the moment on at which the shaker is away
     seconds: float  # resonance and decay
-    resonance: MethodPoint  # `FOUND` where the loop had locked
+    resonance: HeldMotion  # `held` where the loop had locked
 
 
 class AmplitudeGains(NamedTuple):
-    """How a stepped sine holds an amplitude."""
+    """How a stepped sine holds an amplitude.
+
+    A branch that folds over at fixed frequency needs k > −d ln F/d ln X there; far from resonance
+    a large k meets the filters' delay, and the loop rings.
+    """
 
     filter_rate: float  # 1/s
     proportional: float  # k
@@ -78,13 +86,13 @@ class Playback(AbstractController):
     voltages: Float[Array, " sample"]
 
     def initial(self) -> Int[Array, ""]:
-        """See `AbstractController.initial`: the number of the sample."""
+        """The number of the sample."""
         return jnp.asarray(0)
 
     def step(
         self, state: Int[Array, ""], sample: Sample, period: Float[Array, ""]
     ) -> tuple[Array, Array, Array]:
-        """See `AbstractController.step`."""
+        """The voltage of the next row."""
         voltage = self.voltages.at[state].get(mode="fill", fill_value=0.0)
         return state + 1, voltage, state
 
@@ -112,21 +120,21 @@ class SteppedSineDrive(AbstractController):
     held: Held = eqx.field(static=True)
 
     def initial(self) -> StepState:
-        """See `AbstractController.initial`."""
+        """At rest, with nothing followed."""
         zero = jnp.zeros(())
         return StepState(jnp.asarray(0), zero, zero, nothing_followed(2, _ORDERS))
 
     def step(
         self, state: StepState, sample: Sample, period: Float[Array, ""]
     ) -> tuple[StepState, Array, Array]:
-        """See `AbstractController.step`."""
+        """A sine of the step's frequency, as large as what is held wants it."""
         number = (state.samples - self.approach) // self.dwell
         omega = self.frequencies[jnp.clip(number, 0, self.frequencies.size - 1)]
         seen = jnp.stack([sample.force, sample.velocity])
         filters = followed(state.filters, seen, state.angle, _ORDERS, self.filter_rate * period)
         integral, size = state.integral, self.target
         if self.held != "voltage":
-            found = jnp.abs(filters.fundamental(0 if self.held == "force" else 1))
+            found = jnp.abs(filters.harmonics[0 if self.held == "force" else 1, 0])
             found = found / omega if self.held == "displacement" else found
             error = jnp.clip(1 - found / self.target, -_LARGEST_ERROR, _LARGEST_ERROR)
             integral = integral + self.integral_rate * period * error
@@ -134,15 +142,6 @@ class SteppedSineDrive(AbstractController):
         angle = jnp.mod(state.angle + omega * period, 2 * jnp.pi)
         after = StepState(state.samples + 1, angle, integral, filters)
         return after, size * jnp.cos(angle), angle
-
-
-def standard_amplitude_gains(laboratory: Laboratory) -> AmplitudeGains:
-    """Gains from the linear mode of interest: filters of ω/3, k = 1.5, λ = ζω.
-
-    A branch that folds over at fixed frequency needs k > −d ln F/d ln X there; far from resonance
-    a large k meets the filters' delay, and the loop rings.
-    """
-    return AmplitudeGains(laboratory.frequency / 3, 1.5, laboratory.decay)
 
 
 def stepped_sine_test(
@@ -162,7 +161,8 @@ def stepped_sine_test(
     Arguments: `target` is the amplitude of what is `held`: voltage (V; open loop), force (N),
     velocity (m/s) or displacement (m) at the reference sensor; `frequencies` in rad/s in the order
     of the test; cycles of the linear mode of interest at each of them, to settle and then to
-    record; `gains` by default `standard_amplitude_gains`; `first_voltage` (V) is where a law
+    record; `gains` by default filters of ω/3 of the mode of interest, k = 1.5 and λ = ζω;
+    `first_voltage` (V) is where a law
     begins, given five times 1/λ at the first frequency before the first step.
     Returns a `LaboratoryTest` with its steps, for `steady_states_of`. An amplitude that is not
     reached is seen there: the law has no status. Raises `ValueError` for numbers that are not
@@ -170,7 +170,8 @@ def stepped_sine_test(
     """
     if held not in get_args(Held):
         raise ValueError(f"`held` must be one of {', '.join(get_args(Held))}, but is {held!r}.")
-    rates = standard_amplitude_gains(laboratory) if gains is None else gains
+    rates = AmplitudeGains(laboratory.frequency / 3, 1.5, laboratory.decay)
+    rates = rates if gains is None else gains
     steps = np.atleast_1d(np.asarray(frequencies, dtype=float))
     for name, values in (
         *(("target", target), ("frequencies", steps), ("first_voltage", first_voltage)),
@@ -255,23 +256,23 @@ def decay_test(
     """Hold phase resonance by a loop, take the shaker away and record the decay.
 
     Arguments: `voltage` in V of the resonance; `decay_seconds` after it; the others as in
-    `phase_locked_loop`. Returns a `DecayTest`, whose velocity goes into `resonant_decay`.
+    `locked_motions`. Returns a `DecayTest`, whose velocity goes into `resonant_decay`.
     Raises `ValueError` for numbers that are not positive.
     """
     positive("decay_seconds", decay_seconds)
-    held = lock_in(
-        laboratory,
-        voltage,
+    (resonance,), state, seconds = locked_motions(
+        *(laboratory, [(voltage, 0.0)]),
         gains=gains,
         settle_cycles=settle_cycles,
         record_cycles=record_cycles,
         seed=seed,
     )
     free = Playback(jnp.zeros(1))
-    start = held.state._replace(controller=free.initial(), voltage=jnp.zeros(3))
+    start = state._replace(controller=free.initial(), voltage=jnp.zeros(3))
     count = round(decay_seconds * laboratory.sampling_rate)
-    record, _ = run_test(detached(laboratory), free, count, start=start, seed=seed + 1)
-    return DecayTest(record, held.seconds + decay_seconds, held.point)
+    away = dataclasses.replace(laboratory, attached=False)
+    record, _ = run_test(away, free, count, start=start, seed=seed + 1)
+    return DecayTest(record, seconds + decay_seconds, resonance)
 
 
 def steady_states_of(

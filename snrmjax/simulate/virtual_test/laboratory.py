@@ -14,7 +14,6 @@ doi:10.1016/0022-460X(79)90681-9.
 """
 
 import abc
-import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -24,26 +23,26 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from snrmjax.identify.pointwise.snrm import reference_sensor
-from snrmjax.methods.bench.equipment import (
-    Instruments,
-    Shaker,
-    check_instruments,
-    check_shaker,
-    filter_sections,
-)
 from snrmjax.model.effect_base import (
     AbstractForceSpectrum,
     AbstractHysteresis,
     AbstractKinked,
     AbstractMeasurementEffect,
 )
+from snrmjax.model.modes import reference_sensor
 from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.simulate.solutions.hysteresis_cycles import (
     memory_after_step,
     memory_at_rest,
     memory_rate,
     scaled_friction,
+)
+from snrmjax.simulate.virtual_test.equipment import (
+    Instruments,
+    Shaker,
+    check_instruments,
+    check_shaker,
+    filter_sections,
 )
 
 _FEWEST_STEPS = 20  # a cycle of the fastest linear motion, that the integration can follow it
@@ -191,11 +190,6 @@ class Laboratory(eqx.Module):
             return ()
         speed = self.reach() * self.frequency / np.sqrt(2)
         return scaled_friction(self.structure, self.reach(), speed)
-
-
-def detached(laboratory: Laboratory) -> Laboratory:
-    """The same laboratory with the shaker taken away, for a free decay."""
-    return dataclasses.replace(laboratory, attached=False)
 
 
 def run_test(

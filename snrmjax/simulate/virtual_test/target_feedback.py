@@ -24,30 +24,32 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from snrmjax.methods.bench.equipment import positive
-from snrmjax.methods.bench.fourier_filter import FourierState, followed, nothing_followed
-from snrmjax.methods.bench.held_phasors import (
-    HANN,
-    noise_of_sample,
-    scatter_of_ratio,
-    with_velocity_errors,
-)
-from snrmjax.methods.bench.laboratory import (
+from snrmjax.simulate.balance.given_numbers import positive
+from snrmjax.simulate.virtual_test.laboratory import (
     AbstractController,
     Laboratory,
     LabState,
     Sample,
     run_test,
 )
-from snrmjax.methods.one_sensor import drive_point
-from snrmjax.methods.result import MethodPoint, MethodResult, MethodStatus, method_result
+from snrmjax.simulate.virtual_test.record_phasors import (
+    HANN,
+    FourierState,
+    HeldMotion,
+    followed,
+    noise_of_sample,
+    nothing_followed,
+    scatter_of_ratio,
+    through_hann_window,
+)
 
 _ORDERS = np.arange(1, 8)  # harmonics of the target
 _PHASE = np.radians(0.5)  # between force and velocity, below which a motion is on the backbone
 _STEADY = 0.01  # change of the velocity's fundamental between the halves of a record, relative
 _LARGEST = 100.0  # times the target, beyond which the loop is unstable
 _MOST_STEPS = 8  # of frequency at one amplitude
-_FIRST_STEP = 0.002  # of the frequency, relative, where a slope is not yet known
+_LARGEST_STEP = 0.02  # of the frequency, relative
+_NEXT_SEED = 7919  # a prime: noise of one run is not that of another test's
 
 
 class FeedbackSettings(NamedTuple):
@@ -59,18 +61,6 @@ class FeedbackSettings(NamedTuple):
     picard_steps: int = 6
     invasive: float = 0.02  # higher harmonics of the feedback over its fundamental, at most
     filter_rate: float = 0.0  # 1/s, of the filter of the fundamental; 0 feeds the whole velocity
-
-
-class HeldMotion(NamedTuple):
-    """A motion that the feedback holds: fundamentals and how far it disturbs."""
-
-    frequency: float  # rad/s
-    force: complex  # N
-    velocity: complex  # m/s
-    invasive: float  # higher harmonics of the voltage over its fundamental
-    unsteady: float  # change of the velocity between the halves of the record, relative
-    ratio_std: float  # of force over velocity, relative: of either part
-    velocity_std: float  # relative
 
 
 class SCurve(NamedTuple):
@@ -90,13 +80,13 @@ class TargetFeedback(AbstractController):
     target: Complex[Array, " order"]  # m/s
 
     def initial(self) -> Float[Array, ""]:
-        """See `AbstractController.initial`: the angle of the target."""
+        """The angle of the target."""
         return jnp.zeros(())
 
     def step(
         self, state: Float[Array, ""], sample: Sample, period: Float[Array, ""]
     ) -> tuple[Array, Array, Array]:
-        """See `AbstractController.step`."""
+        """The voltage that pulls the velocity towards the target."""
         wanted = jnp.sum(jnp.real(self.target * jnp.exp(1j * _ORDERS * state)))
         voltage = self.gain * (wanted - sample.velocity)
         return jnp.mod(state + self.frequency * period, 2 * jnp.pi), voltage, state
@@ -111,27 +101,34 @@ class FundamentalFeedback(AbstractController):
     filter_rate: Float[Array, ""]  # 1/s
 
     def initial(self) -> tuple[Float[Array, ""], FourierState]:
-        """See `AbstractController.initial`: the angle of the target, and the filter."""
+        """The angle of the target, and the filter."""
         return jnp.zeros(()), nothing_followed(1, _ORDERS)
 
     def step(
         self, state: tuple[Float[Array, ""], FourierState], sample: Sample, period: Float[Array, ""]
     ) -> tuple[tuple[Array, FourierState], Array, Array]:
-        """See `AbstractController.step`."""
+        """The voltage that pulls the velocity's fundamental towards the target."""
         angle, filters = state
         share = self.filter_rate * period
         filters = followed(filters, sample.velocity[None], angle, _ORDERS, share)
-        missing = self.target - filters.fundamental(0)
+        missing = self.target - filters.harmonics[0, 0]
         voltage = self.gain * jnp.real(missing * jnp.exp(1j * angle))
         return (jnp.mod(angle + self.frequency * period, 2 * jnp.pi), filters), voltage, angle
 
 
-class _Bench:
-    """The laboratory as it goes on from one measurement to the next."""
+class FeedbackBench:
+    """The laboratory under a target feedback as it goes on from one measurement to the next.
+
+    Raises `ValueError` for settings that are not positive.
+    """
 
     def __init__(self, laboratory: Laboratory, settings: FeedbackSettings, seed: int):
+        if not all(np.isfinite(value) and value > 0 for value in settings[:-1]) or not (
+            0 <= settings.filter_rate < np.inf
+        ):
+            raise ValueError(f"the settings of the feedback must be positive, but are {settings}.")
         self.laboratory, self.settings, self.seed = laboratory, settings, seed
-        self.samples, self.runs = 0, 0
+        self.runs = 0
         self.state: LabState | None = None
         self.settle = laboratory.samples(settings.settle_cycles)
         self.keep = laboratory.samples(settings.record_cycles)
@@ -139,9 +136,10 @@ class _Bench:
 
     @property
     def seconds(self) -> float:
-        return self.samples / self.laboratory.sampling_rate
+        """How long all measurements took."""
+        return self.runs * (self.settle + self.keep) / self.laboratory.sampling_rate
 
-    def feedback(self, frequency: float, amplitude: float) -> AbstractController:
+    def _feedback(self, frequency: float, amplitude: float) -> AbstractController:
         """The controller of the next measurement."""
         gain, omega = jnp.asarray(float(self.settings.gain)), jnp.asarray(float(frequency))
         if self.settings.filter_rate:
@@ -150,20 +148,17 @@ class _Bench:
         target = np.concatenate([[amplitude], self.higher])
         return TargetFeedback(gain, omega, jnp.asarray(target))
 
-    def held(self, frequency: float, amplitude: float) -> HeldMotion:
-        """The motion under a target of this amplitude, higher harmonics left alone."""
+    def motion(self, frequency: float, amplitude: float) -> HeldMotion:
+        """The motion under a target of this amplitude (m/s), higher harmonics left alone."""
         for _ in range(self.settings.picard_steps):
-            feedback = self.feedback(frequency, amplitude)
             self.runs += 1
-            count = self.settle + self.keep
             record, self.state = run_test(
                 self.laboratory,
-                feedback,
-                count,
+                self._feedback(frequency, amplitude),
+                self.settle + self.keep,
                 start=self.state,
-                seed=self.seed + 7919 * self.runs,
+                seed=self.seed + _NEXT_SEED * self.runs,
             )
-            self.samples += count
             angle, force, velocity, voltage = (
                 np.asarray(column)[-self.keep :]
                 for column in (record.report, record.force, record.velocity, record.voltage)
@@ -171,7 +166,7 @@ class _Bench:
             # A diverging loop may leave numbers whose squares overflow, or none at all.
             if not np.abs(velocity).max() < _LARGEST * amplitude:
                 self.state, self.higher = None, np.zeros_like(self.higher)
-                return HeldMotion(frequency, *6 * (np.nan,))
+                return HeldMotion(False, frequency)
             moved, drive, pushed = (_harmonics(x, angle) for x in (velocity, voltage, force))
             invasive = float(np.linalg.norm(drive[1:]) / np.abs(drive[0]))
             self.higher = moved[1:]
@@ -190,19 +185,40 @@ class _Bench:
         ]
         scatter = np.sqrt(HANN) * scatter_of_ratio(force, velocity, angle)
         return HeldMotion(
-            *(frequency, complex(pushed[0]), complex(moved[0]), invasive, unsteady),
-            *(max(float(np.hypot(*noise)), float(scatter)), float(noise[1])),
+            held=invasive < self.settings.invasive and unsteady < _STEADY,
+            frequency=frequency,
+            force=complex(pushed[0]),
+            velocity=complex(moved[0]),
+            ratio_std=max(float(np.hypot(*noise)), float(scatter)),
+            velocity_std=float(noise[1]),
+            invasive=invasive,
         )
 
-    def holds(self, found: HeldMotion) -> bool:
-        """Whether a motion was held, steadily and without invasion."""
-        return found.invasive < self.settings.invasive and found.unsteady < _STEADY
+    def resonance(self, omega: float, amplitude: float) -> HeldMotion:
+        """The motion in phase with its force at one amplitude, by the secant method.
+
+        Starts at the frequency `omega` (rad/s); not `held` where the phase is beyond 0.5°.
+        """
+        before: tuple[float, float] | None = None
+        for _ in range(_MOST_STEPS):
+            found = self.motion(omega, amplitude)
+            phase = float(np.angle(found.velocity / found.force))
+            if not abs(phase) >= _PHASE:  # on the backbone, or lost
+                return found
+            # A mode's tan φ = (ω̃² − Ω²)/(2ζ̃ω̃Ω): straight in frequency, with slope −1/(ζ̃ω̃).
+            error = np.tan(np.clip(phase, -1.4, 1.4))
+            step = self.laboratory.decay * error
+            if before is not None and before[1] != error:
+                secant = -error * (omega - before[0]) / (error - before[1])
+                step = secant if abs(secant) < 10 * abs(step) else step
+            before = omega, float(error)
+            omega += float(np.clip(step, -_LARGEST_STEP * omega, _LARGEST_STEP * omega))
+        return found._replace(held=False)
 
 
 def _harmonics(signal: np.ndarray, angle: np.ndarray) -> np.ndarray:
     """Complex amplitudes of the target's harmonics, through a Hann window."""
-    window = 2 * np.hanning(len(angle)) / np.hanning(len(angle)).mean()
-    return (np.exp(-1j * _ORDERS[:, None] * angle) * window / len(angle)) @ signal
+    return np.mean(through_hann_window(signal, _ORDERS[:, None] * angle), axis=1)
 
 
 def s_curve(
@@ -221,97 +237,13 @@ def s_curve(
     of its own, or that were not steady within 1 %, are NaN.
     Raises `ValueError` for numbers that are not positive.
     """
-    targets = positive("amplitudes", amplitudes)
     (omega,) = positive("frequency", frequency)
-    bench = _Bench(laboratory, _checked(settings), seed)
-    found = [bench.held(float(omega), float(size)) for size in targets]
-    held = np.array([bench.holds(one) for one in found])
+    bench = FeedbackBench(laboratory, settings, seed)
+    found = [bench.motion(float(omega), float(size)) for size in positive("amplitudes", amplitudes)]
+    held = np.array([one.held for one in found])
     return SCurve(
-        np.where(held, [abs(one.velocity) for one in found], np.nan),
-        np.where(held, [abs(one.force) for one in found], np.nan),
+        np.where(held, np.abs([one.velocity for one in found]), np.nan),
+        np.where(held, np.abs([one.force for one in found]), np.nan),
         np.array([one.invasive for one in found]),
         bench.seconds,
     )
-
-
-def control_based_continuation(
-    laboratory: Laboratory,
-    amplitudes: Float[np.ndarray, " level"],
-    settings: FeedbackSettings,
-    *,
-    seed: int = 0,
-) -> MethodResult:
-    """The backbone: at each target amplitude the frequency at which force and velocity agree.
-
-    The phase that is left between them is taken away by the balance of the mode,
-    ω̃² − Ω² + 2iζ̃ω̃Ω = iΩ|Φ_r Φᵀb| F/v.
-
-    Arguments: `amplitudes` of the target in m/s, rising. Returns a `MethodResult` with a point an
-    amplitude; damping by the balance of power. Amplitudes whose phase was not brought within 0.5°,
-    whose feedback kept harmonics of its own beyond `settings.invasive`, or that were not steady
-    within 1 %, are `NOT_LOCKED`. 1σ are those of the noise and of the scatter within a record; a
-    second mode close by or harmonics of the force are not in them. `test_seconds` counts
-    everything.
-    Raises `ValueError` for numbers that are not positive.
-    """
-    targets = positive("amplitudes", amplitudes)
-    bench = _Bench(laboratory, _checked(settings), seed)
-    modes, omega, decay = laboratory.structure.modes, laboratory.frequency, laboratory.decay
-    points, velocity_std = [], []
-    for level, size in enumerate(targets, 1):
-        found = _resonance(bench, omega, float(size), decay)
-        if found is None:
-            points.append(MethodPoint(MethodStatus.NOT_LOCKED, level))
-            velocity_std.append(np.nan)
-            continue
-        omega = found.frequency
-        points.append(_point(level, found, drive_point(modes)))
-        velocity_std.append(found.velocity_std)
-    points = with_velocity_errors(points, np.array(velocity_std))
-    return method_result("cbc", points, len(targets), test_seconds=bench.seconds)
-
-
-def _point(level: int, found: HeldMotion, per_force: float) -> MethodPoint:
-    """Both numbers by the balance of the mode in a motion near its resonance."""
-    balance = per_force * found.force / found.velocity  # 2ζ̃ω̃ + (ω̃² − Ω²)/(iΩ)
-    omega = np.sqrt(found.frequency**2 - found.frequency * balance.imag)
-    error = abs(balance) * found.ratio_std
-    return MethodPoint(
-        MethodStatus.FOUND,
-        level,
-        velocity=abs(found.velocity),
-        natural_frequency=float(omega),
-        natural_frequency_std=error / 2,
-        damping_ratio=balance.real / (2 * float(omega)),
-        damping_ratio_std=error / (2 * float(omega)),
-    )
-
-
-def _resonance(bench: _Bench, omega: float, size: float, decay: float) -> HeldMotion | None:
-    """The motion in phase with its force at one amplitude, by the secant method."""
-    before: tuple[float, float] | None = None
-    for _ in range(_MOST_STEPS):
-        found = bench.held(omega, size)
-        phase = float(np.angle(found.velocity / found.force))
-        if not np.isfinite(phase):
-            return None
-        if abs(phase) < _PHASE:
-            return found if bench.holds(found) else None
-        # A mode's tan φ = (ω̃² − Ω²)/(2ζ̃ω̃Ω): straight in frequency, with slope −1/(ζ̃ω̃).
-        error = np.tan(np.clip(phase, -1.4, 1.4))
-        step = decay * error
-        if before is not None and before[1] != error:
-            secant = -error * (omega - before[0]) / (error - before[1])
-            step = secant if abs(secant) < 10 * abs(step) else step
-        before = omega, float(error)
-        largest = 10 * _FIRST_STEP * omega
-        omega += float(np.clip(step, -largest, largest))
-    return None
-
-
-def _checked(settings: FeedbackSettings) -> FeedbackSettings:
-    if not all(np.isfinite(value) and value > 0 for value in settings[:-1]) or not (
-        0 <= settings.filter_rate < np.inf
-    ):
-        raise ValueError(f"the settings of the feedback must be positive, but are {settings}.")
-    return settings

@@ -1,6 +1,6 @@
 """Shaker, amplifier and instruments of the virtual laboratory, by their numbers."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -33,14 +33,6 @@ class Instruments(NamedTuple):
     velocity_noise: float = 0.0  # m/s, 1σ of a sample
     filter_corner_hz: float = np.inf  # of the anti-alias filter; infinite for none
     filter_order: int = 4
-
-
-def positive(name: str, values: Any) -> Float[np.ndarray, " value"]:
-    """Numbers in a row. Raises `ValueError` unless all are positive and finite, at least one."""
-    each = np.asarray(values, dtype=float).ravel()
-    if not each.size or not np.all(np.isfinite(each) & (each > 0)):
-        raise ValueError(f"`{name}` must be positive and finite, but is {values}.")
-    return each
 
 
 def check_shaker(shaker: Shaker) -> None:
