@@ -68,7 +68,6 @@ def identify(
                 amplitude=options["amplitude"],
                 measure=options["measure"],
                 n_knots=options["knots"],
-                anchor=options["anchor"],
             )
         for note in found.notes:
             warn(note)
@@ -136,11 +135,6 @@ _CURVES = (
         "Knots of each curve at most. Default: up to 42; curves bend as much as the data ask for.",
         least=2,
     ),
-    OptionRow(
-        *("anchor", bool),
-        "Make both curves start at the linear frequency and damping of the model.",
-        *(None, False),
-    ),
 )
 _JOINT = (
     OptionRow(
@@ -181,7 +175,6 @@ _NOT_WITH_FIT = {
     "amplitude": "name the amplitude with the family, as in `--fit polynomial:2@velocity`",
     "measure": "a joint fit takes the fundamental",
     "knots": "give the size with the family, as in `--fit spline:5`",
-    "anchor": "a joint fit is not tied to the linear mode",
 }
 
 

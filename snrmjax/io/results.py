@@ -121,10 +121,7 @@ def with_amplitude(path: FilePath, of: str, name: str, power: int) -> None:
 
 
 def write_backbone(path: FilePath, identification: Identification) -> None:
-    """Write the backbone with its 1σ between the smallest and the largest point used.
-
-    An anchored backbone starts at zero amplitude.
-    """
+    """Write the backbone with its 1σ between the smallest and the largest point used."""
     write_values(path, identification.backbone.sampled(BACKBONE_POINTS))
 
 
@@ -183,7 +180,6 @@ def summarise(identification: Identification, values: BackboneValues) -> dict:
     frequency = np.asarray(values.natural_frequency) / HERTZ
     damping, velocity = values.damping_ratio, values.velocity
     status = np.asarray(points.status)
-    anchor = identification.anchor
     return {
         "sensor": points.sensor,
         "amplitude": points.argument,
@@ -207,17 +203,7 @@ def summarise(identification: Identification, values: BackboneValues) -> dict:
             "level_frequency_std_hz": identification.level_frequency_std / HERTZ,
             "level_damping_ratio_std": identification.level_damping_std,
         },
-        "anchor": None
-        if anchor is None
-        else {
-            "natural_frequency_gap_hz": anchor.frequency_gap / HERTZ,
-            "natural_frequency_gap_std_hz": anchor.frequency_gap_std / HERTZ,
-            "damping_ratio_gap": anchor.damping_gap,
-            "damping_ratio_gap_std": anchor.damping_gap_std,
-            "largest_shift_hz": anchor.largest_frequency_shift / HERTZ,
-            "largest_damping_ratio_shift": anchor.largest_damping_shift,
-        },
-        "notes": list(identification.notes),
+        "notes": [str(note) for note in identification.notes],
     }
 
 

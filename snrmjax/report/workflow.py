@@ -92,7 +92,6 @@ def identify_by_points(
     amplitude: AmplitudeArgument = "displacement",
     measure: AmplitudeMeasure = "fundamental",
     n_knots: int | None = None,
-    anchor: bool = False,
 ) -> Findings:
     """Identify state by state, draw curves through the points, and predict responses from these.
 
@@ -106,7 +105,7 @@ def identify_by_points(
     check_force(data, "an identification state by state")
     try:
         found = identify_backbone(
-            data, model, amplitude=amplitude, measure=measure, n_knots=n_knots, anchor=anchor
+            data, model, amplitude=amplitude, measure=measure, n_knots=n_knots
         )
     except ValueError as error:
         raise with_doubt(error, data, model) from error
@@ -121,7 +120,7 @@ def identify_by_points(
     )
     words = {
         "amplitude": f"{amplitude}, {measure}",
-        "curves": "smooth" + (", anchored at the linear mode" if anchor else ""),
+        "curves": "smooth",
     }
     values = backbone.sampled(results.BACKBONE_POINTS)
     return Findings(data, model, found, predictions, notes, values, words)
@@ -357,7 +356,7 @@ def write_findings(
         | ({} if one.drive is None else {"drive_v": one.drive})
         for one in found.predictions
     ]
-    summary["notes"] = list(found.notes)
+    summary["notes"] = [str(note) for note in found.notes]
     write_summary(folder / "summary.json", summary)
     figures = plot.save_figures(folder, identification_figures(found, shown))
     if found.fitted is not None:
