@@ -121,7 +121,6 @@ def _by_points(data: SteadyStates, model: Structure, options: IdentifyOptions) -
             amplitude=options.amplitude,
             measure=options.measure,
             n_knots=options.knots,
-            anchor=options.anchor,
         )
     except ValueError as error:
         raise with_doubt(error, data, model) from error

@@ -145,13 +145,6 @@ class IdentifyOptions:
         alone=_FIT,
         why_alone="a joint fit has the size with the family, as `--fit spline:5`",
     )
-    anchor: bool = option(
-        False,
-        "Make both curves start at the linear frequency and damping of the model.",
-        panel=_POINTS,
-        alone=_FIT,
-        why_alone="a joint fit is not tied to the linear mode",
-    )
     fit: str | None = option(
         None,
         "Family of the backbone and, after a comma, of the damping: auto (a smooth curve that "

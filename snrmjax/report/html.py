@@ -152,6 +152,6 @@ def _sentence(text: str) -> str:
     >>> _sentence("two rows are incomplete"), _sentence("run1.mat: two rows are incomplete.")
     ('Two rows are incomplete.', 'run1.mat: two rows are incomplete.')
     """
-    text = text.strip()
+    text = str(text).strip()
     first = text[:1] if _FILE_FIRST.match(text) else text[:1].upper()
     return first + text[1:] + ("" if text.endswith((".", "!", "?")) else ".")

@@ -10,7 +10,6 @@ from matplotlib.ticker import PercentFormatter
 from snrmjax.identify.inference.contributions import Contribution, Contributions
 from snrmjax.identify.inference.fitted_response import FittedResponse
 from snrmjax.identify.inference.optimal_design import NextMeasurement
-from snrmjax.identify.inference.refits import Profile
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.pointwise.backbone_points import BackbonePoints
 from snrmjax.io.units import DEGREE, HERTZ
@@ -205,21 +204,6 @@ def contributions_figure(rows: Sequence[Contribution]) -> Figure:
     axes.set_xlim(0.0, 1.22 * 100 * max(max(share) for share in shares))
     axes.xaxis.set_major_formatter(PercentFormatter(decimals=0))
     name_axes(axes, "", "Share of the band's variance", "")
-    legend(figure)
-    return figure
-
-
-def profile_figure(profile: Profile) -> Figure:
-    """Rise of χ² against one unknown, and where it ends the 95 % interval.
-
-    A parabola is what an unknown with a normal distribution has. Refits that failed are left out.
-    """
-    figure, ((axes,),) = panels(COLUMN, 2.8, 1, 1)
-    marks(axes, profile.values, profile.rise, {**DOT, "color": MEASURED}, "refits")
-    axes.plot(profile.values, profile.rise, color=MEASURED)
-    axes.axhline(BAND**2, color=SIMULATED, linestyle="--", linewidth=LINE, label="95 %")
-    axes.set_ylim(bottom=0.0)
-    name_axes(axes, "", f"{plain(profile.name)} ({profile.unit})", "Rise of χ² (1)")
     legend(figure)
     return figure
 

@@ -147,7 +147,7 @@ def identification_report(
         done=[*(done or {}).items(), ("program", f"snrmjax {version('snrmjax')}")],
         result=identification_sentence(identification, modes),
         summary=identification_summary(identification, modes, words),
-        notes=list(dict.fromkeys([*notes, *identification.notes])),
+        notes=list(dict.fromkeys(map(str, [*notes, *identification.notes]))),
         sections=[
             *sections,
             *further,

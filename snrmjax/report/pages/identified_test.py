@@ -31,8 +31,7 @@ def settings_in_words(found: IdentifiedTest) -> dict[str, str]:
     """Which amplitude and which curves, as the summary and the page name them."""
     if found.joint is None:
         asked = found.options
-        anchored = ", anchored at the linear mode" if asked.anchor else ""
-        return {"amplitude": f"{asked.amplitude}, {asked.measure}", "curves": f"smooth{anchored}"}
+        return {"amplitude": f"{asked.amplitude}, {asked.measure}", "curves": "smooth"}
     unknowns = found.joint.fit.unknowns
     pair = (unknowns.squared_frequency, unknowns.modal_damping)
     curves = " and ".join(joint_results.described(curve) for curve in pair)
