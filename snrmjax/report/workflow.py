@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
-from snrmjax.doctor.doubts import doubt, linear_damping_note, with_doubt
+from snrmjax.doctor.column_misreadings import doubt, linear_damping_note, with_doubt
 from snrmjax.identify.inference.fitted_curves import fitted_values
 from snrmjax.identify.inference.identification import (
     Identification,

@@ -66,7 +66,7 @@ def check(
         found = with_imports(found, FilesRead(tuple(data)))
         write_checkup(folder / "check.json", found)
     for note in found.notes:
-        warn(note)
+        warn(str(note))
     if not found.findings:
         say("nothing found")
     for one in found.findings:

@@ -422,8 +422,8 @@ def _check_section(checkup: Checkup) -> Section:
     header = ("severity", "what", "where", "evidence", "what mends it")
 
     def row(one: Finding) -> tuple[str, ...]:
-        return (one.severity, one.name, one.where, one.evidence, one.mend)
+        return (one.severity, one.name, one.where, str(one.evidence), str(one.mend))
 
     rows = [row(one) for one in checkup.findings]
-    text = [_check_sentence(checkup).capitalize() + ".", *checkup.notes]
+    text = [_check_sentence(checkup).capitalize() + ".", *map(str, checkup.notes)]
     return Section("Check", text, tables=[ReportTable(header, rows)] if rows else ())

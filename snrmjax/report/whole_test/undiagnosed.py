@@ -1,6 +1,6 @@
 """Why a test is not diagnosed: of columns that mean something else the answer would be wrong."""
 
-from snrmjax.doctor.doubts import doubt
+from snrmjax.doctor.column_misreadings import doubt
 from snrmjax.measure.phase_convention import wrong_phases
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.structures import Structure
