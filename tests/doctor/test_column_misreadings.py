@@ -13,7 +13,7 @@ import snrmjax as sj
 from snrmjax.doctor import column_misreadings
 from snrmjax.doctor.column_misreadings import doubt, linear_damping_note, with_doubt
 from snrmjax.measure.phase_convention import wrong_phases
-from snrmjax.report.workflow import Loads, identify_by_points
+from snrmjax.pipelines.identify import identify_test
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 FEW = slice(None, None, 5)  # nine states, three a level, from which no phase can be told wrong
@@ -132,14 +132,14 @@ def test_damping_at_rest_is_compared_with_the_linear_tests(monkeypatch):
 def test_an_identification_without_points_says_why():
     data = few(lambda w, f, v: (f, v / (1j * w)))
     with pytest.raises(ValueError, match=r"no real natural frequency.*as displacements"):
-        identify_by_points(data, model(), Loads())
+        identify_test(data, model())
 
 
 @pytest.mark.long
 def test_the_note_comes_first():
     data = few(lambda w, f, v: (f, v / 9.80665))
-    found = identify_by_points(data, model(), Loads())
-    assert str(found.notes[0]) == str(said(data, model())[0])
+    found = identify_test(data, model())
+    assert found.notes[0] == said(data, model())[0]
 
 
 @pytest.mark.long
