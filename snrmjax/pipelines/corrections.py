@@ -45,7 +45,8 @@ def with_imports(checkup: Checkup, read: FilesRead | None) -> Checkup:
     told = []
     for one in checkup.findings:
         lines = [line for repair in one.repairs if (line := _command(repair, read))]
-        mend = f"{one.mend.rstrip('.')}: {', or '.join(lines)}." if lines else one.mend
+        mend = str(one.mend)
+        mend = f"{mend.rstrip('.')}: {', or '.join(lines)}." if lines else mend
         if len(certain) > 1 and one is certain[0] and (line := _command(_joined(certain), read)):
             mend = f"{' and '.join(each.name for each in certain)} at once: {line}. Alone, {mend}"
         told.append(one._replace(mend=mend))

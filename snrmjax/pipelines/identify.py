@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from snrmjax.doctor.doubts import doubt, linear_damping_note, with_doubt
+from snrmjax.doctor.column_misreadings import doubt, linear_damping_note, with_doubt
 from snrmjax.identify.inference.contributions import Contribution, contributions
 from snrmjax.identify.inference.fitted_curves import fitted_values
 from snrmjax.identify.inference.fitted_response import FittedResponse, fitted_response

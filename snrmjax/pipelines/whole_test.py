@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from snrmjax.doctor.check import check_test
-from snrmjax.doctor.doubts import doubt
+from snrmjax.doctor.column_misreadings import doubt
 from snrmjax.doctor.findings import Checkup
 from snrmjax.identify.modal.modes_of_tests import find_modes
 from snrmjax.identify.modal.response_data import joined_responses

@@ -1,6 +1,5 @@
 """What identification says where columns mean something else, on the exact responses of a mode."""
 
-import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import NamedTuple
@@ -11,7 +10,8 @@ import pytest
 from truths.one_mode import OMEGA, SHAPE, ZETA, model, noisy, states, table
 
 import snrmjax as sj
-from snrmjax.doctor.doubts import doubt, linear_damping_note, with_doubt
+from snrmjax.doctor import column_misreadings
+from snrmjax.doctor.column_misreadings import doubt, linear_damping_note, with_doubt
 from snrmjax.measure.phase_convention import wrong_phases
 from snrmjax.pipelines.identify import identify_test
 
@@ -44,29 +44,31 @@ def said(data, structure):
 
 
 @pytest.mark.parametrize(
-    ("change", "named"),
+    ("change", "kind", "named"),
     [
-        (lambda w, f, v: (f, v / 9.80665), ("in g", "responses in g")),
-        (lambda w, f, v: (f, 1e3 * v), ("in mm", "responses in mm", "forces in kN")),
-        (lambda w, f, v: (f / 4.4482216, v), ("pounds", "forces in pounds")),
-        (lambda w, f, v: (f, v.conj()), ("conjugates", "with the other phase sign")),
-        (lambda w, f, v: (f, 1j * w * v), ("accelerations", "import again as accelerations")),
-        (lambda w, f, v: (f, v / np.sqrt(2)), ("rms", "√2")),
+        (lambda w, f, v: (f, v / 9.80665), "mixed_units", ("response", "g", "m/s²")),
+        (lambda w, f, v: (f, 1e3 * v), "mixed_units", ("response", "mm", "m")),
+        (lambda w, f, v: (f / 4.4482216, v), "mixed_units", ("force", "pounds", "N")),
+        (lambda w, f, v: (f, v.conj()), "misread", "conjugated"),
+        (lambda w, f, v: (f, 1j * w * v), "misread", "acceleration"),
+        (lambda w, f, v: (f, v / np.sqrt(2)), "rms", "response"),
     ],
 )
-def test_a_wrong_unit_or_phase_sign_is_named_with_its_size_and_its_mend(change, named):
+def test_a_wrong_unit_or_phase_sign_is_named_with_its_mend(change, kind, named):
     (note,) = said(few(change), model())
-    said_too = ("To mend it: ", "snrmjax check")
-    for word in (*named, *said_too):
-        assert word in note
+    evidence = note["evidence"]
+    assert (note.kind, evidence.kind) == ("column_misread", kind)
+    assert named in (evidence.get("reading"), evidence.get("column"), *evidence.get("units", ()))
+    assert note["importable"]
+    assert str(note["mend"]).rstrip(".") in str(note)
 
 
 @pytest.mark.parametrize("factor", [9.80665, 1e-3, 1 / 4.4482216])
 def test_the_size_is_that_of_the_mixed_units(factor):
     (note,) = said(few(lambda w, f, v: (f, v / factor)), model())
-    found, std = map(float, re.search(r"ask for (\S+) ± (\S+) times", note).groups())
-    assert abs(found - factor) < 4 * std  # 4σ: one in 16000 by chance
-    assert std < 0.01 * factor
+    evidence = note["evidence"]
+    # 4σ: one in 16000 by chance
+    assert abs(evidence["ratio"] - factor) < 4 * evidence["ratio_std"] < 0.04 * factor
 
 
 def test_good_states_are_silent():
@@ -92,8 +94,8 @@ def test_another_assembly_is_doubted():
 
     assert other(1.01, 1.2) == ()
     (note,) = other(1.2, 0.2)
-    assert note.startswith("natural frequency and damping at small amplitude are not the linear")
-    assert "72 Hz and 0.4 %" in note
+    assert note["quantities"] == ("natural frequency", "damping")
+    assert note["linear"] == pytest.approx((1.2 * OMEGA / (2 * np.pi), 0.2 * ZETA))
 
 
 def test_few_states_and_voltages_are_left_alone():
@@ -116,14 +118,12 @@ def test_damping_at_rest_is_compared_with_the_linear_tests(monkeypatch):
 
     def note(fitted, own):
         at_rest = SimpleNamespace(damping_ratio=[fitted], damping_ratio_std=[5e-4])
-        monkeypatch.setattr("snrmjax.doctor.doubts.fitted_values", lambda *_, **__: at_rest)
+        monkeypatch.setattr(column_misreadings, "fitted_values", lambda *_, **__: at_rest)
         linear = eqx.tree_at(lambda m: m.modes.damping_ratio_std, model(), np.array([own]))
         return linear_damping_note(None, linear)
 
     (said_so,) = note(0.022, 5e-4)
-    assert "2.2 ± 0.05 %" in said_so
-    assert "2 ± 0.05 %" in said_so
-    assert "2.8 combined standard deviations" in said_so
+    assert said_so["apart"] == pytest.approx(0.002 / np.hypot(5e-4, 5e-4))
     assert note(0.021, 5e-4) == ()
     assert note(0.022, 0.0) == note(0.022, np.nan) == note(np.nan, 5e-4) == ()
 
