@@ -48,7 +48,7 @@ SUB_ROOMS = {
         *("model.effect_base", "model.effect_metadata", "model.modes", "model.potential"),
     },
     "measure.recordings": {"measure.signals", "measure.states"},
-    "measure.sweeps": {"measure.recordings", "measure.states"},
+    "measure.sweeps": {"measure.recordings", "measure.signals", "measure.states"},
     "simulate.balance": set(),
     "simulate.continuation": {"simulate.balance"},
     "simulate.solutions": {"simulate.balance", "simulate.continuation"},
