@@ -79,9 +79,10 @@ SUB_ROOMS = {
         *("diagnose.misfit", "diagnose.search", "diagnose.checks", "diagnose.priors"),
     },
     "io.calculix": {"io.files", "io.reduction"},
-    "io.laboratory": {"io.files", "io.units"},
+    "io.laboratory": {"io.files", "io.rows", "io.units"},
     "io.exchange": {
-        *("io.files", "io.units", "io.columns", "io.tables", "io.toml_table", "io.laboratory"),
+        *("io.files", "io.units", "io.columns", "io.rows", "io.tables", "io.toml_table"),
+        "io.laboratory",
     },
     "cli.laboratory": {"cli.console", "cli.options"},
     "report.laws": {"report.style", "report.html"},

@@ -47,6 +47,7 @@ from snrmjax.io.reduction.number_tables import read_number_table
 from snrmjax.io.reduction.source import ASSUMED_DAMPING, ReductionSource
 from snrmjax.io.toml_table import TomlTable, parsed_toml
 from snrmjax.io.units import HERTZ
+from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.rules import BELOW_ONE, IN_RANGE_HZ, NOT_ZERO, POSITIVE, Rule
 
 _KEYS = ("name", "numbers", "damping_ratio", "shapes", "mass", "participation", "sensors")
@@ -90,11 +91,11 @@ def read_load_tables(folder: FilePath) -> ReductionSource:
     participation = _of_modes(top, "participation", n, NOT_ZERO)
     if participation is None:
         participation = first
-        notes.append(f"no participation is stated: a point force at {next(iter(sensors))} is taken")
+        notes.append(Fact("point_force_assumed", sensor=next(iter(sensors))))
     damping = _of_modes(top, "damping_ratio", n, BELOW_ONE)
     if damping is None:
         damping = np.full(n, ASSUMED_DAMPING)
-        notes.append(f"no damping is stated: {ASSUMED_DAMPING:g} is taken for every mode")
+        notes.append(Fact("damping_assumed", ratio=ASSUMED_DAMPING))
     return ReductionSource(
         name=top.text("name", place.resolve().name),
         basis=basis,
@@ -239,7 +240,7 @@ def _of_modes(top: TomlTable, key: str, n: int, *rules: Rule) -> np.ndarray | No
 
 def _sensors(
     top: TomlTable, n: int, shapes: np.ndarray | None
-) -> tuple[dict[str, np.ndarray], list[str]]:
+) -> tuple[dict[str, np.ndarray], list[Fact]]:
     table = top.table("sensors", "[sensors] of modes.toml")
     if table.entries:
         found = {}
@@ -253,4 +254,4 @@ def _sensors(
         raise ValueError("modes.toml has neither [sensors] nor `shapes`: state one of them.")
     row = int(np.argmax(np.abs(shapes[:, 0])))
     name = f"dof {row + 1}"
-    return {name: shapes[row]}, [f"no sensor is stated: {name}, where mode 1 is largest, is taken"]
+    return {name: shapes[row]}, [Fact("sensor_assumed", name=name)]
