@@ -351,7 +351,6 @@ def test_each_command_starts_in_a_process_of_its_own(files, tmp_path, command, w
     ("options", "named"),
     [
         (("--robust",), ("--robust", "--fit auto")),
-        (("--fit", "auto", "--anchor"), ("--anchor", "--fit")),
         (("--fit", "auto", "--knots", "5"), ("--knots", "--fit spline:5")),
         (("--free", "force_gain", "--knots", "5"), ("--knots", "--free", "--fit spline:5")),
         (("--next", "2", "--amplitude", "velocity"), ("--amplitude", "--next", "@velocity")),
@@ -380,7 +379,7 @@ def test_every_option_of_identify_is_joined_to_the_others_or_tried_here(files, t
     command = typer.main.get_command(app).commands["identify"]
     both = {"data", "model", "out", "predict_force", "predict_drive", "extrapolate", "help"}
     both |= {"axis", "day_std", "self_excited"}
-    points = {"amplitude", "measure", "knots", "anchor"}
+    points = {"amplitude", "measure", "knots"}
     joint = {"fit", "free", "robust", "further"}
     assert {one.name for one in command.params} - {"help"} == (both | points | joint) - {"help"}
 

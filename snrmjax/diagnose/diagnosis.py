@@ -185,7 +185,7 @@ def diagnose_model(
         )
     chosen = misfit.predictions.chosen
     phase = np.angle(np.asarray(chosen.states.velocity)[:, 0])
-    notes += [*notes_without_phases(chosen, phase, misfit.level_numbers), *predictions.chosen.notes]
+    notes += [*notes_without_phases(chosen, phase, misfit.level_numbers), *map(str, chosen.notes)]
     notes += [*notes_on_stated_parameters(misfit, fit), *notes_on_found_mass(misfit, fit)]
     notes += _notes_on_answer(model, completed, refused, fit)
     notes += _notes_on_fits(found)
@@ -253,7 +253,7 @@ def _with_law(diagnosis: Diagnosis, law: LawAnswer) -> Diagnosis:
             rms_misfit(misfit, nothing), rms_misfit(misfit, law.fit), *(law.levels or (None, None))
         ),
         checks=checks,
-        notes=(*law.notes, *misfit.predictions.chosen.notes),
+        notes=(*law.notes, *map(str, misfit.predictions.chosen.notes)),
         force_misfit=_force_misfit(misfit, nothing, law.fit),
     )
 

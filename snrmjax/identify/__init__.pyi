@@ -10,7 +10,7 @@ from .curves.families import FAMILIES
 from .inference.contributions import Contribution, Contributions, contributions
 from .inference.fitted_curves import fitted_values
 from .inference.fitted_response import FittedResponse, fitted_response, predicted_resonance
-from .inference.identification import Anchor, Identification, identify_backbone
+from .inference.identification import Identification, identify_backbone
 from .inference.located_points import FittedPoint
 from .inference.optimal_design import (
     AdviceStatus,
@@ -18,7 +18,7 @@ from .inference.optimal_design import (
     NextMeasurements,
     next_measurements,
 )
-from .inference.refits import IntervalEnd, Profile, bootstrap, profile
+from .inference.refits import bootstrap
 from .joint.family_fit import FitStatus
 from .joint.joint_fit import JointFit, corrected_states, fit_jointly
 from .joint.notes import NoiseEstimate
@@ -60,7 +60,6 @@ __all__ = [
     "ON_THE_CURVES",
     "AddedMassTest",
     "AdviceStatus",
-    "Anchor",
     "Backbone",
     "BackboneCalibration",
     "BackbonePoints",
@@ -78,7 +77,6 @@ __all__ = [
     "FittedResponse",
     "Free",
     "Identification",
-    "IntervalEnd",
     "InverseForce",
     "JointFit",
     "KnownShape",
@@ -91,7 +89,6 @@ __all__ = [
     "NoiseEstimate",
     "PointStatus",
     "PredictedResponse",
-    "Profile",
     "Resonance",
     "ResonanceDistribution",
     "ScaledModes",
@@ -123,7 +120,6 @@ __all__ = [
     "nonlinear_mode_velocity",
     "predict_response",
     "predicted_resonance",
-    "profile",
     "reference_sensor",
     "relative_to_base",
     "resonances",

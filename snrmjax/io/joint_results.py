@@ -30,6 +30,7 @@ from snrmjax.io.results import write_values
 from snrmjax.io.tables import write_table
 from snrmjax.io.units import HERTZ
 from snrmjax.model.modes import LinearModes, LinearModesStd, RigidBodyModes, linear_modes
+from snrmjax.numerics.facts import Fact
 
 BAND_POINTS = 200
 _FORMAT = 3
@@ -107,7 +108,7 @@ def summarise_fit(
             for r in responses
             for p in r.not_located
         ],
-        "notes": list(fit.notes),
+        "notes": [str(note) for note in fit.notes],
     }
 
 
@@ -168,7 +169,7 @@ def _content(fit: JointFit) -> dict:
         "noise_stated": fit.noise.stated,
         "drive_known_only": fit.drive_known_only,
         "free": fit.free,
-        "notes": fit.notes,
+        "notes": [str(note) for note in fit.notes],
         "converged": fit.converged,
         "status": fit.status,
         "level_numbers": fit.level_numbers,
@@ -221,7 +222,7 @@ def _rebuilt(content: dict[str, Any]) -> JointFit:
         residuals=np.asarray(content["residuals"]),
         drive_known_only=content["drive_known_only"],
         free=tuple(content["free"]),
-        notes=tuple(content["notes"]),
+        notes=tuple(Fact("as_in_file", text=note) for note in content["notes"]),
         status=FitStatus(content.get("status", known)),
         level_numbers=tuple(content.get("level_numbers", range(data["n_levels"]))),
     )

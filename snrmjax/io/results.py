@@ -175,7 +175,6 @@ def summarise(identification: Identification, values: BackboneValues) -> dict:
     frequency = np.asarray(values.natural_frequency) / HERTZ
     damping, velocity = values.damping_ratio, values.velocity
     status = np.asarray(points.status)
-    anchor = identification.anchor
     return {
         "sensor": points.sensor,
         "amplitude": points.argument,
@@ -198,16 +197,6 @@ def summarise(identification: Identification, values: BackboneValues) -> dict:
             "scale": noise.scale,
             "level_frequency_std_hz": identification.level_frequency_std / HERTZ,
             "level_damping_ratio_std": identification.level_damping_std,
-        },
-        "anchor": None
-        if anchor is None
-        else {
-            "natural_frequency_gap_hz": anchor.frequency_gap / HERTZ,
-            "natural_frequency_gap_std_hz": anchor.frequency_gap_std / HERTZ,
-            "damping_ratio_gap": anchor.damping_gap,
-            "damping_ratio_gap_std": anchor.damping_gap_std,
-            "largest_shift_hz": anchor.largest_frequency_shift / HERTZ,
-            "largest_damping_ratio_shift": anchor.largest_damping_shift,
         },
         "notes": [str(note) for note in identification.notes],
     }

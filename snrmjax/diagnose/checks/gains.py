@@ -300,7 +300,7 @@ def _on_gain(misfit: WeightedMisfit, fit: EffectFit) -> Doubt | None:
             "it."
         )
         return Doubt(reason, _REMEDY, refutes=True)
-    said = force_gain_undetermined(gain.std, gain.farthest)
+    said = str(force_gain_undetermined(gain.std, gain.farthest) or "")
     if not said and abs(np.log(gain.value)) > priors.MOVED_GAIN:
         reason = (
             f"the answer moves the force gain by {100 * (gain.value - 1):+.2g} %: smooth curves of "

@@ -195,7 +195,7 @@ def with_first_gain(
             break
         mass, std = reference.posterior.modal_mass
         gain, by = gain / mass, "smooth curves of amplitude"
-        doubt = force_gain_undetermined(std / mass, float(np.max(np.abs(phase))))
+        doubt = str(force_gain_undetermined(std / mass, float(np.max(np.abs(phase)))) or "")
     note = (
         f"the force is known as a drive voltage only: about {gain:.4g} N/V by {by}. The gain "
         "is fitted too: a 1 % error of the gain looks like 1 % of damping."

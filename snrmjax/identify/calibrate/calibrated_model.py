@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from snrmjax.model.structures import Structure
+from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
 from snrmjax.numerics.result import AbstractResult, Variable
 
@@ -28,7 +29,7 @@ class AbstractCalibration(AbstractResult):
     names: tuple[str, ...] = eqx.field(static=True)
     noise_stated: bool = eqx.field(static=True)
     status: MinimisationStatus = eqx.field(static=True)
-    notes: tuple[str, ...] = eqx.field(static=True)
+    notes: tuple[Fact, ...] = eqx.field(static=True)
 
     @property
     def std(self) -> Float[np.ndarray, " parameter"]:
@@ -76,7 +77,7 @@ class AbstractCalibration(AbstractResult):
         return {
             "status": str(self.status),
             "reduced_chi_square": self.reduced_chi_square,
-            "notes": "\n".join(self.notes),
+            "notes": "\n".join(map(str, self.notes)),
         }
 
 

@@ -28,6 +28,7 @@ from snrmjax.identify.prediction.resonance_distribution import (
     other_modes,
     resonance_distribution,
 )
+from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import Variable
 
 _HERTZ = 2 * np.pi  # rad/s
@@ -133,7 +134,7 @@ def fitted_response(
                 branch=curve.branch,
                 continued=curve.continued,
                 isolated=curve.isolated,
-                note=" ".join(filter(None, [curve.note, _note_on(missing, force)])),
+                notes=(*curve.notes, *_notes_on(missing, force)),
                 frequency_std=frequency_std,
                 velocity_std=velocity_std,
                 resonances=tuple(one for one in good if one.kind == "resonance"),
@@ -145,15 +146,9 @@ def fitted_response(
     return answer
 
 
-def _note_on(missing: tuple[FittedPoint, ...], force: float) -> str:
-    """What was not located under a force."""
-    if not missing:
-        return ""
-    listed = ", ".join(f"{one.kind} near {one.frequency / _HERTZ:.5g} Hz" for one in missing)
-    return (
-        f"{len(missing)} resonances or folds under {force:g} N could not be located ({listed}) and "
-        "have no band."
-    )
+def _notes_on(missing: tuple[FittedPoint, ...], force: float) -> tuple[Fact, ...]:
+    points = tuple((one.kind, float(one.frequency) / _HERTZ) for one in missing)
+    return (Fact("points_not_located", points=points, force=force),) if points else ()
 
 
 def predicted_resonance(

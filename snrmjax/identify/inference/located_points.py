@@ -5,7 +5,7 @@ from typing import Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from snrmjax.identify.inference.forced_motion import ForcedMotion
 from snrmjax.identify.joint.joint_fit import JointFit
@@ -111,19 +111,6 @@ def turns(frequency: np.ndarray, amplitude: np.ndarray) -> list[Place]:
     steps = np.sign(np.diff(frequency))
     at = np.flatnonzero(steps[:-1] * steps[1:] < 0) + 1
     return [Place("fold", float(amplitude[k]), float(frequency[k])) for k in at]
-
-
-def point_slopes(
-    fit: JointFit, force: float, kind: Kind, point: FittedPoint
-) -> Float[np.ndarray, "output unknown"]:
-    """Derivatives of a resonance's or fold's frequency and velocity by the free unknowns.
-
-    Raises `ValueError` when there is no such point there.
-    """
-    found = _solved(fit, force, Place(kind, point.velocity / point.frequency, point.frequency))
-    if found is None:
-        raise ValueError(f"there is no {kind} near {point.frequency / _HERTZ:.4g} Hz.")
-    return found.slopes[:2]
 
 
 def _solved(

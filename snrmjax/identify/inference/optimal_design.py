@@ -12,7 +12,6 @@ from jaxtyping import Array, Complex, Float
 
 from snrmjax.identify.inference.fitted_curves import values_at_displacement
 from snrmjax.identify.inference.fitted_response import FittedResponse, fitted_response
-from snrmjax.identify.inference.located_points import Kind, point_slopes
 from snrmjax.identify.inference.table_result import AbstractTable
 from snrmjax.identify.joint.force_balance import (
     BalanceData,
@@ -28,14 +27,13 @@ from snrmjax.identify.joint.residuals import whitened
 from snrmjax.identify.test_model.states import LEVEL_ERRORS
 from snrmjax.numerics.blocks import padded
 from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import Variable
 from snrmjax.numerics.status import Status
 
-Target = Literal["curves", "frequency", "damping", "resonance", "fold"]
+Target = Literal["curves", "frequency", "damping"]
 
-_NOT_CONVERGED = (
-    "the fit that this advice rests on has not converged: another fit may advise other states"
-)
+_CURVES = ("natural frequency", "damping")
 _HERTZ = 2 * np.pi  # rad/s
 _SHOWN = 12  # advised states on one screen
 _PER_FORCE = 96  # candidate states of one force
@@ -65,7 +63,7 @@ class NextMeasurement(NamedTuple):
     velocity: float  # m/s, expected
     phase: float  # rad, expected of the velocity relative to the force
     expected_band_ratio: float  # mean band after this and the ones before it, over today's
-    reason: str
+    reason: Fact
     drive: float | None = None  # V, where only the drive is known
 
     @property
@@ -86,7 +84,7 @@ class NextMeasurements(AbstractTable[NextMeasurement]):
     target: str = eqx.field(static=True)
     status: AdviceStatus = eqx.field(static=True)
     drive_known_only: bool = eqx.field(static=True)
-    notes: tuple[str, ...] = eqx.field(static=True, default=())
+    notes: tuple[Fact, ...] = eqx.field(static=True, default=())
 
     @property
     def message(self) -> str:
@@ -123,7 +121,7 @@ class NextMeasurements(AbstractTable[NextMeasurement]):
             "velocity_m_s": self.column([one.velocity for one in rows], "m/s", "expected velocity"),
             "phase_deg": self.column(np.degrees([o.phase for o in rows]).tolist(), "deg", "phase"),
             "expected_band_ratio": self.column(ratio, "1", "mean band after it, over today's"),
-            "reason": self.column([one.reason for one in rows], "", "why this state"),
+            "reason": self.column([str(one.reason) for one in rows], "", "why this state"),
         }
 
     def attributes(self) -> dict[str, str | float | int]:
@@ -132,7 +130,7 @@ class NextMeasurements(AbstractTable[NextMeasurement]):
             "target": self.target,
             "sensor": self.sensor,
             "status": self.message,
-            "notes": "\n".join(self.notes),
+            "notes": "\n".join(map(str, self.notes)),
         }
 
 
@@ -141,7 +139,6 @@ def next_measurements(
     count: int,
     *,
     target: Target = "curves",
-    target_force: float | None = None,
     forces: Sequence[float] | Float[np.ndarray, " force"] | None = None,
     from_frequency: float = 0.0,
     to_frequency: float = np.inf,
@@ -155,12 +152,11 @@ def next_measurements(
     are those of the families taken, without what the choice among families leaves open.
 
     Arguments: `target` is the band to narrow: of both curves (relative), of natural frequency or
-    damping alone, or of the frequency of the resonance or upper fold under `target_force`.
+    damping alone.
     `forces`, by default twelve from the smallest to the largest measured. Both are in N, or in V
     where the fitted data know the drive only. Frequencies in rad/s.
     Returns at most `count` states: fewer, or none, when a test can reach no more; `status` says so,
     and `notes` say that the fit has not converged.
-    Raises `ValueError` when the target needs a force and has none, or does not exist there.
     Reference: the one-step rule of sequential design, Fedorov, Theory of Optimal Experiments
     (1972), for a mean of standard deviations.
     """
@@ -169,10 +165,8 @@ def next_measurements(
     if forces is not None:
         given = np.asarray(forces, dtype=np.float64)
         wanted = fit.force_of_drive(given) if fit.drive_known_only else given
-    if target_force is not None and fit.drive_known_only:
-        target_force = float(fit.force_of_drive(np.asarray(target_force)))
     states = _candidates(fit, [float(f) for f in wanted], (from_frequency, to_frequency))
-    slopes, scale = _target(fit, target, target_force)
+    slopes, scale = _target(fit, target)
     advice = [] if states is None else _ranked(fit, states, slopes / scale[:, None], target, count)
     loads = {one.force for one in advice}
     status = AdviceStatus.COMPLETE if len(advice) == count else AdviceStatus.FEWER_STATES
@@ -183,7 +177,7 @@ def next_measurements(
         target=target,
         status=status if states is not None else AdviceStatus.NO_STATE,
         drive_known_only=fit.drive_known_only,
-        notes=() if fit.converged else (_NOT_CONVERGED,),
+        notes=() if fit.converged else (Fact("advice_of_unconverged_fit"),),
     )
 
 
@@ -267,25 +261,15 @@ def _measurable(curve: FittedResponse) -> np.ndarray:
 
 
 def _target(
-    fit: JointFit, target: Target, force: float | None
+    fit: JointFit, target: Target
 ) -> tuple[Float[np.ndarray, "output unknown"], Float[np.ndarray, " output"]]:
     """Slopes of what shall become better known, and the values that its bands are relative to."""
-    if target in ("curves", "frequency", "damping"):
-        measured = np.asarray(fit.motion().displacement)
-        at = np.linspace(measured.min(), measured.max(), _TARGETS)
-        values, slopes, *_ = values_at_displacement(fit, at)
-        parts = {"frequency": [0], "damping": [1]}.get(target, [0, 1])
-        each = [slopes[:, k] / (2.0 if k == 0 else 1.0) for k in parts]
-        return np.concatenate(each), np.concatenate([values[:, k] for k in parts])
-    if force is None:
-        raise ValueError(f"the target {target!r} needs `target_force`.")
-    curves = fitted_response(fit, force)
-    points = [p for c in curves for p in (c.resonances if target == "resonance" else c.folds)]
-    if not points:
-        raise ValueError(f"the fitted response to {force:g} N has no {target}.")
-    best = max(points, key=lambda point: point.velocity)
-    kind: Kind = "resonance" if target == "resonance" else "fold"
-    return point_slopes(fit, force, kind, best)[:1], np.array([best.frequency])
+    measured = np.asarray(fit.motion().displacement)
+    at = np.linspace(measured.min(), measured.max(), _TARGETS)
+    values, slopes, *_ = values_at_displacement(fit, at)
+    parts = {"frequency": [0], "damping": [1]}.get(target, [0, 1])
+    each = [slopes[:, k] / (2.0 if k == 0 else 1.0) for k in parts]
+    return np.concatenate(each), np.concatenate([values[:, k] for k in parts])
 
 
 def _information(fit: JointFit, states: _States) -> Float[np.ndarray, "state part unknown"]:
@@ -360,18 +344,12 @@ def _best(
     return int(index[best]), left[best]
 
 
-def _reason(target: Target, before: np.ndarray, after: np.ndarray) -> str:
-    """Why this state, in words."""
+def _reason(target: Target, before: np.ndarray, after: np.ndarray) -> Fact:
+    """Which band becomes narrower, and by what share."""
     narrowed = 1 - np.sqrt(after / before)
     if target == "curves":
-        half = len(before) // 2
-        names = ("natural frequency", "damping")
-        shares = [float(np.mean(narrowed[:half])), float(np.mean(narrowed[half:]))]
-        which = names[int(np.argmax(shares))]
-        gain = max(shares)
-    else:
-        which = {"frequency": "natural frequency", "damping": "damping"}.get(
-            target, f"{target} frequency"
-        )
-        gain = float(np.mean(narrowed))
-    return f"the {which} band becomes {100 * gain:.2g} % narrower"
+        shares = dict(zip(_CURVES, np.mean(narrowed.reshape(2, -1), axis=1).tolist(), strict=True))
+        curve = max(shares, key=lambda name: shares[name])
+        return Fact("band_narrower", curve=curve, share=shares[curve])
+    curve = _CURVES[target == "damping"]
+    return Fact("band_narrower", curve=curve, share=float(np.mean(narrowed)))

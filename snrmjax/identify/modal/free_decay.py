@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 from scipy.signal import decimate
 
-from snrmjax.identify.modal.modal_fit import AbstractModalFit, phase_collinearity
+from snrmjax.identify.modal.modal_fit import REAL, AbstractModalFit, phase_collinearity
 from snrmjax.identify.modal.pole_orders import PoleOrders, clusters, gathered
 from snrmjax.identify.modal.separable_fit import (
     ChannelRows,
@@ -22,6 +22,7 @@ from snrmjax.identify.modal.separable_fit import (
 )
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.time_recording import TimeRecording
+from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import Variable
 
 _HERTZ = 2 * np.pi
@@ -33,6 +34,7 @@ _FEWEST_SAMPLES = 40
 _SAMPLES_PER_CYCLE = 5  # kept of the highest frequency asked for
 _SIGNIFICANT = 4.0  # standard errors of a mode's largest amplitude, without which it is none
 _MOST_DAMPED = 0.5
+_CORRELATED = 2.0  # sum of the correlations of residuals, from which on it is worth a note
 _MOST_GROWTH = 3.0  # of a mode's logarithm over the record
 
 
@@ -305,17 +307,16 @@ def _result(
     shape_std[top, np.arange(n)] = 0.0
     collinearity, _ = phase_collinearity(ratio)
     notes = [
-        f"mode {k + 1} is complex: modal phase collinearity {value:.2f}"
-        for k, value in enumerate(collinearity)
-        if value < 0.9
+        Fact("complex_mode", mode=k + 1, frequency_hz=float(omega) / _HERTZ, collinearity=value)
+        for k, (omega, value) in enumerate(
+            zip(unknowns[:n][rank], collinearity.tolist(), strict=True)
+        )
+        if value < REAL
     ]
     if not fit.status.found_minimum:
-        notes.append("the least-squares fit had not settled after its last step")
-    if fit.correlation.sum() > 2:
-        notes.append(
-            "residuals of neighbouring samples are correlated (a mode that was missed, or a decay "
-            "that is not linear): errors are widened for it"
-        )
+        notes.append(Fact("modal_fit_not_settled"))
+    if fit.correlation.sum() > _CORRELATED:
+        notes.append(Fact("decay_residuals_correlated"))
     return DecayModes(
         natural_frequency=unknowns[:n][rank],
         damping_ratio=unknowns[n:][rank],

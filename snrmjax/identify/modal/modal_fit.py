@@ -10,11 +10,14 @@ from jaxtyping import Complex, Float
 from snrmjax.identify.modal.pole_orders import PoleOrders
 from snrmjax.identify.modal.response_data import ErrorSource
 from snrmjax.measure.recordings.channels import Channel
+from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
 from snrmjax.numerics.result import AbstractResult, Variable
 
 _HERTZ = 2 * np.pi
 _WIDE = 1.96  # standard deviations of a 95 % band
+REAL = 0.9
+"""Phase collinearity below which a mode is called complex."""
 
 
 class ResponseCurves(NamedTuple):
@@ -41,7 +44,7 @@ class AbstractModalFit(AbstractResult):
     orders: PoleOrders
     sensors: tuple[Channel, ...] = eqx.field(static=True)
     status: MinimisationStatus = eqx.field(static=True)
-    notes: tuple[str, ...] = eqx.field(static=True)
+    notes: tuple[Fact | str, ...] = eqx.field(static=True)
 
     @property
     def n_modes(self) -> int:
@@ -185,5 +188,5 @@ class LinearModalFit(AbstractModalFit):
             "reference": self.reference.name,
             "errors_from": self.source,
             "status": self.status.value,
-            "notes": "\n".join(self.notes),
+            "notes": "\n".join(map(str, self.notes)),
         }

@@ -9,6 +9,7 @@ from jaxtyping import Complex, Float, Int
 
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
+from snrmjax.numerics.facts import Fact
 
 ErrorSource = Literal["stated", "coherence", "residuals"]
 """Where the weights come from: stated 1σ, coherence, or the residuals themselves."""
@@ -31,7 +32,7 @@ class ResponseData(NamedTuple):
     reference: Channel
     source: ErrorSource
     averages: int | None
-    notes: tuple[str, ...]
+    notes: tuple[Fact | str, ...]
 
     @property
     def measured_size(self) -> Float[np.ndarray, "channel line"]:
@@ -177,7 +178,7 @@ def _errors(
     coherence: np.ndarray,
     std: np.ndarray | None,
     keep: np.ndarray,
-) -> tuple[np.ndarray, ErrorSource, list[str]]:
+) -> tuple[np.ndarray, ErrorSource, list[Fact]]:
     """1σ of real and imaginary part, in the unit of what was measured."""
     unknown = np.full(raw.shape, np.nan)
     if std is not None:
@@ -195,9 +196,9 @@ def _errors(
     if not stated.any():
         return unknown, "residuals", []
     if np.any(~stated & np.isfinite(raw)):
-        return unknown, "residuals", ["the coherence is stated in part and not used"]
+        return unknown, "residuals", [Fact("coherence_in_part")]
     if np.median(coherence[stated]) > 1 - _LEAST_MISSING_COHERENCE:
-        return unknown, "residuals", ["the coherence is 1 at most lines: it says nothing of errors"]
+        return unknown, "residuals", [Fact("coherence_is_one")]
     if np.median(coherence[stated]) <= 0:
         raise ValueError("the coherence is zero at most lines: nothing follows the reference.")
     return coherence_std(np.abs(raw), coherence, responses.averages), "coherence", []

@@ -70,7 +70,7 @@ class Backbone(AbstractResult):
     modal_damping: AbstractCurve
     covariance: Float[Array, "parameter parameter"]
     modal_constant: Float[Array, ""]  # Φ_r Φᵀb, 1/kg: acceleration per newton at resonance
-    smallest: Float[Array, ""]  # amplitude of the smallest state used, zero if anchored there
+    smallest: Float[Array, ""]  # amplitude of the smallest state used
     largest: Float[Array, ""]  # amplitude of the largest state used
     argument: AmplitudeArgument = eqx.field(static=True)
     sensor: str = eqx.field(static=True)

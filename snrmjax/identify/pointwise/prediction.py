@@ -15,6 +15,7 @@ from snrmjax.identify.pointwise.points_result import AmplitudeArgument
 from snrmjax.identify.pointwise.prediction_result import PredictedResponse, Resonance
 from snrmjax.identify.pointwise.snrm import nonlinear_mode_velocity
 from snrmjax.model.modes import LinearModes, residual_velocity
+from snrmjax.numerics.facts import Fact
 
 LARGEST_AMPLITUDE_RATIO = 1.5
 """Predictions end, unless asked for more, at this multiple of the largest measured amplitude."""
@@ -277,7 +278,7 @@ def _one_curve(
         branch=tuple(np.where(frequency <= natural, "lead", "lag").tolist()),
         continued=both.amplitude > float(backbone.largest) * (1 + 1e-9),
         isolated=closed,
-        note="",
+        notes=(),
     )
     return _part(curve, keep, backbone)
 
@@ -285,13 +286,11 @@ def _one_curve(
 def _part(curve: PredictedResponse, keep: np.ndarray, backbone: Backbone) -> PredictedResponse:
     """Some points of a curve, and the note on those that extrapolate the backbone."""
     amplitude, continued = curve.amplitude[keep], curve.continued[keep]
-    note = ""
+    notes = ()
     if continued.any():
-        note = (
-            f"{int(continued.sum())} of {len(continued)} points lie beyond the largest measured "
-            f"amplitude, up to {amplitude.max() / float(backbone.largest):.3g} times it: there the "
-            "backbone is extrapolated, which no measurement supports."
-        )
+        ratio = float(amplitude.max() / float(backbone.largest))
+        count = {"n_points": int(continued.sum()), "of": len(continued)}
+        notes = (Fact("beyond_measured_amplitudes", **count, ratio=ratio),)
     return dataclasses.replace(
         curve,
         frequency=curve.frequency[keep],
@@ -300,5 +299,5 @@ def _part(curve: PredictedResponse, keep: np.ndarray, backbone: Backbone) -> Pre
         stable=curve.stable[keep],
         branch=tuple(np.asarray(curve.branch)[keep].tolist()),
         continued=continued,
-        note=note,
+        notes=notes,
     )

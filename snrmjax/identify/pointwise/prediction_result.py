@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float
 
 from snrmjax.identify.pointwise.inversion_result import spans
+from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, Variable
 
 _HERTZ = 2 * np.pi
@@ -54,7 +55,12 @@ class PredictedResponse(AbstractResult):
     branch: tuple[str, ...]  # "lead" (velocity leads the force) or "lag" for every point
     continued: Bool[np.ndarray, " point"]  # beyond the measured amplitudes
     isolated: bool  # a closed curve, apart from the main one
-    note: str  # where the curve extrapolates the backbone; empty where it nowhere does
+    notes: tuple[Fact, ...]  # where it extrapolates the backbone, and what is not located
+
+    @property
+    def note(self) -> str:
+        """The notes in words."""
+        return " ".join(map(str, self.notes))
 
     def summary(self) -> tuple[str, ...]:
         """See `AbstractResult`."""

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from snrmjax.model.modes import LinearModes, LinearModesStd, RigidBodyModes, linear_modes
+from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, Variable
 
 _HERTZ = 2 * np.pi
@@ -35,10 +36,10 @@ class ScaledModes(AbstractResult):
     rigid_shape: Float[np.ndarray, " sensor"] | None  # kg^-1/2; None: no rigid-body mode
     rigid_participation: float
     sensors: tuple[str, ...] = eqx.field(static=True)
-    scaled_by: str = eqx.field(static=True)
+    scaled_by: Fact = eqx.field(static=True)
     per: str = eqx.field(static=True, default="N")
     mass_normalised: bool = eqx.field(static=True, default=True)
-    notes: tuple[str, ...] = eqx.field(static=True, default=())
+    notes: tuple[Fact | str, ...] = eqx.field(static=True, default=())
 
     @property
     def n_modes(self) -> int:
@@ -118,4 +119,5 @@ class ScaledModes(AbstractResult):
 
     def attributes(self) -> dict[str, str | float | int]:
         """See `AbstractResult`."""
-        return {"scaled_by": self.scaled_by, "per": self.per, "notes": "\n".join(self.notes)}
+        notes = "\n".join(map(str, self.notes))
+        return {"scaled_by": str(self.scaled_by), "per": self.per, "notes": notes}
