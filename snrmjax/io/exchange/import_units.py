@@ -134,8 +134,6 @@ def frequency_in_rad(
             f"{mapping.frequency} must be a frequency, but its unit {unit} is of "
             f"{meaning.dimension}: --frequency names another column."
         )
-    if abs(meaning.factor / _HERTZ - 1) < 1e-14:
-        return values * _HERTZ
     return values * meaning.factor
 
 

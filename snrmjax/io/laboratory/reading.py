@@ -1,10 +1,9 @@
 """One reader for every file of a laboratory: its content decides, then its extension."""
 
 import importlib
-import os
 from pathlib import Path
 
-from snrmjax.io.files import FilePath, file_name
+from snrmjax.io.files import FilePath, file_name, read_bytes
 from snrmjax.io.laboratory.arrays.matlab_files import is_old_matlab
 from snrmjax.io.laboratory.contents import Kind, LaboratoryFile, TextFormat
 
@@ -45,16 +44,7 @@ def read_laboratory_file(path: FilePath, text_format: TextFormat | None = None) 
 
 def _kind(path: FilePath) -> Kind:
     """The format of a file."""
-    name = file_name(path)
-    try:
-        with open(path, "rb") as file:
-            head = file.read(_HEAD)
-    except FileNotFoundError as error:
-        raise ValueError(f"{os.fspath(path)} does not exist.") from error
-    except IsADirectoryError as error:
-        raise ValueError(f"{os.fspath(path)} is a folder, but a file is expected.") from error
-    except OSError as error:
-        raise ValueError(f"{os.fspath(path)} cannot be read: {error.strerror}.") from error
+    name, head = file_name(path), read_bytes(path, _HEAD)
     if not head:
         raise ValueError(f"{name} is empty.")
     if any(head[at : at + 8] == _HDF5 for at in (0, 512, 1024, 2048)):  # behind a user block

@@ -35,6 +35,7 @@ or write `q_1 …`. From arrays in Python, `snrmjax.condense.condense` starts at
 """
 
 import os
+import re
 from pathlib import Path
 from typing import NamedTuple
 
@@ -42,15 +43,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from snrmjax.condense.load_cases import ReductionBasis, StaticCases
-from snrmjax.io.files import FilePath, read_text
-from snrmjax.io.reduction.number_tables import read_number_table
+from snrmjax.io.files import FilePath, read_text, shown, suggestion
 from snrmjax.io.reduction.source import ASSUMED_DAMPING, ReductionSource
+from snrmjax.io.rows import Cells, read_cells
 from snrmjax.io.toml_table import TomlTable, parsed_toml
 from snrmjax.io.units import HERTZ
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.rules import BELOW_ONE, IN_RANGE_HZ, NOT_ZERO, POSITIVE, Rule
 
 _KEYS = ("name", "numbers", "damping_ratio", "shapes", "mass", "participation", "sensors")
+_NUMBERED = re.compile(r"([a-z]+)_([1-9][0-9]{0,5})")
 _ORTHOGONAL = 1e-3  # of ΦᵀMΦ − I: files have few digits
 
 
@@ -109,7 +111,7 @@ def read_load_tables(folder: FilePath) -> ReductionSource:
 
 def _read_cases(path: Path, basis: ReductionBasis, shapes: _Matrix | None) -> StaticCases:
     n = len(basis.numbers)
-    table = read_number_table(path, ("f", "q", "u"), ("case", "energy"))
+    table = _read_table(path, ("f", "q", "u"), ("case", "energy"))
     for needed in (("f",), ("q", "u")):
         if not any(stem in table.groups for stem in needed):
             named = " or ".join(f"`{stem}_1 …`" for stem in needed)
@@ -158,7 +160,7 @@ def _matrix(top: TomlTable, place: Path, key: str, stem: str) -> _Matrix | None:
     if key not in top.entries:
         return None
     file = top.text(key)
-    table = read_number_table(place / file, (stem,), ("dof", *(("mass",) * (key == "mass"))))
+    table = _read_table(place / file, (stem,), ("dof", *(("mass",) * (key == "mass"))))
     if key == "mass" and table.cells.has("mass"):
         return _Matrix(table.cells.numbers("mass"), file)
     if stem not in table.groups:
@@ -255,3 +257,40 @@ def _sensors(
     row = int(np.argmax(np.abs(shapes[:, 0])))
     name = f"dof {row + 1}"
     return {name: shapes[row]}, [Fact("sensor_assumed", name=name)]
+
+
+class _Table(NamedTuple):
+    """The rows of a CSV by column; `groups` are the numbered columns, by their stem."""
+
+    cells: Cells
+    groups: dict[str, int]  # number of columns stem_1 … stem_n
+
+    def group(self, stem: str, *, empty_allowed: bool = False) -> np.ndarray:
+        """The numbered columns of one stem, (row, column)."""
+        columns = [f"{stem}_{k + 1}" for k in range(self.groups[stem])]
+        return np.stack(
+            [self.cells.numbers(name, empty_allowed=empty_allowed) for name in columns], axis=1
+        )
+
+
+def _read_table(path: FilePath, stems: tuple[str, ...], single: tuple[str, ...] = ()) -> _Table:
+    """Read a CSV whose columns are `stem_1 … stem_n` for some stems, and some single ones.
+
+    Raises `ValueError` that names file, row or column for an unknown or missing column of a group,
+    and as `read_cells` does.
+    """
+    cells = read_cells(path)
+    groups: dict[str, int] = {}
+    for name in cells.names:
+        numbered = _NUMBERED.fullmatch(name)
+        if numbered and numbered[1] in stems:
+            groups[numbered[1]] = max(groups.get(numbered[1], 0), int(numbered[2]))
+        elif name not in single:
+            known = (*single, *(f"{stem}_1" for stem in stems))
+            near = suggestion(name, known)
+            raise ValueError(f"{cells.file} has the unknown column {shown(name)}{near}.")
+    for stem, count in groups.items():
+        for k in range(count):
+            if not cells.has(f"{stem}_{k + 1}"):
+                raise ValueError(f"{cells.file} lacks the column `{stem}_{k + 1}`.")
+    return _Table(cells, groups)
