@@ -49,7 +49,7 @@ from snrmjax.io.rows import Cells, read_cells
 from snrmjax.io.toml_table import TomlTable, parsed_toml
 from snrmjax.io.units import HERTZ
 from snrmjax.numerics.facts import Fact
-from snrmjax.numerics.rules import BELOW_ONE, IN_RANGE_HZ, NOT_ZERO, POSITIVE, Rule
+from snrmjax.numerics.rules import BELOW_ONE, IN_RANGE_HZ, NOT_ZERO, POSITIVE
 
 _KEYS = ("name", "numbers", "damping_ratio", "shapes", "mass", "participation", "sensors")
 _NUMBERED = re.compile(r"([a-z]+)_([1-9][0-9]{0,5})")
@@ -87,23 +87,25 @@ def read_load_tables(folder: FilePath) -> ReductionSource:
         raise ValueError(
             f"{shapes.file} has {shapes.values.shape[1]} shapes for the {n} modes of modes.toml."
         )
-    basis = _basis(frequency, _mode_numbers(top, n), shapes, mass)
+    stated = "numbers" in top.entries
+    numbers = top.mode_numbers("numbers") if stated else tuple(range(1, n + 1))
+    if len(numbers) != n:
+        raise top.refusal("numbers", f"{n} numbers, one a mode", list(numbers))
+    basis = _basis(frequency, numbers, shapes, mass)
     sensors, notes = _sensors(top, n, None if shapes is None else shapes.values)
-    first = next(iter(sensors.values()))
-    participation = _of_modes(top, "participation", n, NOT_ZERO)
+    name, first = next(iter(sensors.items()))
+    participation = top.numbers_of_modes("participation", n, NOT_ZERO)
     if participation is None:
-        participation = first
-        notes.append(Fact("point_force_assumed", sensor=next(iter(sensors))))
-    damping = _of_modes(top, "damping_ratio", n, BELOW_ONE)
+        notes.append(Fact("point_force_assumed", sensor=name))
+    damping = top.numbers_of_modes("damping_ratio", n, BELOW_ONE)
     if damping is None:
-        damping = np.full(n, ASSUMED_DAMPING)
         notes.append(Fact("damping_assumed", ratio=ASSUMED_DAMPING))
     return ReductionSource(
         name=top.text("name", place.resolve().name),
         basis=basis,
-        damping_ratio=damping,
+        damping_ratio=np.array(damping or [ASSUMED_DAMPING] * n),
         sensors=sensors,
-        participation=participation,
+        participation=np.array(participation or first),
         cases=_read_cases(place / "cases.csv", basis, shapes),
         notes=tuple(notes),
     )
@@ -217,41 +219,13 @@ def _check_identity(product: np.ndarray, numbers: tuple[int, ...], files: str) -
     )
 
 
-def _mode_numbers(top: TomlTable, n: int) -> tuple[int, ...]:
-    if "numbers" not in top.entries:
-        return tuple(range(1, n + 1))
-    values = top.entries["numbers"]
-    found = [k for k in values if isinstance(k, int)] if isinstance(values, list) else []
-    good = isinstance(values, list) and len(values) == n == len(set(found))
-    if not good or any(isinstance(k, bool) or k < 1 for k in found):
-        raise top.refusal("numbers", f"{n} different whole numbers from 1 on", values)
-    return tuple(found)
-
-
-def _of_modes(top: TomlTable, key: str, n: int, *rules: Rule) -> np.ndarray | None:
-    """A number for each mode, or one for all; None where it is not stated."""
-    if key not in top.entries:
-        return None
-    if not isinstance(top.entries[key], list):
-        return np.full(n, top.number(key, *rules))
-    values = top.numbers(key, *rules, each="mode")
-    if len(values) != n:
-        raise top.refusal(key, f"{n} numbers, one a mode", top.entries[key])
-    return np.array(values)
-
-
 def _sensors(
     top: TomlTable, n: int, shapes: np.ndarray | None
 ) -> tuple[dict[str, np.ndarray], list[Fact]]:
     table = top.table("sensors", "[sensors] of modes.toml")
     if table.entries:
-        found = {}
-        for name in table.entries:
-            values = table.numbers(name, each="mode")
-            if len(values) != n:
-                raise table.refusal(name, f"{n} numbers, one a mode", table.entries[name])
-            found[name] = np.array(values)
-        return found, []
+        named = {name: table.numbers(name, each="mode", count=n) for name in table.entries}
+        return {name: np.array(shape) for name, shape in named.items()}, []
     if shapes is None:
         raise ValueError("modes.toml has neither [sensors] nor `shapes`: state one of them.")
     row = int(np.argmax(np.abs(shapes[:, 0])))
