@@ -14,6 +14,7 @@ from snrmjax.io.laboratory.arrays.structs import read_struct
 from snrmjax.io.laboratory.arrays.value_tree import Node, held
 from snrmjax.io.laboratory.contents import LaboratoryFile, TextFormat
 from snrmjax.io.laboratory.physical_units import unit_meaning
+from snrmjax.numerics.facts import Fact
 
 _LARGEST = 2**28  # bytes
 _LOOKED_AT = 200  # lines in which the header ends
@@ -34,12 +35,13 @@ def read_separated_text(path: Path, text_format: TextFormat | None = None) -> La
     lines = text.splitlines()
     separator, decimal = _marks(lines, told, file)
     first = _first_row(lines, separator, decimal, told, file)
-    names, units, notes = _header(lines, first, separator, decimal, told)
+    names, units = _header(lines, first, separator, told)
+    notes: list[Fact] = []
     fields = _split("\n".join(lines[first : first + 1]), separator)
     if len(names) != len(fields):
         names = [f"column_{k + 1}" for k in range(len(fields))]
         units = {}
-        notes.append("no row of names above the numbers: the columns are numbered.")
+        notes.append(Fact("columns_numbered"))
     rows = [
         (k, line)
         for k, line in enumerate(lines[first:], first + 1)
@@ -47,7 +49,7 @@ def read_separated_text(path: Path, text_format: TextFormat | None = None) -> La
     ]
     dropped = sum(bool(line.strip()) for line in lines[first:]) - len(rows)
     if dropped:
-        notes.append(f"{dropped} lines of comment among the numbers are not read.")
+        notes.append(Fact("comments_not_read", n=dropped))
     values = _numbers(rows, separator, decimal, names, file)
     tree: dict[str, Node] = {}
     for name, column in zip(names, values, strict=True):
@@ -55,14 +57,15 @@ def read_separated_text(path: Path, text_format: TextFormat | None = None) -> La
             tree[name] = list[Node](column)
             continue
         if column is None:
-            notes.append(f"column {name} is empty and is not read.")
+            notes.append(Fact("not_read", name=f"column {name}", why="empty"))
             continue
         missing = int(np.isnan(column).sum())
         if missing:
-            notes.append(f"column {name} has {missing} empty fields.")
+            notes.append(Fact("empty_fields", name=name, n=missing))
         tree[name] = held(column, {"unit": units[name]} if units.get(name) else {})
     marks = {mark: word for word, mark in _SEPARATORS.items()}
-    notes.append(f"separator {marks[separator]}, decimal {decimal}, numbers from row {first + 1}.")
+    how = {"separator": marks[separator], "decimal": decimal, "first_row": first + 1}
+    notes.append(Fact("text_read", **how))
     found = read_struct("", tree, entry=len(rows) == 1)
     stem = path.stem or "table"
     tables = tuple(table._replace(name=stem) for table in found.numbered())
@@ -178,9 +181,9 @@ def _first_row(lines: list[str], separator: str, decimal: str, told: TextFormat,
 
 
 def _header(
-    lines: list[str], first: int, separator: str, decimal: str, told: TextFormat
-) -> tuple[list[str], dict[str, str], list[str]]:
-    """Names, units and notes of the rows above the numbers."""
+    lines: list[str], first: int, separator: str, told: TextFormat
+) -> tuple[list[str], dict[str, str]]:
+    """Names and units of the rows above the numbers."""
     width = len(_split(lines[first], separator))
     rows: list[tuple[int, list[str]]] = []
     for k in range(max(0, first - _LOOKED_AT), first):
@@ -188,7 +191,7 @@ def _header(
         if len(fields) == width or k == (told.header_row or 0) - 1:
             rows.append((k, fields))
     if not rows:
-        return [], {}, []
+        return [], {}
     names, below = rows[-1][1], list[str]()
     if told.header_row:
         names = next((one for k, one in rows if k == told.header_row - 1), names)
@@ -208,7 +211,7 @@ def _header(
         told_unit = unit or (below[k].strip("[]() ") if k < len(below) else "")
         if told_unit:
             units[word] = told_unit
-    return plain, units, []
+    return plain, units
 
 
 def _all_units(fields: list[str]) -> bool:
