@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import snrmjax as sj
+from snrmjax.simulate.solutions.normal_modes import NormalModeBranch
 
 HERTZ = 2 * np.pi
 TONGUE_HZ = (87.3, 90.4)  # where the flat beam's mode exchanges energy with its second one
@@ -74,7 +75,7 @@ def study(
     model: sj.model.Structure,
     data: sj.measure.SteadyStates,
     argument: str,
-    branch: sj.simulate.NormalModeBranch,
+    branch: NormalModeBranch,
     responses: list[sj.simulate.ResponseCurve],
     skip_hz: tuple[float, float],
 ) -> tuple[dict, sj.identify.Backbone]:

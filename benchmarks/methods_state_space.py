@@ -92,16 +92,16 @@ def tested(volts: float, noise: float) -> Records:
     shape = 1 / np.sqrt(MASS)
     modes = sj.model.linear_modes([REST], [RATIO], [[shape]], [shape])
     potential = sj.model.polynomial_potential({"1111": CUBIC * shape**2 / 4}, 1)
-    laboratory = sj.methods.Laboratory(
+    laboratory = sj.simulate.Laboratory(
         sj.model.structure(modes, potential),
-        sj.methods.Shaker(30.0, 8.0, mass=0.05, damping=1.0, stiffness=500.0),
-        sj.methods.Instruments(velocity_noise=noise),
+        sj.simulate.Shaker(30.0, 8.0, mass=0.05, damping=1.0, stiffness=500.0),
+        sj.simulate.Instruments(velocity_noise=noise),
         RATE,
         substeps=8,
     )
     both = []
     for seed in SEEDS:
-        test = sj.methods.multisine_test(laboratory, volts, LINES, SAMPLES, PERIODS, seed=seed)
+        test = sj.simulate.multisine_test(laboratory, volts, LINES, SAMPLES, PERIODS, seed=seed)
         both.append((np.asarray(test.record.force), np.asarray(test.record.velocity)))
     return Records(*(np.array(one) for one in zip(*both, strict=True)))
 

@@ -142,13 +142,13 @@ study = sj.study.Study(
     nominal,
     sj.study.Peaks(
         sj.study.ResponseRange(*ENDS, harmonic_order=7, stability=False),
-        sj.study.OfForces(np.array([FORCE])),
+        [FORCE],
         grid_points=241,
     ),
     (
-        sj.study.normal("thickness_m", MEAN["thickness_m"], std["thickness_m"]),
-        sj.study.normal("rise_m", MEAN["rise_m"], std["rise_m"]),
-        sj.study.lognormal("damping_ratio", MEAN["damping_ratio"], std["damping_ratio"]),
+        sj.study.Normal("thickness_m", MEAN["thickness_m"], std["thickness_m"]),
+        sj.study.Normal("rise_m", MEAN["rise_m"], std["rise_m"]),
+        sj.study.LogNormal("damping_ratio", MEAN["damping_ratio"], std["damping_ratio"]),
     ),
     sj.study.Sampling("latin_hypercube", MEMBERS),
     model_of=beam_of,

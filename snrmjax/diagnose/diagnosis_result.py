@@ -23,6 +23,7 @@ from snrmjax.measure.states import SteadyStates
 from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
 from snrmjax.model.parameters import parameter_rules, with_parameters
 from snrmjax.model.structures import Structure
+from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
 from snrmjax.numerics.result import AbstractResult, Variable
 from snrmjax.numerics.rules import Rule
@@ -136,7 +137,7 @@ class Diagnosis(AbstractResult):
     checks: Checks
     detection_limits: dict[str, float]
     table: tuple[tuple[TriedEffect, ...], ...]  # what each step of the search compared
-    notes: tuple[str, ...]
+    notes: tuple[Fact | str, ...]
     force_misfit: ForceMisfit
     data: SteadyStates  # as they were compared: in N, where a drive voltage was given
     # Of levels whose force was recorded in a wrong scale: the acting one over it.
@@ -219,7 +220,7 @@ class Diagnosis(AbstractResult):
         if self.notes:
             lines.append("notes:")
             for note in self.notes:
-                lines += textwrap.wrap(note, 98, initial_indent="- ", subsequent_indent="  ")
+                lines += textwrap.wrap(str(note), 98, initial_indent="- ", subsequent_indent="  ")
         return tuple(lines)
 
     def most_probable(self) -> str:
@@ -277,7 +278,7 @@ class Diagnosis(AbstractResult):
             "gap_before": self.gap.before,
             "gap_after": self.gap.after,
             "p_value_of_fit": self.checks.p_value,
-            "notes": " ".join(self.notes),
+            "notes": " ".join(map(str, self.notes)),
         }
 
 

@@ -9,6 +9,8 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from snrmjax.numerics.facts import Fact
+
 FilePath = str | os.PathLike[str]
 
 
@@ -135,6 +137,8 @@ def _plain(value: object) -> object:
         return {key: _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [_plain(item) for item in value]
+    if isinstance(value, Fact):
+        return str(value)
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value

@@ -36,9 +36,14 @@ BAND_POINTS = 200
 _FORMAT = 3
 
 
-def write_fitted_backbone(path: Path, fit: JointFit) -> None:
-    """Write both fitted curves with 1σ from zero to the largest measured velocity."""
-    write_values(path, values_to_the_largest(fit, BAND_POINTS))
+def write_fitted_backbone(
+    path: FilePath, fit: JointFit, *, added: tuple[str, int] | None = None
+) -> None:
+    """Write both fitted curves with 1σ from zero to the largest measured velocity.
+
+    Arguments: `added` as for `write_values`.
+    """
+    write_values(path, values_to_the_largest(fit, BAND_POINTS), added=added)
 
 
 def write_next(path: FilePath, advice: Sequence[NextMeasurement] | NextMeasurements) -> None:

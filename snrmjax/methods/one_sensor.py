@@ -6,9 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from snrmjax.identify.pointwise.snrm import reference_sensor
 from snrmjax.measure.states import PHASE_UNKNOWN, SteadyStates
-from snrmjax.model.modes import LinearModes
+from snrmjax.model.modes import LinearModes, reference_sensor
 
 
 class SensorStates(NamedTuple):

@@ -245,6 +245,19 @@ def linear_response(
     ) + _rigid_body_velocity(modes, frequency, force)
 
 
+def reference_sensor(modes: LinearModes) -> int:
+    """The sensor at which the mode of interest moves most: amplitudes are given there.
+
+    Within `jax.jit` mode shapes of several sensors must be known while compiling (not arguments).
+    """
+    if modes.mode_shape.shape[0] == 1:
+        return 0
+    shape = modes.mode_shape
+    if isinstance(shape, jax.core.Tracer):  # of a derivative: it still has its value
+        shape = jax.lax.stop_gradient(shape)
+    return int(np.argmax(np.abs(np.asarray(shape)[:, modes.mode_of_interest])))
+
+
 def _modal_sum(
     shape: Float[Array, "sensor mode"],
     participation: Float[Array, " mode"],

@@ -146,7 +146,7 @@ def minus(text: str) -> str:
     return text.replace("-", "−")
 
 
-def _sentence(text: str) -> str:
+def _sentence(text: object) -> str:
     """A note as a sentence: a capital first but for a file's name, a full stop last.
 
     >>> _sentence("two rows are incomplete"), _sentence("run1.mat: two rows are incomplete.")

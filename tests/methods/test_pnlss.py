@@ -174,12 +174,12 @@ def test_forces_that_are_no_polynomials_are_said(drag, said):
     """No power of v draws v|v|: what it leaves is no noise."""
     effects = [sj.model.make_effect("quadratic_damping", {"coefficient": drag})] if drag else []
     modes = sj.model.linear_modes([REST], [RATIO], [[1.0]], [1.0])
-    laboratory = sj.methods.Laboratory(
-        *(sj.model.structure(modes, effects=effects), sj.methods.Shaker(0.1, 0.1)),
-        sj.methods.Instruments(velocity_noise=1e-4, force_noise=1e-3),
+    laboratory = sj.simulate.Laboratory(
+        *(sj.model.structure(modes, effects=effects), sj.simulate.Shaker(0.1, 0.1)),
+        sj.simulate.Instruments(velocity_noise=1e-4, force_noise=1e-3),
         2000.0,
     )
-    played = sj.methods.multisine_test(laboratory, 1.0, np.arange(50, 120), 4000, 5, seed=0).record
+    played = sj.simulate.multisine_test(laboratory, 1.0, np.arange(50, 120), 4000, 5, seed=0).record
     channels = [Channel("force", "force"), Channel("tip", "velocity")]
     values = np.stack([np.asarray(played.force), np.asarray(played.velocity)])
     record = time_recording(values, channels, 2000.0, name="multisine")

@@ -14,10 +14,11 @@ import snrmjax as sj
 from snrmjax.diagnose.search.locating import Located
 from snrmjax.io.units import HERTZ
 from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
-from snrmjax.report import diagnosis_figures as plot
-from snrmjax.report import diagnosis_report as told
+from snrmjax.pipelines.diagnose import simulated_levels
 from snrmjax.report import style as drawing
+from snrmjax.report.figures import diagnosis as plot
 from snrmjax.report.html import report_html
+from snrmjax.report.pages import diagnosis as told
 
 SHAPE, PARTICIPATION, OMEGA, ZETA = 2.0, 3.0, 100.0, 0.01
 LARGEST = 0.6  # m/s
@@ -166,8 +167,10 @@ def drag():
 @pytest.fixture(scope="module")
 def pictures(drag):
     given, _, found = drag
-    predicted, responses = told.with_responses(found, given)
-    return predicted, {**told.diagnosis_figures(found), "responses": responses}
+    simulated = simulated_levels(found, given)
+    responses = told.responses_figure(found, simulated)
+    figures = {**told.diagnosis_figures(found), "responses": responses}
+    return simulated.predicted.levels, figures
 
 
 def html_of(found, pictures, **settings):

@@ -18,9 +18,9 @@ import snrmjax as sj
 from snrmjax.identify.pointwise.prediction_result import Resonance
 from snrmjax.io.units import HERTZ
 from snrmjax.report import html as reports
-from snrmjax.report.figures import backbone_figure, response_figure
+from snrmjax.report.figures.identification import backbone_figure, response_figure
 from snrmjax.report.html import Report, ReportFigure, ReportTable, Section, write_report
-from snrmjax.report.identification_report import (
+from snrmjax.report.pages.identification import (
     ComparedResponses,
     identification_report,
     identification_sentence,

@@ -10,13 +10,15 @@ from truths.joint_fits import exact_fit, noisy_fit
 from truths.printed_page import unreadable
 
 import snrmjax as sj
-from snrmjax.identify.inference.contributions import Contribution
+from snrmjax.identify.inference.contributions import Contribution, contributions
+from snrmjax.identify.inference.fitted_response import fitted_response
 from snrmjax.io.joint_results import read_joint_fit, write_joint_fit
 from snrmjax.io.units import DEGREE, HERTZ
-from snrmjax.report import joint_figures as joint_plot
-from snrmjax.report import joint_report
+from snrmjax.pipelines.identify import FitDetails
 from snrmjax.report import sampling as plot_data
+from snrmjax.report.figures import joint_fit as joint_plot
 from snrmjax.report.html import Report, report_html
+from snrmjax.report.pages import joint_fit as joint_report
 
 TRUE = {"backbone": "polynomial:1@displacement", "damping": "viscous_quadratic@velocity"}
 
@@ -29,7 +31,10 @@ def fit():
 
 @pytest.fixture(scope="module")
 def told(fit):
-    return joint_report.reported_fit(fit, sj.next_measurements(fit, 3))
+    advice = sj.next_measurements(fit, 3)
+    forces = sorted({one.force for one in advice})
+    responses = tuple(fitted_response(fit, force)[0] for force in forces)
+    return FitDetails(fit, tuple(contributions(fit)), advice, responses)
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,9 @@ import pytest
 from matplotlib.figure import Figure
 
 import snrmjax as sj
+from snrmjax.io.results import write_response
 from snrmjax.io.units import HERTZ
+from snrmjax.simulate.continuation.stability import StabilityLoss
 from snrmjax.simulate.solutions import forced_response
 
 FORCE, ENDS = 0.12, (1.0, 4.0)
@@ -150,7 +152,7 @@ def test_stability_that_was_not_computed_is_neither_stable_nor_unstable(curve):
     (bare,) = sj.forced_response(oscillator(), FORCE, *ENDS, harmonic_order=3, stability=False)
     assert set(bare.stability) == {kind.NOT_COMPUTED}
     assert not np.any(bare.is_stable | bare.is_unstable)
-    assert set(bare.stability_loss) == {sj.simulate.StabilityLoss.NOT_COMPUTED}
+    assert set(bare.stability_loss) == {StabilityLoss.NOT_COMPUTED}
     assert f"stability: {len(bare.frequency)} not computed" in repr(bare)
     styles = {line.get_linestyle() for line in bare.plot().axes[0].lines}
     assert "--" not in styles  # no part is drawn as unstable
@@ -168,7 +170,7 @@ def test_files_say_where_stability_was_not_computed(curve, tmp_path):
     fold = int(curve.at_events("fold")[0])
     multipliers[fold] = np.nan
     holed = dataclasses.replace(curve, multipliers=multipliers)
-    sj.io.write_response(tmp_path / "response.csv", [holed])
+    write_response(tmp_path / "response.csv", [holed])
     rows = [line.split(",") for line in (tmp_path / "response.csv").read_text().splitlines()]
     stable, event = rows[0].index("stable"), rows[0].index("event")
     body = rows[1:]
@@ -185,7 +187,7 @@ def test_one_many_and_arrays_of_forces_are_the_same():
     for curves in found:
         assert len(curves) == 1
         np.testing.assert_array_equal(curves[0].frequency, found[0][0].frequency)
-    with pytest.raises(ValueError, match=r"every force must be positive, but one is -1.0 N"):
+    with pytest.raises(ValueError, match=r"`forces` must be positive and finite, but is -1"):
         sj.forced_response(oscillator(), np.array([FORCE, -1.0]), *ENDS)
 
 

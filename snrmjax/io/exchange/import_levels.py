@@ -5,8 +5,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
-from snrmjax.io.exchange.import_map import Assumption, Assumptions
-from snrmjax.measure.recordings.velocity_states import counted_levels, number_levels
+from snrmjax.io.exchange.import_map import Assumptions
+from snrmjax.measure.recordings.velocity_states import number_levels
+from snrmjax.numerics.facts import Fact
 
 
 class MeasuredPart(NamedTuple):
@@ -48,9 +49,9 @@ def numbered_levels(
         return np.unique(keys, return_inverse=True)[1] + 1, level
     if level == "file" or (not level and len(parts) > 1):
         if not level:
-            assumed["level"] = Assumption("one level a file, in the order in which they were named")
+            assumed.add("level", Fact("level_a_file"))
         return files, "file"
     number, rule = number_levels(level or "auto", force, None, frequency)  # type: ignore[arg-type]
     if not level:
-        assumed["level"] = Assumption(counted_levels(number, rule))
+        assumed.add("level", Fact("levels_counted", n=len(np.unique(number)), by=rule))
     return number, rule

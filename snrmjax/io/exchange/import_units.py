@@ -6,10 +6,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from snrmjax.io.exchange.import_map import Assumption, Assumptions, ImportMap
+from snrmjax.io.exchange.import_map import Assumptions, ImportMap
 from snrmjax.io.files import near_miss
 from snrmjax.io.laboratory.physical_units import UnitMeaning, unit_meaning
 from snrmjax.measure.recordings.channels import SI_UNIT
+from snrmjax.numerics.facts import Fact
 
 AMPLITUDE_FACTORS = {"peak": 1.0, "": 1.0, "rms": np.sqrt(2.0), "peak_to_peak": 0.5}
 """What makes peak amplitudes of peak, rms and peak-to-peak ones."""
@@ -109,8 +110,7 @@ def amplitude_factor(told: ImportMap, units: Mapping[str, str], assumed: Assumpt
             "holds for all? --amplitude peak, rms or peak_to_peak."
         )
     size = next(iter(sizes), "peak")
-    why = "the units say so" if sizes else "nothing is said"
-    assumed["amplitude"] = Assumption(why, size)
+    assumed.add("amplitude", Fact("units_say_so") if sizes else Fact("nothing_is_said"), size)
     return float(AMPLITUDE_FACTORS[size])
 
 
@@ -124,7 +124,7 @@ def frequency_in_rad(
             raise ValueError(
                 f"is {told.frequency} in Hz or in rad/s? State it: --frequency-unit Hz or rad/s."
             )
-        assumed["frequency_unit"] = Assumption("nothing is said", "Hz")
+        assumed.add("frequency_unit", Fact("nothing_is_said"), "Hz")
         return values * _HERTZ
     assumed.unit("frequency_unit", told.frequency_unit, file_unit)
     meaning = _understood(unit, "--frequency-unit")
@@ -149,36 +149,34 @@ def phase_in_rad(
 
     Raises `ValueError` with a question where degrees and radians are both possible.
     """
-    unit, why = told.phase_unit, ""
-    if not unit and file_unit:
-        meaning = unit_meaning(file_unit)
-        if meaning.dimension != "angle":
-            raise ValueError(
-                f"{column} must be an angle, but its unit is {file_unit}: --phase names another "
-                "column, --phase-unit its unit."
-            )
-        unit, why = ("rad" if meaning.factor == 1 else "deg"), "the file says so"
-    if told.phase_unit and file_unit and unit_meaning(file_unit).dimension == "angle":
-        found = "rad" if unit_meaning(file_unit).factor == 1 else "deg"
-        if found != told.phase_unit:
-            raise ValueError(
-                f"--phase-unit says {told.phase_unit}, but {column} is in {file_unit}: which is "
-                "right?"
-            )
+    stated = unit_meaning(file_unit) if file_unit else None
+    if stated and stated.dimension != "angle" and not told.phase_unit:
+        raise ValueError(
+            f"{column} must be an angle, but its unit is {file_unit}: --phase names another "
+            "column, --phase-unit its unit."
+        )
+    of_file = (
+        "" if not stated or stated.dimension != "angle" else "rad" if stated.factor == 1 else "deg"
+    )
+    if told.phase_unit and of_file not in ("", told.phase_unit):
+        raise ValueError(
+            f"--phase-unit says {told.phase_unit}, but {column} is in {file_unit}: which is right?"
+        )
+    unit = told.phase_unit or of_file
+    if not told.phase_unit and of_file:
+        assumed.add("phase_unit", Fact("unit_of_file"), unit)
     if not unit:
         ends = [word for word in ("deg", "rad") if column.lower().rstrip("_)]s").endswith(word)]
-        if ends:
-            unit, why = ends[0], f"{column} says so"
-        elif np.nanmax(np.abs(values), initial=0.0) > 2 * _HERTZ:
-            unit, why = "deg", f"{column} reaches beyond two turns in radians"
-        else:
+        if not ends and not np.nanmax(np.abs(values), initial=0.0) > 2 * _HERTZ:
             raise ValueError(f"is {column} in degrees or in radians? --phase-unit deg or rad.")
-    if why:
-        assumed["phase_unit"] = Assumption(why, unit)
-    if not told.phase_sign:
-        assumed["phase_sign"] = Assumption(
-            "a positive phase is ahead of the force, e^(+iwt)", "lead"
+        said, beyond = (
+            Fact("column_says_so", column=column),
+            Fact("phase_beyond_two_turns", column=column),
         )
+        unit, why = (ends[0], said) if ends else ("deg", beyond)
+        assumed.add("phase_unit", why, unit)
+    if not told.phase_sign:
+        assumed.add("phase_sign", Fact("phase_ahead_of_the_force"), "lead")
     sign = -1.0 if told.phase_sign == "lag" else 1.0
     return sign * (np.radians(values) if unit == "deg" else values)
 

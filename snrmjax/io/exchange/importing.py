@@ -8,13 +8,13 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from snrmjax.io.columns import is_ours
 from snrmjax.io.exchange.import_levels import MeasuredPart, numbered_levels
-from snrmjax.io.exchange.import_map import Assumption, Assumptions, ImportMap
+from snrmjax.io.exchange.import_map import Assumptions, ImportMap
 from snrmjax.io.exchange.import_units import Force
 from snrmjax.io.exchange.own_tables import (
-    is_own_table,
     restated,
-    restated_in_words,
+    restated_how,
     states_of_own_table,
 )
 from snrmjax.io.exchange.record_import import import_record, told_record
@@ -31,6 +31,7 @@ from snrmjax.measure.states import (
     steady_states,
     with_levels_apart,
 )
+from snrmjax.numerics.facts import Fact
 
 
 class Imported(NamedTuple):
@@ -43,7 +44,7 @@ class Imported(NamedTuple):
     records: tuple[TimeRecording, ...]
     used: ImportMap
     assumed: Assumptions
-    notes: tuple[str, ...]
+    notes: tuple[Fact | str, ...]
     steps: StepCounts | None = None  # of all records that are stepped sines
 
 
@@ -63,12 +64,12 @@ def import_files(paths: Sequence[Path], told: ImportMap) -> Imported:
     Returns `Imported`. Raises `ValueError`: as `read_laboratory_file` does, and with a question
     that names the option where something cannot be told.
     """
-    assumed, notes = Assumptions(), list[str]()
+    assumed, notes = Assumptions(), list[Fact | str]()
     chosen: list[_Dataset] = []
     for path in paths:
         held = read_laboratory_file(path, told.text_format)
         chosen += _datasets(held, told)
-        notes += [f"{held.name}: {note}" for note in held.notes]
+        notes += [Fact("note_of_file", file=held.name, note=note) for note in held.notes]
     kinds = {type(one.content) for one in chosen}
     if len(kinds) > 1:
         listed = ", ".join(f"{one.file}: {one.name}" for one in chosen)
@@ -78,7 +79,9 @@ def import_files(paths: Sequence[Path], told: ImportMap) -> Imported:
     if isinstance(chosen[0].content, TimeRecording):
         return _records(chosen, told, assumed, notes)
     own = [
-        one for one in chosen if isinstance(one.content, NumberTable) and is_own_table(one.content)
+        one
+        for one in chosen
+        if isinstance(one.content, NumberTable) and is_ours(one.content.columns)
     ]
     if own and not told.responses:
         parts = [
@@ -86,8 +89,7 @@ def import_files(paths: Sequence[Path], told: ImportMap) -> Imported:
             for one in own
             if isinstance(one.content, NumberTable)
         ]
-        taken = restated_in_words(told) or "taken as they are"
-        notes.append(f"the columns are those of our table: {taken}.")
+        notes.append(restated_how(told))
         return Imported(_joined(parts), (), told, assumed, tuple(notes))
     return _phasors(chosen, told, assumed, notes)
 
@@ -117,7 +119,7 @@ def _datasets(held: LaboratoryFile, told: ImportMap) -> list[_Dataset]:
 
 
 def _records(
-    chosen: Sequence[_Dataset], told: ImportMap, assumed: Assumptions, notes: list[str]
+    chosen: Sequence[_Dataset], told: ImportMap, assumed: Assumptions, notes: list[Fact | str]
 ) -> Imported:
     if told.phase_sign == "lag":
         raise ValueError(
@@ -133,7 +135,7 @@ def _records(
         if isinstance(one.content, TimeRecording):
             record, used = told_record(one.content, told, one.file, assumed)
             states, used, more, counts = import_record(record, used, one.file, assumed)
-            notes += [f"{one.file}: {note}" for note in more]
+            notes += [Fact("note_of_file", file=one.file, note=note) for note in more]
             steps += [] if counts is None else [counts]
             if states is None:
                 kept.append(record)
@@ -141,14 +143,13 @@ def _records(
                 parts.append(states)
     counted = joined_counts(steps) if steps else None
     if counted is not None:
-        notes.append(f"{counted.words}.")
+        reasons = tuple(counted.left_out.items())
+        notes.append(Fact("steps_used", used=counted.used, left_out=reasons))
     if not parts:
         return Imported(None, tuple(kept), used, assumed, tuple(notes))
     if told.level == "file" or (len(parts) > 1 and not told.level):
         if not told.level:
-            assumed["level"] = Assumption(
-                "one level a record, in the order in which they were named"
-            )
+            assumed.add("level", Fact("level_a_record"))
         used = used._replace(level="file")
         parts = [
             dataclasses.replace(one, level=jnp.full(one.n_states, k + 1))
@@ -160,7 +161,7 @@ def _records(
 
 
 def _phasors(
-    chosen: Sequence[_Dataset], told: ImportMap, assumed: Assumptions, notes: list[str]
+    chosen: Sequence[_Dataset], told: ImportMap, assumed: Assumptions, notes: list[Fact | str]
 ) -> Imported:
     """Tables and frequency responses."""
     parts: list[MeasuredPart] = []

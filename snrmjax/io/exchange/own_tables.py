@@ -6,28 +6,21 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
+from snrmjax.io.columns import is_ours
 from snrmjax.io.exchange.import_map import ImportMap
 from snrmjax.io.exchange.import_units import AMPLITUDE_FACTORS, force_meaning, motion_meaning
-from snrmjax.io.files import read_text
 from snrmjax.io.laboratory.contents import NumberTable
+from snrmjax.io.rows import header_of
 from snrmjax.io.tables import steady_states_of_fields
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.velocity_states import velocity_factors
 from snrmjax.measure.states import SteadyStates
-
-_OWN = ("frequency_hz", "velocity_re_m_s", "velocity_im_m_s")
-_OWN_FILES = ({"frequency_hz", "velocity_re_m_s"}, {"frequency_hz", "velocity_m_s", "level"})
-
-
-def is_own_table(table: NumberTable) -> bool:
-    """Whether a table has the columns of our CSV."""
-    return all(name in table.columns for name in _OWN)
+from snrmjax.numerics.facts import Fact
 
 
 def is_own_file(path: Path) -> bool:
     """Whether a CSV is meant as ours, by its header: its reader then says what is amiss."""
-    header = {word.strip().strip("\ufeff") for word in read_text(path).split("\n", 1)[0].split(",")}
-    return any(columns <= header for columns in _OWN_FILES)
+    return is_ours(header_of(path))
 
 
 def states_of_own_table(table: NumberTable, file: str) -> SteadyStates:
@@ -90,17 +83,14 @@ def _with_force(states: SteadyStates, told: ImportMap) -> SteadyStates:
     return dataclasses.replace(states, force=newtons, drive=drive, force_std=std)
 
 
-def restated_in_words(told: ImportMap) -> str:
-    """What of our table is told to be otherwise; empty where nothing is."""
-    return ", ".join(
-        words
-        for said, words in (
-            (told.unit, f"velocity columns in {told.unit}"),
-            (told.force_unit, f"forces in {told.force_unit}"),
-            (told.amplitude not in ("", "peak"), f"amplitudes {told.amplitude}"),
-            (told.phase_sign == "lag", "phasors conjugated"),
-        )
-        if said
+def restated_how(told: ImportMap) -> Fact:
+    """What of our table is told to be otherwise."""
+    return Fact(
+        "our_own_table",
+        unit=told.unit,
+        force_unit=told.force_unit,
+        amplitude="" if told.amplitude == "peak" else told.amplitude,
+        conjugated=told.phase_sign == "lag",
     )
 
 

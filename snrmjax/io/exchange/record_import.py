@@ -1,18 +1,21 @@
 """Steady states, or records of a decay, of a laboratory's time records."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 
-from snrmjax.io.exchange.import_map import Assumption, Assumptions, ImportMap, ResponseMap
+from snrmjax.io.exchange.import_map import Assumptions, ImportMap, ResponseMap
 from snrmjax.io.exchange.import_units import force_meaning, motion_meaning
+from snrmjax.io.exchange.table_import import sensor_of
 from snrmjax.measure.recordings.channels import Channel, channel_number
 from snrmjax.measure.recordings.step_counts import StepCounts
 from snrmjax.measure.recordings.stepped_sine import stepped_sine_states
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.recordings.velocity_states import Levels
-from snrmjax.measure.states import UNNAMED_SENSOR, SteadyStates
+from snrmjax.measure.states import SteadyStates
 from snrmjax.measure.sweeps.slow_sweep import sweep_states
+from snrmjax.numerics.facts import Fact
 
 _DIRECT: dict[str, Levels] = {"force": "force", "drive": "drive", "runs": "runs"}
 
@@ -53,9 +56,7 @@ def told_record(
         assumed.unit(f"response {number + 1}.unit", one.unit, old.unit)
         quantity, factor, unit = motion_meaning(one.quantity, one.unit, old.unit, one.channel)
         channels[k] = old._replace(quantity=quantity, unit=unit, calibration=factor)  # type: ignore[arg-type]
-        sensor = one.sensor or (UNNAMED_SENSOR[0] if len(told.responses) == 1 else one.channel)
-        if not one.sensor:
-            assumed[f"response {number + 1}.sensor"] = Assumption("not stated; --sensor names it")
+        sensor = sensor_of(one, told, number + 1, assumed)
         filled.append(ResponseMap(one.channel, quantity, one.unit, sensor))
     if told.drive:
         k = _number(record, told.drive, file, "--drive")
@@ -87,41 +88,29 @@ def import_record(
             f"--level must be one of force, drive, runs or file for time records, but is "
             f"{told.level!r}."
         )
-    responses = [one.channel for one in told.responses]
     level = _DIRECT.get(told.level, "auto")
-    sensors = [one.sensor for one in told.responses]
-    drive = told.drive or None
+    said: dict[str, Any] = {
+        "level": level,
+        "sensors": [one.sensor for one in told.responses],
+        "drive": told.drive or None,
+    }
+    read = record, told.force, [one.channel for one in told.responses]
     failed = []
-    counts: StepCounts | None
     for kind in (told.record,) if told.record else ("steps", "sweep"):
         try:
             if kind == "steps":
-                found = stepped_sine_states(
-                    record,
-                    told.force,
-                    responses,
-                    level=level,
-                    sensors=sensors,
-                    drive=drive,
-                )
-                states, notes, counts = found.states, found.notes, found.counts
+                steps = stepped_sine_states(*read, **said)
+                states, notes, counts = steps.states, steps.notes, steps.counts
             else:
-                swept = sweep_states(
-                    record,
-                    told.force,
-                    responses,
-                    level=level,
-                    sensors=sensors,
-                    drive=drive,
-                )
+                swept = sweep_states(*read, **said)
                 states, notes, counts = swept.states, swept.remarks, None
         except ValueError as error:
             failed.append(f"{kind}: {error}")
             continue
         if not told.record:
-            assumed["record"] = Assumption("recognised in the record", kind)
+            assumed.add("record", Fact("record_recognised"), kind)
         if not told.level:
-            assumed["level"] = Assumption(f"{len(np.unique(states.level))} found")
+            assumed.add("level", Fact("levels_found", n=len(np.unique(states.level))))
         return states, told._replace(record=kind, level=told.level or level), notes, counts
     if told.record:
         raise ValueError(f"{file} does not read as {failed[0]}")
@@ -138,14 +127,11 @@ def record_columns(record: TimeRecording, told: ImportMap) -> dict[str, Channel]
     if told.force:
         force = by_name[told.force]
         columns["drive_v" if force.quantity == "voltage" else "force_n"] = force
-    endings = {
-        "velocity": "velocity_m_s",
-        "acceleration": "acceleration_m_s2",
-        "displacement": "displacement_m",
-    }
+    endings = {"velocity": "m_s", "acceleration": "m_s2", "displacement": "m"}
     for one in told.responses:
         lead = "" if len(told.responses) == 1 else f"{one.sensor}."
-        columns[f"{lead}{endings[by_name[one.channel].quantity]}"] = by_name[one.channel]
+        quantity = by_name[one.channel].quantity
+        columns[f"{lead}{quantity}_{endings[quantity]}"] = by_name[one.channel]
     return columns
 
 

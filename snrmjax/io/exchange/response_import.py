@@ -5,12 +5,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from snrmjax.io.exchange.import_levels import MeasuredPart
-from snrmjax.io.exchange.import_map import Assumption, Assumptions, ImportMap
+from snrmjax.io.exchange.import_map import Assumptions, ImportMap
 from snrmjax.io.exchange.import_units import Force, force_meaning, require_name
 from snrmjax.io.exchange.table_import import import_table
 from snrmjax.io.laboratory.contents import NumberTable
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
+from snrmjax.numerics.facts import Fact
 
 _FREQUENCY, _FORCE, _SET = "frequency of the lines", "force behind the responses", "set"
 _RULES = ("force", "runs", "file")
@@ -22,7 +23,7 @@ def import_responses(
     told: ImportMap,
     file: str,
     assumed: Assumptions,
-) -> tuple[MeasuredPart, ImportMap, Force, list[str]]:
+) -> tuple[MeasuredPart, ImportMap, Force, list[Fact]]:
     """States of sets of frequency responses, one set a level.
 
     The force is a channel among the responses (spectra, or responses over a generator), or the
@@ -38,9 +39,9 @@ def import_responses(
         raise ValueError(f"--level must be order, z, force or file of {file}, not {told.level!r}.")
     if told.level == "z" and not np.isfinite(z).all():
         raise ValueError(f"--level z: {file} states no value on the z axis: --level order.")
-    spectra = bool(told.force) and all(_has(one, told.force) for one in sets)
+    spectra = bool(told.force) and all(told.force in _names(one.responses) for one in sets)
     keys = z if told.level == "z" else np.arange(1.0, len(sets) + 1)
-    columns = {_FREQUENCY: _joined([_or_nothing(one.frequency) for one in sets])}
+    columns = {_FREQUENCY: np.concatenate([_or_nothing(one.frequency) for one in sets])}
     columns[_SET] = np.repeat(keys, [one.frequency.size for one in sets])
     units = {_FREQUENCY: "rad/s"}
     rule = told.level if told.level in _RULES else _SET
@@ -48,7 +49,7 @@ def import_responses(
     if not spectra:
         amplitude = _amplitudes(sets, z, told, file)
         pairs = zip(amplitude, sets, strict=True)
-        columns[_FORCE] = _joined([np.full(one.frequency.size, size) for size, one in pairs])
+        columns[_FORCE] = np.concatenate([np.full(one.frequency.size, size) for size, one in pairs])
         units[_FORCE] = "V" if _reference_force(sets, told, file).is_voltage else "N"
         as_table = as_table._replace(
             force=_FORCE, force_unit="", force_amplitude=(), over_force=True
@@ -57,34 +58,32 @@ def import_responses(
     for name, unit, option in [*asked, *([(told.force, told.force_unit, "--force")] * spectra)]:
         parts = []
         for one in sets:
-            row = _row(one, name, file, option)
+            names = _names(one.responses)
+            require_name(option, name, names, "responses", file)
+            row = names.index(name)
             channel = one.responses[row]
             # A known channel's values are in SI already: its own unit, or the one that is stated.
             values = one.values[row, _reference(one, told, file, spectra=spectra)]
             parts.append(values / channel.calibration if unit else values)
-        columns[name] = _joined(parts) if option == "--response" else _or_nothing(_joined(parts))
+        columns[name] = (
+            np.concatenate(parts) if option == "--response" else _or_nothing(np.concatenate(parts))
+        )
         if channel.quantity not in ("unknown", "voltage") or option == "--force":
             units[name] = channel.unit if unit else _si(channel)
     table = NumberTable(file, columns, {name: unit for name, unit in units.items() if unit})
     part, found, force, notes = import_table(table, as_table, file, assumed)
     del assumed["frequency_unit"]
     if spectra:
-        assumed["force_amplitude"] = Assumption(
-            "spectra or responses over one reference, of amplitude 1"
-        )
+        assumed.add("force_amplitude", Fact("spectra_of_one_reference"))
     else:
         del assumed["force_unit"]
         reference = sets[0].references[_reference(sets[0], told, file, spectra=False)]
         if not _si(reference) and not told.force_unit:
-            assumed["force_unit"] = Assumption("the file states none of the reference", "N")
+            assumed.add("force_unit", Fact("reference_without_unit"), "N")
     if not told.level:
-        assumed["level"] = Assumption("one level a set of responses, in the file's order")
+        assumed.add("level", Fact("level_a_set"))
     told = told._replace(responses=found.responses, level=told.level or "order")
     return part, told, force, notes
-
-
-def _joined(parts: Sequence[np.ndarray]) -> np.ndarray:
-    return np.concatenate(parts)
 
 
 def _or_nothing(values: np.ndarray) -> np.ndarray:
@@ -139,27 +138,15 @@ def _si(channel: Channel) -> str:
     return channel.si_unit if channel.quantity != "unknown" else ""
 
 
-def _has(one: FrequencyResponses, name: str) -> bool:
-    return name in [channel.name for channel in one.responses]
-
-
-def _row(one: FrequencyResponses, name: str, file: str, option: str) -> int:
-    names = [channel.name for channel in one.responses]
-    require_name(option, name, names, "responses", file)
-    return names.index(name)
+def _names(channels: Sequence[Channel]) -> list[str]:
+    return [channel.name for channel in channels]
 
 
 def _reference(one: FrequencyResponses, told: ImportMap, file: str, *, spectra: bool) -> int:
-    names = [channel.name for channel in one.references]
+    names = _names(one.references)
     if told.force and not spectra:
-        outputs = [channel.name for channel in one.responses]
-        require_name(
-            "--force",
-            told.force,
-            names,
-            f"responses {', '.join(outputs)}, and over the references",
-            file,
-        )
+        what = f"responses {', '.join(_names(one.responses))}, and over the references"
+        require_name("--force", told.force, names, what, file)
         return names.index(told.force)
     if len(names) > 1:
         raise ValueError(

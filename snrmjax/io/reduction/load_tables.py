@@ -118,7 +118,7 @@ def _read_cases(path: Path, basis: ReductionBasis, shapes: _Matrix | None) -> St
             raise ValueError(
                 f"{path.name} has {table.groups[stem]} modes in `{stem}_1 …`, but modes.toml {n}."
             )
-    names = tuple(table.cells.texts("case")) if table.has("case") else ()
+    names = tuple(table.cells.texts("case")) if table.cells.has("case") else ()
     for k, name in enumerate(names):
         if name in names[:k]:
             raise ValueError(f"{path.name} has the case {name!r} twice.")
@@ -137,7 +137,9 @@ def _read_cases(path: Path, basis: ReductionBasis, shapes: _Matrix | None) -> St
         moved = table.group("q", empty_allowed=True)
     else:
         moved = np.asarray(displacement) @ np.asarray(basis.filter).T
-    energy = table.cells.numbers("energy", empty_allowed=True) if table.has("energy") else None
+    energy = (
+        table.cells.numbers("energy", empty_allowed=True) if table.cells.has("energy") else None
+    )
     if energy is not None and np.isnan(energy).all():
         energy = None
     return StaticCases(
@@ -156,7 +158,7 @@ def _matrix(top: TomlTable, place: Path, key: str, stem: str) -> _Matrix | None:
         return None
     file = top.text(key)
     table = read_number_table(place / file, (stem,), ("dof", *(("mass",) * (key == "mass"))))
-    if key == "mass" and table.has("mass"):
+    if key == "mass" and table.cells.has("mass"):
         return _Matrix(table.cells.numbers("mass"), file)
     if stem not in table.groups:
         raise ValueError(f"{file} lacks the column `{stem}_1`.")

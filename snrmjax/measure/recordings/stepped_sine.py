@@ -23,10 +23,10 @@ from snrmjax.measure.recordings.velocity_states import (
     ChosenChannels,
     Levels,
     PhasorTable,
-    checked_orders,
     choose_channels,
     states_of_phasors,
 )
+from snrmjax.measure.signals import require_fundamental
 from snrmjax.measure.states import SteadyStates
 from snrmjax.numerics.result import AbstractResult, Variable
 from snrmjax.numerics.status import Status
@@ -181,7 +181,7 @@ def stepped_sine_states(
     >>> found.states.force.round(3).tolist(), np.angle(found.states.velocity).round(3).tolist()
     ([2.0, 2.0], [[0.2], [0.2]])
     """
-    orders = checked_orders(harmonic_order)
+    orders = require_fundamental("harmonic_order", harmonic_order)
     chosen = choose_channels(recording, force, responses, sensors=sensors, drive=drive)
     if frequencies is None:
         steps = _recognised(recording, chosen, least_amplitude_step, least_frequency_step)

@@ -9,7 +9,6 @@ from jaxtyping import Complex, Float, Int
 
 from snrmjax.measure.recordings.channels import Channel, channel_number
 from snrmjax.measure.recordings.time_recording import TimeRecording
-from snrmjax.measure.signals import require_orders
 from snrmjax.measure.states import SteadyStates, steady_states
 
 Levels = Literal["auto", "force", "drive", "runs"]
@@ -99,14 +98,6 @@ def velocity_factors(
     safe = np.where(turn == 0, 1.0, turn)
     at_rest = np.where(power == 0, 1.0, np.where(power > 0, 0.0, np.nan))
     return np.where(turn == 0, at_rest, safe**power)
-
-
-def checked_orders(harmonic_order: Sequence[int]) -> tuple[int, ...]:
-    """Harmonic orders with the fundamental. Raises `ValueError` otherwise."""
-    orders = require_orders("harmonic_order", tuple(harmonic_order))
-    if 1 not in orders:
-        raise ValueError(f"`harmonic_order` must contain the fundamental, 1, but is {orders}.")
-    return orders
 
 
 def states_of_phasors(

@@ -17,10 +17,10 @@ from snrmjax.measure.recordings.tone_track import (
 from snrmjax.measure.recordings.velocity_states import (
     ChosenChannels,
     Levels,
-    checked_orders,
     choose_channels,
     states_of_phasors,
 )
+from snrmjax.measure.signals import require_fundamental
 from snrmjax.measure.states import SteadyStates
 from snrmjax.measure.sweeps.sweep_bias import SweepBias, sweep_bias_where_slow
 from snrmjax.measure.sweeps.sweep_correction import ModalBalance, modal_balance
@@ -174,7 +174,7 @@ def sweep_states(
     >>> found.states.force.round(4).tolist(), np.angle(found.states.velocity).round(4).tolist()
     ([2.0, 2.0], [[0.2], [0.2]])
     """
-    orders = checked_orders(harmonic_order)
+    orders = require_fundamental("harmonic_order", harmonic_order)
     chosen = choose_channels(recording, force, responses, sensors=sensors, drive=drive)
     if not cycles >= 6:
         raise ValueError(f"`cycles` must be 6 at least, but is {cycles:g}.")

@@ -18,13 +18,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from snrmjax.identify.pointwise.snrm import reference_sensor
 from snrmjax.measure.recordings.ring_down import find_ring_downs
 from snrmjax.measure.recordings.steps import moves_within_steps, recognise_steps
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.recordings.tone_track import ToneTrack, track_tone, unwrapped_phase
 from snrmjax.measure.sweeps.sweep_runs import sweep_runs
-from snrmjax.model.modes import LinearModes
+from snrmjax.model.modes import LinearModes, reference_sensor
 
 _MOTIONS = ("velocity", "acceleration", "displacement")
 _HERTZ = 2 * np.pi

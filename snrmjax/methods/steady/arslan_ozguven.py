@@ -10,11 +10,10 @@ Reference: Ö. Arslan, M. Aykan & H. N. Özgüven, Mech. Syst. Signal Process. 2
 import numpy as np
 from jaxtyping import Complex
 
-from snrmjax.identify.pointwise.snrm import reference_sensor
 from snrmjax.measure.states import SteadyStates
 from snrmjax.methods.one_sensor import SensorStates, sensor_states
 from snrmjax.methods.result import MethodPoint, MethodResult, MethodStatus, method_result
-from snrmjax.model.modes import LinearModes
+from snrmjax.model.modes import LinearModes, reference_sensor
 
 
 def arslan_ozguven(data: SteadyStates, modes: LinearModes) -> MethodResult:

@@ -13,6 +13,7 @@ from snrmjax.model.effect_base import AbstractForce
 from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.simulate.balance.given_numbers import frequency_range, positive
 from snrmjax.simulate.balance.harmonic_balance import (
     HarmonicBalance,
     harmonic_balance,
@@ -122,7 +123,7 @@ def damped_normal_mode(
     Raises `ValueError` for a velocity that is not positive and finite.
     Reference: Krack, Comput. Struct. 154 (2015) 59, doi:10.1016/j.compstruc.2015.03.008.
     """
-    _require_positive("largest_velocity", largest_velocity)
+    positive("largest_velocity", largest_velocity)
     model = simulated_structure(model)
     j = model.modes.mode_of_interest
     omega = float(model.modes.natural_frequency[j])
@@ -202,7 +203,7 @@ def phase_controlled(
     Reference: Peeters, Kerschen & Golinval, J. Sound Vib. 330 (2011) 486,
     doi:10.1016/j.jsv.2010.08.028.
     """
-    _require_positive("largest_force", largest_force)
+    positive("largest_force", largest_force)
     if not abs(phase) < np.pi / 2:
         raise ValueError(f"`phase` must lie between -π/2 and π/2, but is {phase:g} rad.")
     model = simulated_structure(model)
@@ -269,12 +270,8 @@ def response_controlled(
     Reference: Karaağaçlı & Özgüven, Mech. Syst. Signal Process. 144 (2020) 107023,
     doi:10.1016/j.ymssp.2020.107023.
     """
-    _require_positive("velocity", velocity)
-    if not 0 < from_frequency < to_frequency < np.inf:
-        raise ValueError(
-            "`from_frequency` must be positive and below a finite `to_frequency`, but they are "
-            f"{float(from_frequency):g} and {float(to_frequency):g} rad/s."
-        )
+    positive("velocity", velocity)
+    ends = frequency_range(from_frequency, to_frequency)
     model = simulated_structure(model)
     shape = np.asarray(model.modes.mode_shape[0])
     j = model.modes.mode_of_interest
@@ -288,7 +285,6 @@ def response_controlled(
     balance = harmonic_balance(
         model, unit, scale, harmonic_order=harmonic_order, n_samples=n_samples
     )
-    ends = np.array([from_frequency, to_frequency], dtype=np.float64)
     curve = _trace_response(balance, float(velocity), ends, np.array(False), steps)
     points = np.asarray(curve.points)[: int(curve.n_points)]
     if int(curve.status) == CurveStatus.NO_START:
@@ -362,8 +358,3 @@ def _motion(
     frequency = points[:, -1] * float(balance.frequency_scale)
     velocity = velocity_along(coefficients, frequency, np.asarray(balance.model.modes.mode_shape))
     return frequency, coefficients, velocity
-
-
-def _require_positive(name: str, value: float) -> None:
-    if not 0 < value < np.inf:
-        raise ValueError(f"`{name}` must be positive and finite, but is {value!r}.")

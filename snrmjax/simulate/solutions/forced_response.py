@@ -14,10 +14,8 @@ from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.numerics.blocks import mapped, over_cores, taken
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.result import AbstractResult, Variable
-from snrmjax.simulate.balance.harmonic_balance import (
-    HarmonicBalance,
-    harmonic_balance,
-)
+from snrmjax.simulate.balance.given_numbers import frequency_range, positive
+from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, harmonic_balance
 from snrmjax.simulate.balance.labelled import HERTZ, range_text
 from snrmjax.simulate.continuation.continuation import (
     CurveStatus,
@@ -87,22 +85,11 @@ def forced_response(
     >>> curve.status.name, curve.at_events("phase_resonance").size
     ('UPPER_END', 1)
     """
-    loads = positive_values("force", forces, "N")
+    loads = positive("forces", forces)
     settings = ResponseSettings(harmonic_order, n_samples, steps, stability)
     ends = (from_frequency, to_frequency)
     batch = forced_response_batch([model] * len(loads), loads, *ends, settings=settings)
     return [part for parts in batch.curves for part in parts]
-
-
-def positive_values(
-    name: str, values: float | Sequence[float] | Float[ArrayLike, "..."], unit: str
-) -> Float[np.ndarray, " value"]:
-    """One or many values as a vector. Raises `ValueError` for one that is not positive."""
-    vector = np.atleast_1d(np.asarray(values, dtype=np.float64)).ravel()
-    for value in vector.tolist():
-        if not 0 < value < np.inf:
-            raise ValueError(f"every {name} must be positive, but one is {value!r} {unit}.")
-    return vector
 
 
 class ResponseBatch(AbstractResult):
@@ -194,16 +181,6 @@ def forced_response_batch(
     names = [one.name for one in dataclasses.fields(ResponseBatch)][:-1]
     columns = {name: np.array([one[name] for one in summaries]) for name in names}
     return ResponseBatch(**columns, curves=tuple(rows))
-
-
-def frequency_range(from_frequency: float, to_frequency: float) -> Float[np.ndarray, " end"]:
-    """Both ends in rad/s. Raises `ValueError` when they are no range."""
-    if not 0 < from_frequency < to_frequency < np.inf:
-        raise ValueError(
-            "`from_frequency` must be positive and below a finite `to_frequency`, but they are "
-            f"{float(from_frequency):g} and {float(to_frequency):g} rad/s."
-        )
-    return np.array([from_frequency, to_frequency], dtype=np.float64)
 
 
 def _paired(

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from snrmjax.model.structures import Structure, equilibria, simulated_structure
 from snrmjax.numerics.blocks import as_arrays, padded, taken
 from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.simulate.balance.given_numbers import frequency_range, positive
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, linear_coefficients
 from snrmjax.simulate.balance.labelled import HERTZ, range_text
 from snrmjax.simulate.continuation.continuation import CurveStatus, StepControl
@@ -22,8 +23,6 @@ from snrmjax.simulate.solutions.forced_response import (
     DEFAULT_SETTINGS,
     ResponseSettings,
     forced_response_batch,
-    frequency_range,
-    positive_values,
     solve_at_frequency,
 )
 
@@ -140,7 +139,7 @@ def isolated_responses(
     other harmonics than `harmonic_order`.
     """
     model = simulated_structure(model)
-    (load,) = positive_values("force", force, "N").tolist()
+    (load,) = positive("force", force).tolist()
     ends = frequency_range(from_frequency, to_frequency)
     if known is None:
         plain = dataclasses.replace(settings, stability=False)

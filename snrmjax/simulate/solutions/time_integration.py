@@ -15,6 +15,7 @@ from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.numerics.compiled import jitted
 from snrmjax.numerics.result import AbstractResult, Variable
 from snrmjax.numerics.status import Status
+from snrmjax.simulate.balance.given_numbers import positive
 from snrmjax.simulate.balance.harmonics import harmonic_basis, velocity_phasors
 from snrmjax.simulate.balance.labelled import HERTZ, range_text
 from snrmjax.simulate.solutions.hysteresis_cycles import (
@@ -145,8 +146,8 @@ def settled_motion(
     >>> bool(motion.converged), bool(abs(motion.velocity[1] / exact - 1).max() < 1e-4)
     (True, True)
     """
-    _require_positive("force", force)
-    _require_positive("frequency", frequency)
+    positive("force", force)
+    positive("frequency", frequency)
     frequency = jnp.asarray(frequency, dtype=jnp.float64)
     motions = _stepped(
         simulated_structure(model),
@@ -183,8 +184,8 @@ def stepped_sine(
     Returns an `IntegratedMotion` whose arrays lead with the step. Another number of steps
     compiles anew. Raises as `settled_motion` does.
     """
-    _require_positive("force", force)
-    _require_positive("frequencies", frequencies)
+    positive("force", force)
+    positive("frequencies", frequencies)
     frequencies = jnp.asarray(frequencies, dtype=jnp.float64)
     if frequencies.ndim != 1 or not frequencies.size:
         raise ValueError(
@@ -220,15 +221,6 @@ def _settings(max_cycles: int, accuracy: IntegrationAccuracy) -> _Settings:
             f"a motion needs {LEAST_CYCLES} cycles or more to settle, but gets {max_cycles}."
         )
     return _Settings(jnp.asarray(max_cycles), *(jnp.asarray(part) for part in accuracy))
-
-
-def _require_positive(name: str, value: Any) -> None:
-    if isinstance(value, jax.core.Tracer):
-        return
-    values = np.ravel(np.asarray(value, dtype=np.float64))
-    wrong = values[~((values > 0) & np.isfinite(values))]
-    if wrong.size:
-        raise ValueError(f"`{name}` must be positive and finite, but is {wrong[0]!r}.")
 
 
 def _start_state(model: Structure, start: Any) -> Float[Array, "2 mode"]:

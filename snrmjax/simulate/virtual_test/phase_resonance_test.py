@@ -11,15 +11,11 @@ from jaxtyping import ArrayLike, Float
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.simulate.balance.given_numbers import frequency_range, positive
 from snrmjax.simulate.balance.labelled import HERTZ, range_text
 from snrmjax.simulate.continuation.response_curve import ResponseCurve
 from snrmjax.simulate.solutions.controlled import ControlledCurve
-from snrmjax.simulate.solutions.forced_response import (
-    ResponseSettings,
-    forced_response_batch,
-    frequency_range,
-    positive_values,
-)
+from snrmjax.simulate.solutions.forced_response import ResponseSettings, forced_response_batch
 from snrmjax.simulate.virtual_test.appropriation import (
     around,
     between,
@@ -157,7 +153,7 @@ def phase_resonance_test(
         raise ValueError(f"`by` must be one of {get_args(Means)}, but is {by!r}.")
     if steps_per_sweep < 2:
         raise ValueError(f"`steps_per_sweep` must be 2 or more, but is {steps_per_sweep}.")
-    loads = positive_values("force", forces, "N").tolist()
+    loads = positive("forces", forces).tolist()
     low, high = frequency_range(from_frequency, to_frequency).tolist()
     if by == "harmonic_balance":
         found = _along_curves(model, loads, (low, high), limits, points_per_level, harmonic_order)

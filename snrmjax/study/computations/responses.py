@@ -23,6 +23,7 @@ from snrmjax.study.computations.base import (
     Members,
     OfForces,
     Output,
+    of_forces,
 )
 
 _GRID = "frequency_hz"
@@ -59,17 +60,17 @@ class Peaks(AbstractComputation):
     `no_peak_in_range`; one whose response is higher at an end than at its highest peak has
     `highest_at_range_end`: the resonance lies outside, and a wider range would have it.
 
-    With `grid_points` also the highest and the lowest velocity of the response at that many
-    frequencies: what the response bands of a report are made of. With `isolated` also the responses
-    that are not connected to those of small motion (takes several times as long).
+    `forces` in N; None: `force_n` varies. With `grid_points` also the highest and the lowest
+    velocity of the response at that many frequencies: what the response bands of a report are made
+    of. With `isolated` also the responses that are not connected to those of small motion (takes
+    several times as long).
     """
 
     kind: ClassVar[str] = "peaks"
     members_a_chunk: ClassVar[int] = 128
-    driven: ClassVar[bool] = True
 
     within: ResponseRange
-    forces: OfForces = OfForces()
+    forces: OfForces = eqx.field(default=None, converter=of_forces)
     grid_points: int = eqx.field(static=True, default=0)
     isolated: bool = eqx.field(static=True, default=False)
 
@@ -143,14 +144,16 @@ class Peaks(AbstractComputation):
 
 
 class Curves(AbstractComputation):
-    """Whole forced responses, unstable parts included, point by point."""
+    """Whole forced responses, unstable parts included, point by point.
+
+    `forces` in N; None: `force_n` varies.
+    """
 
     kind: ClassVar[str] = "curves"
     members_a_chunk: ClassVar[int] = 64
-    driven: ClassVar[bool] = True
 
     within: ResponseRange
-    forces: OfForces = OfForces()
+    forces: OfForces = eqx.field(default=None, converter=of_forces)
 
     def outputs(self) -> dict[str, Output]:
         """See `AbstractComputation.outputs`."""

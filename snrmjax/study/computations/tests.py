@@ -86,7 +86,6 @@ class VirtualTests(AbstractIdentified):
 
     kind: ClassVar[str] = "virtual_test"
     members_a_chunk: ClassVar[int] = 8
-    driven: ClassVar[bool] = True
 
     within: ResponseRange
     levels: Float[np.ndarray, " level"]
@@ -111,7 +110,6 @@ class Identifications(AbstractIdentified):
 
     kind: ClassVar[str] = "identify"
     members_a_chunk: ClassVar[int] = 16
-    driven: ClassVar[bool] = False
 
     data: SteadyStates
 
@@ -128,7 +126,6 @@ class Diagnoses(AbstractComputation):
 
     kind: ClassVar[str] = "diagnose"
     members_a_chunk: ClassVar[int] = 4
-    driven: ClassVar[bool] = False
 
     data: SteadyStates
 

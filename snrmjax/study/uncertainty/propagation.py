@@ -90,8 +90,8 @@ def propagate_uncertainty(quantities: Quantities) -> Propagation:
     doi:10.1115/1.1446068.
 
     >>> from snrmjax.study.uncertainty.quantities import function_quantities
-    >>> from snrmjax.study.variations import normal
-    >>> square = function_quantities(lambda x: x**2, [normal("x", 1.0, 0.2)], ["y"])
+    >>> from snrmjax.study.variations import Normal
+    >>> square = function_quantities(lambda x: x**2, [Normal("x", 1.0, 0.2)], ["y"])
     >>> found = propagate_uncertainty(square)
     >>> found.statistics[:, 0, 0].round(6).tolist()
     [1.0, 1.04]

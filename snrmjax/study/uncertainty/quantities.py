@@ -44,8 +44,8 @@ def function_quantities(
 ) -> Quantities:
     """The results of a JAX function of a vector of the uncertain numbers.
 
-    >>> from snrmjax.study.variations import normal
-    >>> varied = normal("a", 1.0, 0.1), normal("b", 2.0, 0.2)
+    >>> from snrmjax.study.variations import Normal
+    >>> varied = Normal("a", 1.0, 0.1), Normal("b", 2.0, 0.2)
     >>> area = function_quantities(lambda x: x[:1] * x[1], varied, ["area_m2"])
     >>> area.gradient.round(12).tolist()
     [[0.2, 0.2]]
@@ -83,8 +83,8 @@ def response_quantities(
     another peak that becomes the highest): a `Study` of the same `varied` does.
 
     >>> from snrmjax.model import flat_beam
-    >>> from snrmjax.study.variations import normal
-    >>> beam, varied = flat_beam(), [normal("mode_1.damping_ratio", 0.05, 0.005)]
+    >>> from snrmjax.study.variations import Normal
+    >>> beam, varied = flat_beam(), [Normal("mode_1.damping_ratio", 0.05, 0.005)]
     >>> found = response_quantities(beam, varied, 480.0, 520.0, force=2e-4, harmonic_order=1)
     >>> found.names[:2]
     ('peak_frequency_hz', 'peak_velocity_m_s')

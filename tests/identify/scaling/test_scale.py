@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from truths.modal_structures import HERTZ, base_response, chain, receptance
 
-from snrmjax.cli.laboratory.modal_sources import asked_scale
 from snrmjax.identify.modal.base_motion import relative_to_base
 from snrmjax.identify.modal.linear_fit import fit_linear_modes
 from snrmjax.identify.modal.modes_of_tests import find_modes
@@ -22,6 +21,8 @@ from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.frequency_responses import frequency_responses
 from snrmjax.measure.states import steady_states
 from snrmjax.model.modes import linear_response
+from snrmjax.pipelines.modes import _asked_scale
+from snrmjax.pipelines.options import ModesOptions
 
 MASSES = [1.0, 1.2, 0.8]
 RATIOS = [0.01, 0.008, 0.006]
@@ -278,9 +279,9 @@ BAD = [
     ("from 1 to 3", lambda: scale_modes(FIT, DrivePoint()).linear_modes(3)),
     (
         "one scale of the shapes",
-        lambda: asked_scale(DrivePoint("s1"), unscaled=True),
+        lambda: _asked_scale(ModesOptions(drive_point="s1", unscaled=True), None),
     ),
-    ("needs its kilograms", lambda: asked_scale(DrivePoint(), added_mass=0.1)),
+    ("needs its kilograms", lambda: _asked_scale(ModesOptions(second_mass=0.1), None)),
     ("only with the masses at the sensors", lambda: scale_modes(FIT, SensorMasses({}, 1.0))),
     ("no level 7", lambda: responses_of_states(states(0.0), 7)),
 ]
