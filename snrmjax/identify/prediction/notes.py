@@ -9,15 +9,15 @@ from snrmjax.identify.pointwise.backbone import BackboneValues
 from snrmjax.identify.prediction.new_level import LevelTrend
 from snrmjax.identify.prediction.resonance_distribution import ResonanceDistribution
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.units import HERTZ
 
-_HERTZ = 2 * np.pi
 _SURE = 0.975  # probability of a resonance that needs no word
 _WORTH = 0.025  # probability of negative damping that needs one
 
 
 def where_in_words(one: ResonanceDistribution) -> Fact:
     """Whether a further level has the resonance, and its 95 % ranges."""
-    low, high = (one.frequency[[0, -1]] / _HERTZ).tolist()
+    low, high = (one.frequency[[0, -1]] / HERTZ).tolist()
     slow, fast = one.velocity[[0, -1]].tolist()
     return Fact(
         "resonance_of_a_level",
