@@ -88,7 +88,9 @@ SUB_ROOMS = {
         *("io.files", "io.units", "io.columns", "io.rows", "io.tables", "io.toml_table"),
         "io.laboratory",
     },
-    "report.figures": {"report.style", "report.html", "report.sampling"},
+    "report.figures": {
+        *("report.style", "report.html", "report.sampling", "report.sentences"),
+    },
     "report.pages": {
         *("report.figures", "report.style", "report.html", "report.sampling"),
         "report.sentences",
