@@ -1,8 +1,8 @@
 """A reduced-order model from its source: load cases, condensation, and how far it holds."""
 
+import dataclasses
 from collections.abc import Callable
-from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from snrmjax.condense.scale_study import (
     typical_displacement,
 )
 from snrmjax.io.calculix.reduction import read_deck_source
+from snrmjax.io.files import FilePath
 from snrmjax.io.reduction.beam_source import read_beam
 from snrmjax.io.reduction.load_tables import read_load_tables
 from snrmjax.io.reduction.source import ReductionSource, run_load_cases
@@ -24,7 +25,7 @@ from snrmjax.io.units import HERTZ
 from snrmjax.model.potential import monomial_key
 from snrmjax.model.structures import Structure, equilibria
 from snrmjax.numerics.facts import Fact
-from snrmjax.pipelines.options import ReduceOptions
+from snrmjax.pipelines.options import ReduceOptions, checked
 
 _SWEEP = (2.0, 3.0, 5.0, 7.5, 10.0)  # of the loads of single modes, to see the model's range
 _FEW_SCALES = (0.1, 0.3, 1.0, 3.0)  # of a study whose load cases take long
@@ -156,11 +157,14 @@ def _stated_scale_compared(source: ReductionSource, found: Condensation) -> list
     return [fact]
 
 
-def read_reduction_source(beam: Path | None, options: ReduceOptions) -> ReductionSource:
+def read_reduction_source(
+    beam: FilePath | None = None, options: ReduceOptions | None = None, **settings: Any
+) -> ReductionSource:
     """What is condensed: a beam file, or tables or a deck by the options; exactly one of them.
 
     Raises `ValueError` for none or several of them, and as the readers do.
     """
+    options = checked(dataclasses.replace(options or ReduceOptions(), **settings))
     sources = {"BEAM": beam, "--tables": options.tables, "--calculix": options.calculix}
     given = [name for name, path in sources.items() if path is not None]
     if len(given) != 1:

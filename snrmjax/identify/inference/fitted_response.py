@@ -29,7 +29,7 @@ from snrmjax.identify.prediction.resonance_distribution import (
     resonance_distribution,
 )
 from snrmjax.numerics.facts import Fact
-from snrmjax.numerics.result import Variable
+from snrmjax.numerics.result import quantity
 
 _HERTZ = 2 * np.pi  # rad/s
 
@@ -41,8 +41,9 @@ class FittedResponse(PredictedResponse):
     place where the drawn curve has them, without a band.
     """
 
-    frequency_std: Float[np.ndarray, " point"]  # rad/s, at fixed amplitude
-    velocity_std: Float[np.ndarray, " point"]  # of the magnitude at fixed frequency; large at folds
+    frequency_std: Float[np.ndarray, " point"] = quantity("point", "Hz", "1σ at fixed amplitude")
+    # Of the magnitude; large at folds.
+    velocity_std: Float[np.ndarray, " point"] = quantity("point", "m/s", "1σ at fixed frequency")
     resonances: tuple[FittedPoint, ...]
     folds: tuple[FittedPoint, ...]
     not_located: tuple[FittedPoint, ...]
@@ -63,15 +64,6 @@ class FittedResponse(PredictedResponse):
             f"the measured amplitudes, {len(self.not_located)} resonances or folds not located",
             *((f"note: {self.note}",) if self.note else ()),
         )
-
-    def variables(self) -> dict[str, Variable]:
-        """See `AbstractResult`."""
-        per, std = ("point",), self.frequency_std / _HERTZ
-        return {
-            **super().variables(),
-            "frequency_std_hz": Variable(per, std, "Hz", "1σ at fixed amplitude"),
-            "velocity_std_m_s": Variable(per, self.velocity_std, "m/s", "1σ at fixed frequency"),
-        }
 
     def attributes(self) -> dict[str, str | float | int]:
         """See `AbstractResult`."""

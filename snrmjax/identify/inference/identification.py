@@ -65,16 +65,24 @@ class Identification(AbstractResult):
         return float(self.fit.noise.level_std[3]) * float(self.fit.modes.damping_ratio[j])
 
     def summary(self) -> tuple[str, ...]:
-        """See `AbstractResult`."""
-        states, *_ = self.points.summary()
-        _, *curves = self.backbone.summary()
-        scale, unit = self.fit.noise.scale, "times the stated noise"
-        if not self.fit.noise.stated:
-            scale, unit = 100 * scale, "% of the measured phasor (1σ)"
+        """How many points, ranges of the curves, what states and levels scatter by, notes."""
+        points, ends = self.points, self.backbone.sampled()
+        n_levels, noise = len(np.unique(np.asarray(points.level))), self.fit.noise
+        scale = f"{noise.scale:.3g} times the stated noise"
+        if not noise.stated:
+            scale = f"{100 * noise.scale:.3g} % of the measured phasor (1σ)"
+        hertz, ratio = np.asarray(ends.natural_frequency) / _HERTZ, np.asarray(ends.damping_ratio)
+        speed = np.asarray(ends.velocity)
+        status, counts = np.unique(np.asarray(points.status), return_counts=True)
+        outcomes = (PointStatus(int(kind)).message for kind in status)
         return (
-            states.replace("BackbonePoints", "Identification", 1),
-            *curves,
-            f"scatter of states about the curves: {scale:.3g} {unit}",
+            f"Identification: {len(points.status)} steady states of {n_levels} levels at "
+            f"{points.sensor!r}",
+            *(f"{n} {outcome}" for n, outcome in zip(counts, outcomes, strict=True)),
+            f"natural frequency {np.nanmin(hertz):.6g} to {np.nanmax(hertz):.6g} Hz",
+            f"damping ratio {100 * np.nanmin(ratio):.4g} to {100 * np.nanmax(ratio):.4g} %",
+            f"velocity {np.nanmin(speed):.4g} to {np.nanmax(speed):.4g} m/s",
+            f"scatter of states about the curves: {scale}",
             f"level to level: {self.level_frequency_std / _HERTZ:.2g} Hz and "
             f"{100 * self.level_damping_std:.2g} % of critical damping (1σ)",
             *(f"note: {note}" for note in self.notes),
@@ -252,7 +260,7 @@ def notes_on_phases(
     level = points.level[use]
     sign = np.sign(float(curves.modal_constant))  # negative: the mode moves against force
     sine = sign * np.sin(np.angle(np.asarray(points.mode_velocity)))[use]
-    curve, _ = curves.modal_damping.values_and_slopes(np.asarray(points.amplitude)[use])
+    curve = curves.modal_damping.linearised(np.asarray(points.amplitude)[use]).value
     excess = np.asarray(points.modal_damping)[use] / curve - 1
     _, member = np.unique(level, return_inverse=True)
     count = np.bincount(member)

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -21,14 +21,13 @@ from snrmjax.identify.joint.force_balance import (
     no_errors,
     weighting_at,
 )
-from snrmjax.identify.joint.free_unknowns import Unravel, padded_levels
+from snrmjax.identify.joint.free_unknowns import Unravel, padded_levels, whitened
 from snrmjax.identify.joint.joint_fit import JointFit
-from snrmjax.identify.joint.residuals import whitened
 from snrmjax.identify.test_model.states import LEVEL_ERRORS
 from snrmjax.numerics.blocks import padded
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.facts import Fact
-from snrmjax.numerics.result import Variable
+from snrmjax.numerics.result import Variable, setting
 from snrmjax.numerics.status import Status
 
 Target = Literal["curves", "frequency", "damping"]
@@ -78,13 +77,26 @@ class NextMeasurements(AbstractTable[NextMeasurement]):
     """Advised steady states, the best first; a sequence of `NextMeasurement`."""
 
     coordinates = ("rank",)
+    columns: ClassVar = {
+        "rank": (lambda row: row.rank, "1", "rank, the best first"),
+        "force_n": (lambda row: row.force, "N", "force"),
+        "drive_v": (lambda row: row.drive, "V", "drive voltage"),
+        "frequency_hz": (lambda row: row.frequency / _HERTZ, "Hz", "frequency"),
+        "velocity_m_s": (lambda row: row.velocity, "m/s", "expected velocity"),
+        "phase_deg": (lambda row: np.degrees(row.phase), "deg", "phase"),
+        "expected_band_ratio": (
+            lambda row: row.expected_band_ratio,
+            *("1", "mean band after it, over today's"),
+        ),
+        "reason": (lambda row: str(row.reason), "", "why this state"),
+    }
 
     responses: tuple[FittedResponse, ...]  # the main curves under the advised forces
-    sensor: str = eqx.field(static=True)
-    target: str = eqx.field(static=True)
-    status: AdviceStatus = eqx.field(static=True)
+    sensor: str = setting()
+    target: str = setting()
+    status: AdviceStatus = setting()
     drive_known_only: bool = eqx.field(static=True)
-    notes: tuple[Fact, ...] = eqx.field(static=True, default=())
+    notes: tuple[Fact, ...] = setting(default=())
 
     @property
     def message(self) -> str:
@@ -105,33 +117,13 @@ class NextMeasurements(AbstractTable[NextMeasurement]):
         return (*lines, *(f"note: {note}" for note in self.notes))
 
     def variables(self) -> dict[str, Variable]:
-        """See `AbstractResult`."""
-
-        rows = self.rows
-        load = {"force_n": self.column([one.force for one in rows], "N", "force")}
-        if self.drive_known_only:
-            load = {"drive_v": self.column([one.drive for one in rows], "V", "drive voltage")}
-        ratio = [one.expected_band_ratio for one in rows]
-        return {
-            "rank": self.column([one.rank for one in rows], "1", "rank, the best first"),
-            **load,
-            "frequency_hz": self.column(
-                [one.frequency / _HERTZ for one in rows], "Hz", "frequency"
-            ),
-            "velocity_m_s": self.column([one.velocity for one in rows], "m/s", "expected velocity"),
-            "phase_deg": self.column(np.degrees([o.phase for o in rows]).tolist(), "deg", "phase"),
-            "expected_band_ratio": self.column(ratio, "1", "mean band after it, over today's"),
-            "reason": self.column([str(one.reason) for one in rows], "", "why this state"),
-        }
+        """Those of the rows, the force as a test states it."""
+        left_out = "force_n" if self.drive_known_only else "drive_v"
+        return {name: one for name, one in super().variables().items() if name != left_out}
 
     def attributes(self) -> dict[str, str | float | int]:
         """See `AbstractResult`."""
-        return {
-            "target": self.target,
-            "sensor": self.sensor,
-            "status": self.message,
-            "notes": "\n".join(map(str, self.notes)),
-        }
+        return {**super().attributes(), "status": self.status.message}
 
 
 def next_measurements(

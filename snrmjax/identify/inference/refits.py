@@ -11,9 +11,8 @@ from jaxtyping import Array, Float, Int
 
 from snrmjax.identify.joint.family_fit import SOLVER
 from snrmjax.identify.joint.force_balance import BalanceProblem, filled
-from snrmjax.identify.joint.free_unknowns import Unravel, padded_problem
+from snrmjax.identify.joint.free_unknowns import Unravel, corrected_residuals, padded_problem
 from snrmjax.identify.joint.joint_fit import JointFit
-from snrmjax.identify.joint.residuals import corrected_residuals
 from snrmjax.numerics.compiled import compiled
 
 _MOST_STEPS = 200  # of a refit

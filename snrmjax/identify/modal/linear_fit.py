@@ -19,9 +19,13 @@ from snrmjax.identify.modal.modal_notes import (
     fit_notes,
     lines_in_half_power,
 )
-from snrmjax.identify.modal.noise_model import std_from_residuals
 from snrmjax.identify.modal.pole_orders import PoleOrders, clusters, poles_of_responses
-from snrmjax.identify.modal.response_data import ResponseData, coherence_std, response_data
+from snrmjax.identify.modal.response_data import (
+    ResponseData,
+    coherence_std,
+    response_data,
+    std_from_residuals,
+)
 from snrmjax.identify.modal.separable_fit import (
     ChannelRows,
     SeparableFit,

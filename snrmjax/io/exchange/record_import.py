@@ -103,7 +103,7 @@ def import_record(
                 states, notes, counts = steps.states, steps.notes, steps.counts
             else:
                 swept = sweep_states(*read, **said)
-                states, notes, counts = swept.states, swept.remarks, None
+                states, notes, counts = swept.states, swept.notes, None
         except ValueError as error:
             failed.append(f"{kind}: {error}")
             continue

@@ -29,9 +29,8 @@ from truths.sizes import repeats
 
 import snrmjax as sj
 from snrmjax.identify.curves.families import parse_family
-from snrmjax.identify.joint.free_unknowns import packed_unknowns, padded_data
+from snrmjax.identify.joint.free_unknowns import corrected_residuals, packed_unknowns, padded_data
 from snrmjax.identify.joint.joint_fit import fit_jointly
-from snrmjax.identify.joint.residuals import corrected_residuals
 from snrmjax.io.joint_results import (
     read_joint_fit,
     summarise_fit,
