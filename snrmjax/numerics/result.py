@@ -92,9 +92,7 @@ def setting(**settings: Any) -> Any:
     return eqx.field(static=True, metadata={"setting": True}, **settings)
 
 
-@dataclass_transform(
-    frozen_default=True, field_specifiers=(eqx.field, dataclasses.field, quantity, setting)
-)
+@dataclass_transform(field_specifiers=(eqx.field, quantity, setting))
 class AbstractResult(eqx.Module):
     """Base of results: a repr of one screen, `to_xarray()`, `to_pandas()` and `plot()`.
 
