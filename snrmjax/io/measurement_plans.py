@@ -81,6 +81,7 @@ def _check_filled(path: FilePath) -> None:
     """Refuse a table with an empty field where something was to be measured."""
     cells = read_cells(path)
     header = read_header(cells)
+    cells.require_rows()
     std = ("harmonic_std_m_s",) if header.harmonics else ()
     for name in (*PHASOR, *header.harmonics, *std):
         for number, text in enumerate(cells.texts(name) if name in header.used else ()):

@@ -267,4 +267,5 @@ def _read_table(path: FilePath, stems: tuple[str, ...], single: tuple[str, ...] 
         for k in range(count):
             if not cells.has(f"{stem}_{k + 1}"):
                 raise ValueError(f"{cells.file} lacks the column `{stem}_{k + 1}`.")
+    cells.require_rows()
     return _Table(cells, groups)

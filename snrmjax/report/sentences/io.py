@@ -1,20 +1,6 @@
 """What files, and their import, have to tell."""
 
-from collections.abc import Sequence
-
 from snrmjax.report.sentences import Wording, number_of
-
-_LEVELS_BY = {
-    "drive": "by amplitude of the drive",
-    "force": "by amplitude of the force",
-    "runs": "by runs of the frequency",
-}
-
-
-def _steps_used(used: int, left_out: Sequence[tuple[str, int]]) -> str:
-    reasons = ", ".join(f"{count} {reason}" for reason, count in left_out if count)
-    total = used + sum(count for _, count in left_out)
-    return f"{used} of {total} steps used{f'; left out: {reasons}' if reasons else ''}."
 
 
 def _our_own_table(unit: str, force_unit: str, amplitude: str, conjugated: bool) -> str:
@@ -64,7 +50,6 @@ SENTENCES: dict[str, Wording] = {
     "level_a_record": "one level a record, in the order in which they were named",
     "level_a_set": "one level a set of responses, in the file's order",
     "levels_found": "{n} found",
-    "levels_counted": lambda n, by: f"{number_of(n, 'level')} {_LEVELS_BY[by]}",
     "record_recognised": "recognised in the record",
     "spectra_of_one_reference": "spectra or responses over one reference, of amplitude 1",
     "reference_without_unit": "the file states none of the reference",
@@ -135,6 +120,5 @@ SENTENCES: dict[str, Wording] = {
     # Notes on an import.
     "note_of_file": "{file}: {note}",
     "rows_incomplete": "{n} of {of} rows of {file} are incomplete, left out.",
-    "steps_used": _steps_used,
     "our_own_table": _our_own_table,
 }

@@ -68,9 +68,10 @@ _LEVELS_BY = {
 }
 
 
-def _steps_used(used: int, left_out: Mapping[str, int]) -> str:
-    reasons = ", ".join(f"{count} {reason}" for reason, count in left_out.items())
-    steps = f"{used} of {used + sum(left_out.values())} steps used"
+def _steps_used(used: int, left_out: Mapping[str, int] | Iterable[tuple[str, int]]) -> str:
+    counts = dict(left_out)
+    reasons = ", ".join(f"{count} {reason}" for reason, count in counts.items() if count)
+    steps = f"{used} of {used + sum(counts.values())} steps used"
     return f"{steps}; left out: {reasons}" if reasons else steps
 
 
