@@ -93,7 +93,7 @@ SUB_ROOMS = {
     "report.modal": {"report.style", "report.html"},
     "report.interactive": {"report.style", "report.html"},
     "report.sentences": set(),
-    "report.study": {"report.style", "report.html"},
+    "report.study": {"report.style", "report.html", "report.sentences"},
     # One page of the pages of other commands.
     "report.whole_test": {
         *("report.html", "report.interactive", "report.modal", "report.workflow"),
@@ -107,6 +107,7 @@ SUB_ROOMS = {
     # A study is made of computations, which know nothing of where and how often they run.
     "study.computations": set(),
     "study.uncertainty": {"study.variations"},
+    "study.analysis": {"study.computations", "study.uncertainty"},
 }
 NUMERICAL = set(ROOMS) - {"io", "study", "report"}
 MOST_MODULES = 13
