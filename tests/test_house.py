@@ -96,7 +96,7 @@ SUB_ROOMS = {
         "report.sentences",
     },
     "report.sentences": set(),
-    "report.study": {"report.style", "report.html"},
+    "report.study": {"report.style", "report.html", "report.sentences"},
     "io.reduction": {
         *("io.columns", "io.files", "io.rows", "io.tables", "io.toml_table", "io.units"),
     },
@@ -105,6 +105,7 @@ SUB_ROOMS = {
     # A study is made of computations, which know nothing of where and how often they run.
     "study.computations": set(),
     "study.uncertainty": {"study.variations"},
+    "study.analysis": {"study.computations", "study.uncertainty"},
 }
 NUMERICAL = set(ROOMS) - {"io", "study", "pipelines", "report"}
 MOST_MODULES = 13
