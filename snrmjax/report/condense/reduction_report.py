@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from snrmjax.condense.case_checks import case_names
-from snrmjax.condense.condensation import Condensation, condense
+from snrmjax.condense.condensation import Condensation, reduced_model
 from snrmjax.condense.load_cases import StaticCases
 from snrmjax.condense.load_set import NONLINEAR_RATIO, modal_loads
 from snrmjax.condense.scale_study import (
@@ -106,7 +106,7 @@ def reduce(
     displacement, cases = None, source.cases
     if cases is None:
         displacement, cases = run_load_cases(source)
-    found = condense(source.basis, cases, degree=source.degree)
+    found = reduced_model(source.basis, cases, degree=source.degree)
     _refuse_contradictions(source, found)
     compared = _stated_scale_compared(source, found)
     scales = sweep = None
@@ -123,7 +123,7 @@ def reduce(
             report=report,
         )
     structure = source.structure(found)
-    notes = [*source.notes, *compared, *(one.message for one in found.warnings)]
+    notes = [*source.notes, *compared, *map(str, found.warnings)]
     if scales is not None and not scales.holds_default:
         notes.append("the load scale of the model is not inside a plateau of the coefficients")
     states = [one for one in equilibria(structure) if one.stable]
@@ -140,7 +140,7 @@ def _refuse_contradictions(source: ReductionSource, found: Condensation) -> None
         return
     for one in found.warnings:
         if one.kind == "inconsistent_case":
-            raise ValueError(f"{one.message}; mend or remove it.")
+            raise ValueError(f"{one}; mend or remove it.")
     ratio = found.quality.linear_stiffness_ratio
     worst = int(np.argmax(np.abs(np.nan_to_num(ratio, nan=1.0) - 1)))
     if abs(ratio[worst] - 1) > _REFUSED_LINEAR:
@@ -171,7 +171,7 @@ def _stated_scale_compared(source: ReductionSource, found: Condensation) -> list
         displacement, cases = run_load_cases(source._replace(load_scale=None))
     except ValueError as error:
         return [f"{stated} cannot be compared with a scale that is chosen: {error}"]
-    chosen = condense(source.basis, cases, degree=source.degree)
+    chosen = reduced_model(source.basis, cases, degree=source.degree)
     scale = float(np.max(displacement)) / source.thickness
     monomials, own = chosen.potential.monomials, np.asarray(chosen.potential.coefficient)
     leading = np.flatnonzero(leading_terms(own, typical_displacement(cases), monomials))
@@ -266,8 +266,8 @@ def reduction_summary(reduction: Reduction) -> dict:
         },
         "load_scale_study": None,
         "warnings": [
-            {"kind": one.kind, "message": one.message, "cases": case_list(found.cases, one.cases)}
-            for one in found.warnings
+            {"kind": f.kind, "message": str(f), "cases": case_list(found.cases, f.get("cases", ()))}
+            for f in found.warnings
         ],
         "notes": list(reduction.notes),
     }
