@@ -183,10 +183,7 @@ def integrated_job(job: tuple[list[tuple[str, int]], Path]) -> None:
 
 def judged(job: tuple[Path, str]) -> dict[str, object]:
     """Errors over 1σ at every true resonance, by both ways, and what the fits warn of."""
-    # The integration needs none of it.
-    from discrepancy_coverage import scores
-
-    import snrmjax as sj
+    import snrmjax as sj  # the integration needs none of it
 
     folder, name = job
     model = sj.read_model(folder / f"{name}.toml")
@@ -204,6 +201,33 @@ def judged(job: tuple[Path, str]) -> dict[str, object]:
         "converged": fit.converged,
         "missed": len(_last_column(folder / f"{name}.truth")) - len(rows),
     }
+
+
+def scores(
+    fit: object,
+    points: object,
+    speed: np.ndarray,
+    natural: np.ndarray,
+    ratio: np.ndarray,
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Errors over 1σ of frequency and damping by both ways at true phase resonances, and their 1σ.
+
+    Arguments: `speed` in m/s, `natural` in rad/s and the damping `ratio` of the truths, relative to
+    the model's modal mass. The 1σ are relative to the truth. Rows: frequency, damping.
+    """
+    import snrmjax as sj
+
+    joint = sj.identify.fitted_values(fit, speed)
+    # Damping of both is relative to the modal mass that a fit found: compared by its force.
+    found = float(fit.problem.modal_mass_of(fit.unknowns) * abs(fit.problem.modal_constant))
+    curve = points.backbone.values(speed / natural)
+    errors, bands = {}, {}
+    for way, values in (("joint", joint), ("pointwise", curve)):
+        std = np.array([values.natural_frequency_std, found * values.damping_ratio_std])
+        given = np.array([values.natural_frequency, found * values.damping_ratio])
+        errors[way] = (given - [natural, ratio]) / std
+        bands[way] = std / [natural, ratio]
+    return errors, bands
 
 
 def _last_column(path: Path) -> list[str]:

@@ -2,8 +2,7 @@
 
 M ü + C u̇ + f(u) = p cos Ωt for u = Σ_h a_h cos hΩt + b_h sin hΩt, with f the elements' internal
 force at samples of the period (alternating frequency-time). It shares the elements with a
-condensation, but neither modes, potential nor solver. Used by `rom_full_order.py` (normal modes)
-and `rom_forced_response.py`.
+condensation, but neither modes, potential nor solver. Used by `rom_forced_response.py`.
 """
 
 import time

@@ -3,7 +3,7 @@
 Run: python benchmarks/simulator_speed.py [--without-peers] [--out DIR] [--environments DIR]
 
 Two curves with nine harmonics around all their folds: the flat beam (77 unknowns with the
-frequency) and the monostable curved beam (20). The peers are pyHarm-os, jaxcont, and a plain
+frequency) and the monostable curved beam (20). The peers are jaxcont and a plain
 NumPy/SciPy program (`peers/`). They get the equations as numbers, not the package, and run in
 environments of their own. The limit is as many LU factorisations as snrmjax used, and nothing else.
 All methods take turns; times are medians of several warm runs, with the compile time of the first
@@ -45,7 +45,7 @@ import snrmjax as sj
 HERTZ = 2 * np.pi
 PEERS = Path(__file__).parent / "peers"
 HARMONICS, REFERENCE_HARMONICS = 9, 31
-ROUNDS = {"snrmjax": 5, "numpy_scipy": 5, "jaxcont": 5, "pyHarm": 3, "lu": 5}
+ROUNDS = {"snrmjax": 5, "numpy_scipy": 5, "jaxcont": 5, "lu": 5}
 PEER_TOLERANCE = 1e-8  # on the last step or the residual, in scaled unknowns
 PEER_LIMIT_SECONDS = 300.0  # for one answer of a peer
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}  # faster at these sizes
@@ -200,7 +200,7 @@ class Peer:
         name = f"{script.removesuffix('_peer.py')}_{case.beam}"
         self.curve = out / f"{name}.npz"
         variables = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
-        # A home of its own: numba compiles in this run too, and pyHarm's settings go nowhere else.
+        # A home of its own: numba compiles in this run too.
         self.home = tempfile.TemporaryDirectory()
         variables |= {"HOME": self.home.name, "NUMBA_CACHE_DIR": self.home.name}
         with (out / f"{name}.log").open("w") as log:
@@ -384,8 +384,6 @@ def compare(case: Case, out: Path, pythons: dict[str, Path]) -> dict[str, object
         )
         if fastest:
             ratios[f"fastest_peer_over_{label}"] = peer_times[fastest] / per_point[name]
-        if "pyHarm" in peer_times:
-            ratios[f"pyharm_over_{label}"] = peer_times["pyHarm"] / per_point[name]
     return ratios
 
 
@@ -525,10 +523,9 @@ def main() -> None:
         out.mkdir(parents=True, exist_ok=True)
         pythons = {"scipy": Path(sys.executable)}
         if not options.without_peers:
-            for name in ("jaxcont", "pyharm"):
-                python = environment(folder, name)
-                if python:
-                    pythons[name] = python
+            python = environment(folder, "jaxcont")
+            if python:
+                pythons["jaxcont"] = python
         ratios = [compare(case, out, pythons) for case in CASES]
     cold_process()
     second_model()

@@ -18,9 +18,7 @@ from pathlib import Path
 import numpy as np
 
 import snrmjax as sj
-from snrmjax.study.computations.base import OfForces
-from snrmjax.study.compute import Progress
-from snrmjax.study.run import RunSettings
+from snrmjax.study.run import Progress
 
 HERTZ = 2 * np.pi
 FORCES = {"one_mode": 0.0133, "flat_beam": 0.0133}
@@ -40,13 +38,13 @@ def study_of(name: str, members: int, chunk: int) -> sj.study.Study:
         60 * HERTZ, 120 * HERTZ, harmonic_order=HARMONICS[name], stability=False
     )
     varied = (
-        sj.study.lognormal("mode_1.damping_ratio", 0.05, 0.005),
-        sj.study.normal("potential.1111", 3.4375e12, 1e11),
+        sj.study.LogNormal("mode_1.damping_ratio", 0.05, 0.005),
+        sj.study.Normal("potential.1111", 3.4375e12, 1e11),
     )
     return sj.study.Study(
         name,
         model,
-        sj.study.Peaks(within, OfForces(np.array([FORCES[name]]))),
+        sj.study.Peaks(within, [FORCES[name]]),
         varied,
         sj.study.Sampling("sobol", members),
         seed=1,
@@ -72,7 +70,7 @@ def timed(study: sj.study.Study, out: Path, **settings: object) -> dict:
     """One run."""
     steps: list[Progress] = []
     begin = time.perf_counter()
-    run = sj.study.run_study(study, out, RunSettings(progress=steps.append, **settings))
+    run = sj.study.run_study(study, out, progress=steps.append, **settings)
     seconds = time.perf_counter() - begin
     first = steps[0].done
     return {

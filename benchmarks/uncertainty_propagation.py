@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 import snrmjax as sj
-from snrmjax.study.uncertainty.moments import STATISTICS
+from snrmjax.study.uncertainty.propagation import STATISTICS
 
 HERTZ = 2 * np.pi
 SCALES = {"small": 0.5, "large": 5.0}
@@ -75,7 +75,7 @@ def varied_of(case: Case, scale: float) -> tuple:
     }
     numbers["force_n"] = case.force, scale * 0.01 * case.force
     return tuple(
-        (sj.study.lognormal if name.endswith("damping_ratio") else sj.study.normal)(name, *number)
+        (sj.study.LogNormal if name.endswith("damping_ratio") else sj.study.Normal)(name, *number)
         for name, number in numbers.items()
     )
 
@@ -101,7 +101,7 @@ def propagated(name: str, case: Case, members: int) -> None:
         middle = time.perf_counter()
         sampling = sj.study.Sampling("sobol", members)
         study = study_of(case, varied, sampling)
-        rows = sj.study.planned(study).rows(range(members))
+        rows = study.ensemble().rows(range(members))
         end = time.perf_counter()
         for q, quantity in enumerate(found.quantities.names):
             by = dict(zip(("first order", "second order"), found.statistics[:, :, q], strict=True))
@@ -127,7 +127,7 @@ def propagated(name: str, case: Case, members: int) -> None:
             other_number_of_folds=f"{int(np.sum(rows['n_folds'] != folds))} of {members}",
             derivative_seconds=middle - begin,
             members_seconds=end - middle,
-            notes=list(found.notes),
+            notes=[str(note) for note in found.notes],
         )
 
 

@@ -3,16 +3,8 @@
 `jaxcont.continuation` makes a new function object at every call and so compiles at every call;
 the engine beneath it, `pseudo_arclength_scan`, takes the residual as a static argument and
 compiles once, so it is what is timed here. Stability and events are left out. The Jacobian is
-jaxcont's own (forward mode). Run by simulator_speed.py, and by speed_per_core.py with `--cold`
-(import and first curve) or `--batch N` (forces from a tenth of the problem's, by `jax.vmap` of the
-engine as jaxcont's example of a sweep has it, and one by one).
+jaxcont's own (forward mode). Run by simulator_speed.py.
 """
-
-import json
-import sys
-import time
-
-BEGIN = time.perf_counter()
 
 # ruff: noqa: E402
 from collections.abc import Callable
@@ -32,7 +24,6 @@ from peer_problem import (
     basis,
     end_status,
     linear_start,
-    read_problem,
     serve,
 )
 
@@ -109,45 +100,10 @@ def solver(problem: Problem) -> Callable[[], Curve]:
     return run
 
 
-def many(problem: Problem, count: int) -> dict[str, float]:
-    """Seconds of all curves for forces up to the problem's: side by side and one by one."""
-    at_share, (start, *settings) = parts(problem)
-    shares = jnp.geomspace(0.1, 1.0, count)
-
-    def one(share: jax.Array) -> jax.Array:
-        def residual(u: jax.Array, frequency: jax.Array) -> jax.Array:
-            return at_share(u, frequency, share)
-
-        iterations = jnp.asarray(ITERATIONS)
-        found = pseudo_arclength_scan(residual, share * start, *settings, MAX_POINTS, iterations)
-        return found.states, found.params, found.n_valid
-
-    together, alone = jax.jit(jax.vmap(one)), jax.jit(one)
-    ways = {
-        "vmap": lambda: jax.block_until_ready(together(shares)),
-        "one_by_one": lambda: [jax.block_until_ready(alone(share)) for share in shares],
-    }
-    seconds = {}
-    for name, way in ways.items():
-        times = []
-        for _ in range(4):
-            begin = time.perf_counter()
-            way()
-            times.append(time.perf_counter() - begin)
-        seconds[name] = float(np.median(times[1:]))
-    return seconds
-
-
 if __name__ == "__main__":
-    if sys.argv[2] == "--cold":
-        solver(read_problem(sys.argv[1]))()
-        print(time.perf_counter() - BEGIN)
-    elif sys.argv[2] == "--batch":
-        print(json.dumps(many(read_problem(sys.argv[1]), int(sys.argv[3]))))
-    else:
-        serve(
-            "jaxcont",
-            f"jaxcont {version('jaxcont')}, jax {version('jax')}",
-            "pseudo_arclength_scan, jacfwd, residual norm <= tolerance",
-            solver,
-        )
+    serve(
+        "jaxcont",
+        f"jaxcont {version('jaxcont')}, jax {version('jax')}",
+        "pseudo_arclength_scan, jacfwd, residual norm <= tolerance",
+        solver,
+    )

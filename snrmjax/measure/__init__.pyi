@@ -9,7 +9,7 @@ from .recordings.multisine import MultisineResponses, multisine_responses
 from .recordings.ring_down import RingDown, find_ring_downs
 from .recordings.stepped_sine import SteppedSineStates, StepStatus, stepped_sine_states
 from .recordings.time_recording import TimeRecording, time_recording
-from .records import RecordFit, fit_records, steady_state_from_records
+from .records import steady_state_from_records
 from .signals import ForceVelocityLoop, force_velocity_loop, peak_amplitude, synthesise
 from .states import OptionalColumns, SteadyStates, join_steady_states, steady_states
 from .sweeps.slow_sweep import SweepStatus, SweptStates, sweep_states
@@ -26,7 +26,6 @@ __all__ = [
     "HarmonicFitStatus",
     "MultisineResponses",
     "OptionalColumns",
-    "RecordFit",
     "RingDown",
     "SteadyStates",
     "StepStatus",
@@ -42,7 +41,6 @@ __all__ = [
     "equivalent_force",
     "find_ring_downs",
     "fit_harmonics",
-    "fit_records",
     "force_velocity_loop",
     "frequency_responses",
     "join_steady_states",

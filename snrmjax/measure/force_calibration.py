@@ -1,7 +1,6 @@
 """Force from drive voltage: a straight line through the forces of several voltages."""
 
 import dataclasses
-from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -10,43 +9,22 @@ import numpy as np
 from jaxtyping import Array, Float, Shaped
 
 from snrmjax.measure.states import SteadyStates
-from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.result import AbstractResult, quantity
 
 
 class ForceCalibration(AbstractResult):
     """The line F = gain · drive + offset, and how well it is known."""
 
-    coordinates: ClassVar[tuple[str, ...]] = ("term",)
-
-    gain: Float[Array, ""]  # N/V
-    offset: Float[Array, ""]  # N
-    covariance: Float[Array, "2 2"]  # of gain and offset; NaN = unknown
-    residual_std: Float[Array, ""]  # N, scatter about the line, NaN with two points
-    misfit: Float[Array, ""]  # the same in stated σ, NaN where none is stated
-
-    def summary(self) -> tuple[str, ...]:
-        """See `AbstractResult`."""
-        std = np.sqrt(np.diag(np.asarray(self.covariance)))
-        return (
-            "ForceCalibration: force = gain · drive + offset",
-            f"gain {float(self.gain):.6g} ± {std[0]:.2g} N/V (1σ)",
-            f"offset {float(self.offset):.4g} ± {std[1]:.2g} N (1σ)",
-            f"scatter about the line {float(self.residual_std):.3g} N",
-        )
-
-    def variables(self) -> dict[str, Variable]:
-        """See `AbstractResult`."""
-        std = np.sqrt(np.diag(np.asarray(self.covariance)))
-        covariance = np.asarray(self.covariance)
-        terms, line = np.array(["gain", "offset"]), np.array([self.gain, self.offset])
-        across = ("term", "other_term")
-        return {
-            "term": Variable(("term",), terms, "", "term of the line"),
-            "value": Variable(("term",), line, "N/V and N", "value"),
-            "std": Variable(("term",), std, "N/V and N", "its 1σ"),
-            "covariance": Variable(across, covariance, "products of N/V and N", "covariance"),
-            "residual_std_n": Variable((), np.asarray(self.residual_std), "N", "scatter"),
-        }
+    gain: Float[Array, ""] = quantity("", "N/V", "gain")
+    offset: Float[Array, ""] = quantity("", "N", "offset")
+    # Of gain and offset; NaN = unknown.
+    covariance: Float[Array, "2 2"] = quantity(
+        "term other_term", "products of N/V and N", "covariance"
+    )
+    # NaN with two points.
+    residual_std: Float[Array, ""] = quantity("", "N", "scatter about the line")
+    # NaN where no error is stated.
+    misfit: Float[Array, ""] = quantity("", "1", "scatter about the line over the stated 1σ")
 
     def force(self, drive: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
         """Force in N at a drive in V."""

@@ -9,10 +9,10 @@ import pytest
 
 import snrmjax as sj
 from snrmjax.cli import main
-from snrmjax.cli.measured_tests import read_measured_test
 from snrmjax.measure import Channel, time_recording
 from snrmjax.methods.records.recorded_test import RecordKind, recorded_test
 from snrmjax.methods.records.recorded_velocity import recorded_velocity
+from snrmjax.pipelines.measured_files import read_measured_test
 
 HERTZ = 2 * np.pi
 RATE, SECONDS = 1000.0, 4.0

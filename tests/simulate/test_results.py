@@ -7,6 +7,7 @@ import pytest
 from matplotlib.figure import Figure
 
 import snrmjax as sj
+from snrmjax.io.results import write_response
 from snrmjax.io.units import HERTZ
 from snrmjax.simulate.continuation.stability import StabilityLoss
 from snrmjax.simulate.solutions import forced_response
@@ -168,7 +169,7 @@ def test_files_say_where_stability_was_not_computed(curve, tmp_path):
     fold = int(curve.at_events("fold")[0])
     multipliers[fold] = np.nan
     holed = dataclasses.replace(curve, multipliers=multipliers)
-    sj.io.write_response(tmp_path / "response.csv", [holed])
+    write_response(tmp_path / "response.csv", [holed])
     rows = [line.split(",") for line in (tmp_path / "response.csv").read_text().splitlines()]
     stable, event = rows[0].index("stable"), rows[0].index("event")
     body = rows[1:]

@@ -13,6 +13,7 @@ from snrmjax.identify.pointwise.inversion_result import PointStatus
 from snrmjax.identify.pointwise.points_result import BackbonePoints
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.least_squares import inverse_of
 from snrmjax.numerics.levenberg_marquardt import MinimisationStatus, StepRule, minimise
 from snrmjax.numerics.result import Variable
@@ -203,6 +204,10 @@ def _vector(values: Float[ArrayLike, " point"]) -> Float[np.ndarray, " point"]:
     return np.atleast_1d(np.asarray(values, dtype=np.float64))
 
 
+def _chosen(names: tuple[str, ...], which: np.ndarray) -> tuple[str, ...]:
+    return tuple(name for name, there in zip(names, which, strict=True) if there)
+
+
 def _outcome(
     model_of: ModelOf,
     names: tuple[str, ...],
@@ -224,22 +229,17 @@ def _outcome(
             relative = relative * reduced
         covariance = relative * values * values[:, None]
         if stated and reduced > 1 + margin:
-            notes.append(
-                f"residuals are {np.sqrt(reduced):.2g} times the stated errors: they are "
-                "understated or the model lacks something; the standard deviations are widened."
-            )
-        vague = [k for k, size in enumerate(np.sqrt(np.diag(relative))) if not size < 1]
-        if vague:
-            listed = ", ".join(names[k] for k in vague)
-            notes.append(f"the backbone says next to nothing about {listed}: state `prior_std`.")
+            notes.append(Fact("calibration_noise", scale=float(np.sqrt(reduced))))
+        vague = ~(np.diag(relative) < 1)
+        if vague.any():
+            notes.append(Fact("parameters_hardly_known", names=_chosen(names, vague)))
     if end.status == MinimisationStatus.NOT_FINITE:
-        notes.append("the start has no such mode at some velocities: begin nearer.")
+        notes.append(Fact("no_mode_at_start"))
     elif not end.status.found_minimum:
-        notes.append("the fit did not converge: begin nearer, or fit fewer parameters.")
+        notes.append(Fact("calibration_not_converged"))
     at_limit = np.abs(np.abs(end.point) - _FURTHEST) < 1e-9
     if at_limit.any():
-        listed = ", ".join(name for name, there in zip(names, at_limit, strict=True) if there)
-        notes.append(f"{listed} ended ten times off the start: begin nearer, or state `prior_std`.")
+        notes.append(Fact("parameters_at_limit", names=_chosen(names, at_limit)))
     by_value = linear.jacobian[:n] * sigma[:, None] / values
     variance = np.einsum("ki,ij,kj->k", by_value, covariance, by_value)
     return BackboneCalibration(

@@ -36,6 +36,7 @@ from snrmjax.model.parameters import (
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import mapped
 from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.least_squares import inverse_of
 from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
 
@@ -371,29 +372,22 @@ def _result(
 
 def _notes(
     chosen: ComparedColumns, names: tuple[str, ...], found: _Fitted, reduced: float, margin: float
-) -> list[str]:
+) -> list[Fact]:
     notes = []
     if found.status == MinimisationStatus.NOT_FINITE:
-        notes.append("no balanced motion was found for any state: nothing was fitted.")
+        notes.append(Fact("no_motion_for_calibration"))
     elif not found.status.found_minimum:
-        notes.append(
-            f"the fit did not converge within {_STEPS} steps: values and standard deviations are "
-            "not those of a minimum; start nearer, or fit fewer parameters."
-        )
+        notes.append(Fact("calibration_not_converged"))
     if not found.usable.all():
-        lost = ", ".join(str(k) for k in chosen.rows[~found.usable])
-        notes.append(f"no balanced motion was found for the states {lost}: they have no weight.")
-    times = f"{np.sqrt(reduced):.2g} times the stated noise"
-    if chosen.noise_stated and not reduced <= 1 + margin:
         notes.append(
-            f"residuals are {times}: it is understated or the model lacks something; the standard "
-            "deviations are widened accordingly."
+            Fact("states_without_motion", states=tuple(chosen.rows[~found.usable].tolist()))
         )
-    if chosen.noise_stated and reduced < 1 - margin:
-        notes.append(f"residuals are only {times}: it is overstated.")
-    blind = [name for name, slope in zip(names, found.jacobian.T, strict=False) if not slope.any()]
+    if chosen.noise_stated and not abs(reduced - 1) <= margin:
+        notes.append(Fact("calibration_noise", scale=float(np.sqrt(reduced))))
+    slopes = zip(names, found.jacobian.T, strict=False)
+    blind = tuple(name for name, slope in slopes if not slope.any())
     if blind:
-        notes.append(f"the data say nothing about {', '.join(blind)}.")
+        notes.append(Fact("parameters_without_data", names=blind))
     return notes
 
 

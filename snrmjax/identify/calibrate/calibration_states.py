@@ -12,6 +12,7 @@ from snrmjax.measure.states import SteadyStates, check_force, relative_errors
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import taken
 from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.facts import Fact
 
 OneKind = TypeVar("OneKind", Array, np.ndarray)
 
@@ -47,7 +48,7 @@ class ComparedColumns(NamedTuple):
     orders: tuple[int, ...]  # harmonics that are compared
     phase_unknown: Bool[np.ndarray, "state sensor"]
     noise_stated: bool
-    notes: tuple[str, ...]
+    notes: tuple[Fact, ...]
 
 
 def calibration_states(
@@ -68,7 +69,7 @@ def calibration_states(
             f"{list(model.modes.sensors)}."
         )
     check_force(data, "a comparison with a model")
-    notes: list[str] = []
+    notes = []
     # Operations of JAX compile for every number of states.
     told: Any = jax.tree.map(np.asarray, data)
     r = reference_sensor(model.modes)
@@ -88,9 +89,9 @@ def calibration_states(
     errors = np.asarray(relative_errors(told))[:, sensors]
     stated = bool(np.all(errors[measured][:, 1:] > 0))  # NaN is not
     if not stated:
-        stated_for = "not all are" if np.any(errors[measured][:, 1:] > 0) else "none is"
+        in_part = bool(np.any(errors[measured][:, 1:] > 0))
         errors = np.broadcast_to([0.0, ASSUMED_ERROR, ASSUMED_ERROR], errors.shape)
-        notes.append(f"every point is given the same relative error, as {stated_for} stated.")
+        notes.append(Fact("equal_errors_assumed", some_stated=in_part))
     errors = np.where(measured[..., None], errors, 0.0)
     places = [k for k, h in enumerate(told.harmonic_order) if 1 < h <= harmonic_order]
     harmonics = told.harmonics[:, sensors][..., places]
@@ -102,7 +103,7 @@ def calibration_states(
     harmonics = np.where(unknown[..., None], np.abs(harmonics), harmonics)
     errors[..., 2] = np.where(unknown, 0.0, errors[..., 2])
     if places and not there.any():
-        notes.append("harmonics are left out: no error is stated for them.")
+        notes.append(Fact("harmonics_without_error"))
         harmonics, there, places = harmonics[..., :0], there[..., :0], []
     n = len(rows)
     real = np.concatenate([np.ones((n, 1), bool), measured[:, 1:], there.reshape(n, -1)], axis=1)

@@ -9,12 +9,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
 from snrmjax.identify.calibrate.calibration_states import CalibrationStates, calibration_states
-from snrmjax.identify.pointwise.inversion_result import spans
 from snrmjax.measure.states import SteadyStates, check_phases
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import mapped
 from snrmjax.numerics.compiled import compiled
-from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.result import AbstractResult, Variable, quantity
 from snrmjax.simulate.balance.prescribed_motion import PrescribedMotion, prescribed_motion
 
 
@@ -25,29 +24,21 @@ class InverseForce(AbstractResult):
 
     force: Complex[Array, " state"]  # N, as recorded, relative to the phase of the measured force
     velocity: Complex[Array, "state harmonic sensor"]  # m/s, as recorded, h = 0…H
-    converged: Bool[Array, " state"]
-
-    def summary(self) -> tuple[str, ...]:
-        """See `AbstractResult`."""
-        found = int(np.sum(np.asarray(self.converged)))
-        return (
-            f"InverseForce: {found} of {len(self.converged)} motions found",
-            f"force {spans(np.abs(np.asarray(self.force)))} N",
-        )
+    converged: Bool[Array, " state"] = quantity("state", "1", "whether a motion was found")
 
     def variables(self) -> dict[str, Variable]:
-        """See `AbstractResult`."""
+        """Real and imaginary parts of forces and velocities."""
         force, velocity = np.asarray(self.force), np.asarray(self.velocity)
+        state, where = ("state",), ("state", "harmonic", "sensor")
         n, orders = velocity.shape[:2]
-        where = ("state", "harmonic", "sensor")
         return {
-            "state": Variable(("state",), np.arange(n), "1", "steady state"),
+            "state": Variable(state, np.arange(n), "1", "steady state"),
             "harmonic": Variable(("harmonic",), np.arange(orders), "1", "harmonic order"),
-            "force_re_n": Variable(("state",), force.real, "N", "force in phase with the measured"),
-            "force_im_n": Variable(("state",), force.imag, "N", "force 90° ahead of it"),
+            "force_re_n": Variable(state, force.real, "N", "force in phase with the measured"),
+            "force_im_n": Variable(state, force.imag, "N", "force 90° ahead of it"),
             "velocity_re_m_s": Variable(where, velocity.real, "m/s", "velocity, real part"),
             "velocity_im_m_s": Variable(where, velocity.imag, "m/s", "velocity, imaginary part"),
-            "converged": Variable(("state",), self.converged, "1", "whether a motion was found"),
+            **super().variables(),
         }
 
 

@@ -14,7 +14,6 @@ from snrmjax.identify.pointwise.points_result import AmplitudeArgument
 
 _SCAN = 256  # displacements of the backbone, on which a velocity is looked for
 _ITERATIONS = 12
-_STEP = 1e-5  # relative, of central differences by the amplitude
 _KNOTS = 120  # of curves of families by name, for what takes a `Backbone`
 _DOUBLINGS = 6  # of the displacement, to reach a velocity
 
@@ -171,16 +170,16 @@ def _on_backbone(
     given_velocity = near is not None
     at = np.asarray(at, dtype=float)
     if of_velocity[0] == given_velocity:
-        squared, by_own, _ = _linearised(curves[0], at)
+        squared, by_own, _ = curves[0].linearised(at)
         root = np.sqrt(squared)
         other = at / root if given_velocity else at * root
         # x = v/√s or v = x√s.
         moves = (-0.5 if given_velocity else 0.5) * (other / squared)[:, None] * by_own
     else:
-        other = at * np.sqrt(_linearised(curves[0], 0 * at)[0]) if near is None else near
+        other = at * np.sqrt(curves[0].linearised(0 * at)[0]) if near is None else near
         for _ in range(_ITERATIONS + 1):
             # v − x√s(x) for x, or x√s(v) − v for v.
-            squared, by_own, steep = _linearised(curves[0], other)
+            squared, by_own, steep = curves[0].linearised(other)
             root = np.sqrt(squared)
             gap = other * root - at if given_velocity else at * root - other
             arm = (other if given_velocity else at) / (2 * root)
@@ -189,29 +188,13 @@ def _on_backbone(
             other = other - gap / slope
         by_own = by_own + steep[:, None] * moves
     displacement, velocity = (other, at) if given_velocity else (at, other)
-    damping, by_damping, steep = _linearised(
-        curves[1], velocity if of_velocity[1] else displacement
-    )
+    damping, by_damping, steep = curves[1].linearised(velocity if of_velocity[1] else displacement)
     # The unknowns after those of the curves move nothing here.
     slopes = np.zeros((len(at), 2, len(fit.covariance)))
     slopes[:, 0, :n], slopes[:, 1, n : n + by_damping.shape[1]] = by_own, by_damping
     if of_velocity[1] != given_velocity:
         slopes[:, 1, :n] = steep[:, None] * moves
     return OnBackbone(np.stack([squared, damping], axis=1), slopes, displacement, velocity)
-
-
-def _linearised(
-    curve: AbstractFamily, amplitude: Float[np.ndarray, " point"]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Values, derivatives by the parameters, and by the amplitude by central differences."""
-    values, slopes = curve.values_and_slopes(amplitude)
-    step = _STEP * np.maximum(amplitude, 1e-3 * float(curve.scale))
-    (above, _), (below, _) = (
-        curve.values_and_slopes(np.maximum(amplitude + sign * step, 0.0)) for sign in (1, -1)
-    )
-    width = amplitude + step - np.maximum(amplitude - step, 0.0)
-    with np.errstate(invalid="ignore"):
-        return values, slopes, (above - below) / width
 
 
 class _Reached(NamedTuple):

@@ -12,10 +12,14 @@ from jaxtyping import Array, Float
 
 from snrmjax.identify.checks.residual_autocorrelation import share_told_by
 from snrmjax.identify.joint.force_balance import BalanceProblem, Unknowns, nearest_errors
-from snrmjax.identify.joint.free_unknowns import Unravel, packed_unknowns, padded_problem
+from snrmjax.identify.joint.free_unknowns import (
+    Unravel,
+    corrected_residuals,
+    packed_unknowns,
+    padded_problem,
+)
 from snrmjax.identify.joint.notes import NoiseEstimate
 from snrmjax.identify.joint.posterior_view import LEAST_LEFT
-from snrmjax.identify.joint.residuals import corrected_residuals
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.least_squares import degrees_spent, root_of_inverse
 from snrmjax.numerics.status import Status

@@ -283,7 +283,7 @@ def _curve(found: TestPosterior, choice: Choice, which: int) -> AbstractFamily:
                         f"{choice.kind}:{size} has {one.parameters.shape[0]} parameters, but "
                         f"there are {n} states only: choose a smaller family."
                     )
-                off = np.sqrt(np.mean(((one.values_and_slopes(at)[0] - values) / std) ** 2))
+                off = np.sqrt(np.mean(((one.linearised(at).value - values) / std) ** 2))
                 tried.append((float(off), one.parameters.shape[0], one))
     # The simplest that lies in the band of the smooth curve, or else the nearest to it.
     inside = [row for row in tried if row[0] < 1.0]

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 from scipy.signal import decimate
 
-from snrmjax.identify.modal.modal_fit import AbstractModalFit, phase_collinearity
+from snrmjax.identify.modal.modal_fit import REAL, AbstractModalFit, phase_collinearity
 from snrmjax.identify.modal.pole_orders import PoleOrders, clusters, gathered
 from snrmjax.identify.modal.separable_fit import (
     ChannelRows,
@@ -22,9 +22,10 @@ from snrmjax.identify.modal.separable_fit import (
 )
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.time_recording import TimeRecording
+from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import Variable
+from snrmjax.numerics.units import HERTZ
 
-_HERTZ = 2 * np.pi
 _MOTIONS = ("displacement", "velocity", "acceleration")
 _HIGHEST = 30  # half the model order
 _MOST_ROWS, _MOST_COLUMNS = 240, 3000  # of a Hankel matrix
@@ -33,6 +34,7 @@ _FEWEST_SAMPLES = 40
 _SAMPLES_PER_CYCLE = 5  # kept of the highest frequency asked for
 _SIGNIFICANT = 4.0  # standard errors of a mode's largest amplitude, without which it is none
 _MOST_DAMPED = 0.5
+_CORRELATED = 2.0  # sum of the correlations of residuals, from which on it is worth a note
 _MOST_GROWTH = 3.0  # of a mode's logarithm over the record
 
 
@@ -102,7 +104,7 @@ def fit_free_decay(
     length = min(part.shape[1] for part in parts)
     values = np.concatenate([part[:, :length] for part in parts])
     if to_frequency is not None:
-        step = max(1, int(rate / (_SAMPLES_PER_CYCLE * to_frequency / _HERTZ)))
+        step = max(1, int(rate / (_SAMPLES_PER_CYCLE * to_frequency / HERTZ)))
         for factor in _factors(step):
             values = decimate(values, factor, axis=1, zero_phase=True)
             rate /= factor
@@ -207,8 +209,8 @@ def _start(
         damped = orders.pole[(orders.pole.real < 0) & (orders.damping_ratio < 0.25)]
         if not wanted.size or np.any(wanted <= 0) or np.any(wanted >= top) or not damped.size:
             raise ValueError(
-                f"poles must be from 0 to {top / _HERTZ:.6g} Hz, where the decay shows some, but "
-                f"are {', '.join(f'{one / _HERTZ:.6g}' for one in wanted) or 'none'}."
+                f"poles must be from 0 to {top / HERTZ:.6g} Hz, where the decay shows some, but "
+                f"are {', '.join(f'{one / HERTZ:.6g}' for one in wanted) or 'none'}."
             )
         return np.array([damped[np.argmin(np.abs(np.abs(damped) - one))] for one in wanted])
     found = clusters(orders, (0.0, top))
@@ -305,17 +307,16 @@ def _result(
     shape_std[top, np.arange(n)] = 0.0
     collinearity, _ = phase_collinearity(ratio)
     notes = [
-        f"mode {k + 1} is complex: modal phase collinearity {value:.2f}"
-        for k, value in enumerate(collinearity)
-        if value < 0.9
+        Fact("complex_mode", mode=k + 1, frequency_hz=float(omega) / HERTZ, collinearity=value)
+        for k, (omega, value) in enumerate(
+            zip(unknowns[:n][rank], collinearity.tolist(), strict=True)
+        )
+        if value < REAL
     ]
     if not fit.status.found_minimum:
-        notes.append("the least-squares fit had not settled after its last step")
-    if fit.correlation.sum() > 2:
-        notes.append(
-            "residuals of neighbouring samples are correlated (a mode that was missed, or a decay "
-            "that is not linear): errors are widened for it"
-        )
+        notes.append(Fact("modal_fit_not_settled"))
+    if fit.correlation.sum() > _CORRELATED:
+        notes.append(Fact("decay_residuals_correlated"))
     return DecayModes(
         natural_frequency=unknowns[:n][rank],
         damping_ratio=unknowns[n:][rank],

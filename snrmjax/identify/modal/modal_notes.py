@@ -9,14 +9,14 @@ from snrmjax.identify.modal.modal_bases import (
     receptance_bases,
     unpacked,
 )
-from snrmjax.identify.modal.modal_fit import LinearModalFit, phase_collinearity
+from snrmjax.identify.modal.modal_fit import REAL, LinearModalFit, phase_collinearity
 from snrmjax.identify.modal.response_data import ResponseData
 from snrmjax.identify.modal.separable_fit import ChannelRows, SeparableFit, fit_separable
+from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.units import HERTZ
 
-_HERTZ = 2 * np.pi
 _FEW_LINES = 8.0  # in the half-power band, below which leakage may count
 _BIASED = 0.01  # relative bias of damping that is worth a note
-_REAL = 0.9  # phase collinearity below which a mode is called complex
 _TURNED = np.radians(5.0)  # mean phase that is worth a note
 _CERTAIN = 3.0  # standard errors
 _MISFIT = 1.5  # rms residual over stated σ that is worth a note
@@ -105,57 +105,33 @@ def fit_notes(
     settings: BasisSettings,
     fit: SeparableFit,
     rank: Int[np.ndarray, " mode"],
-) -> tuple[str, ...]:
-    """Sentences on what the fit assumes and the data do not keep."""
-    notes = [*_complexity(found), *_misfits(found)]
+) -> list[Fact]:
+    """What the fit assumes and the data do not keep."""
+    notes = []
     averaged = data.source == "coherence" or data.averages is not None
     few = found.lines_in_band < _FEW_LINES
+    hertz = (found.natural_frequency / HERTZ).tolist()
     if settings.window_time is None and averaged and few.any():
-        bias = leakage_bias(data, settings, fit, found.curves.std)[rank]
-        notes = [*_leakage(found, np.where(few, bias, 0.0)), *notes]
-    if not found.status.found_minimum:
-        notes.append("the least-squares fit had not settled after its last step")
-    if settings.window_time is not None:
-        notes.append(
-            "leakage of Hann's window is modelled: averages of stationary random excitation, "
-            f"windows of {settings.window_time:.4g} s"
-        )
-    return tuple(notes)
-
-
-def _leakage(found: LinearModalFit, bias: np.ndarray) -> list[str]:
-    return [
-        f"the half-power band of mode {k + 1} ({found.natural_frequency[k] / _HERTZ:.6g} Hz) has "
-        f"{found.lines_in_band[k]:.1f} lines: if these are averages of random excitation under "
-        f"Hann's window, leakage makes its damping some {100 * bias[k]:.2g} % too high, which is "
-        "not in the error; model it (window hann), or measure with finer lines"
-        for k in np.flatnonzero(np.abs(bias) > _BIASED)
-    ]
-
-
-def _complexity(found: LinearModalFit) -> list[str]:
-    notes = []
-    for k in range(found.n_modes):
-        where = f"mode {k + 1} ({found.natural_frequency[k] / _HERTZ:.6g} Hz)"
-        phase, std = found.mean_phase[k], found.mean_phase_std[k]
+        bias = np.where(few, leakage_bias(data, settings, fit, found.curves.std)[rank], 0.0)
+        for k in np.flatnonzero(np.abs(bias) > _BIASED).tolist():
+            lines, share = float(found.lines_in_band[k]), float(bias[k])
+            notes.append(
+                Fact("leakage", mode=k + 1, frequency_hz=hertz[k], lines=lines, bias=share)
+            )
+    for k, (phase, std) in enumerate(zip(found.mean_phase, found.mean_phase_std, strict=True)):
+        at = {"mode": k + 1, "frequency_hz": hertz[k]}
         if abs(phase) > max(_TURNED, _CERTAIN * std):
-            notes.append(
-                f"the residues of {where} are turned by {np.degrees(phase):.2g}° ± "
-                f"{np.degrees(1.96 * std):.2g}° from real ones: an instrument's phase (free it), "
-                "a neighbouring mode that was missed, or complex modes"
-            )
-        if found.collinearity[k] < _REAL:
-            notes.append(
-                f"{where} is complex: modal phase collinearity {found.collinearity[k]:.2f}; its "
-                "real shape is an approximation"
-            )
-    return notes
-
-
-def _misfits(found: LinearModalFit) -> list[str]:
-    return [
-        f"the residuals of {name} are {value:.2g} times what is stated of its errors: the "
-        "errors of the modes are scaled by that"
+            turn = {"phase_deg": float(np.degrees(phase)), "std_deg": float(np.degrees(std))}
+            notes.append(Fact("residues_turned", **at, **turn))
+        if found.collinearity[k] < REAL:
+            notes.append(Fact("complex_mode", **at, collinearity=float(found.collinearity[k])))
+    notes += [
+        Fact("misfit_of_sensor", sensor=name, times=float(value))
         for name, value in zip(found.sensor_names, found.misfit, strict=True)
         if value > _MISFIT
     ]
+    if not found.status.found_minimum:
+        notes.append(Fact("modal_fit_not_settled"))
+    if settings.window_time is not None:
+        notes.append(Fact("leakage_modelled", window_s=settings.window_time))
+    return notes

@@ -15,6 +15,7 @@ from snrmjax.identify.modal.state_responses import (
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.states import SteadyStates
+from snrmjax.numerics.facts import Fact
 
 _OF_DECAYS = ("to_frequency", "poles", "highest_order")
 
@@ -25,7 +26,7 @@ def find_modes(
     level: int | None = None,
     base: MotionKind | None = None,
     **settings: Any,
-) -> tuple[LinearModalFit | DecayModes, tuple[str, ...]]:
+) -> tuple[LinearModalFit | DecayModes, tuple[Fact, ...]]:
     """Modes of what was measured, and notes on it.
 
     Of steady states the lowest level counts, and the next one says whether it was low enough.
@@ -46,13 +47,14 @@ def find_modes(
     found = _of_responses(lowest.responses, base, {**settings, "std": lowest.std})
     above = levels[levels.index(chosen) + 1 :]
     if not above:
-        return found, ("one level alone: nothing says whether it was low enough to be linear",)
+        return found, (Fact("one_level_for_modes"),)
     other = responses_of_states(source, above[0])
     by_hand = {"poles": tuple(found.natural_frequency), "order": None, "std": other.std}
     try:
         second = _of_responses(other.responses, base, {**settings, **by_hand})
     except ValueError as error:
-        return found, (f"level {above[0]} cannot be compared with level {chosen}: {error}",)
+        pair = {"level": chosen, "other": above[0]}
+        return found, (Fact("levels_not_compared", **pair, reason=str(error)),)
     return amplitude_dependence(found, second, (lowest.velocity, other.velocity))
 
 

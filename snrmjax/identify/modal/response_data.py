@@ -6,17 +6,22 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float, Int
+from scipy.optimize import minimize
 
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
+from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.units import HERTZ
 
 ErrorSource = Literal["stated", "coherence", "residuals"]
 """Where the weights come from: stated 1σ, coherence, or the residuals themselves."""
 
-_HERTZ = 2 * np.pi
 _FEWEST_LINES = 6
 _POWERS = {"displacement": 0, "velocity": 1, "acceleration": 2}
 _LEAST_MISSING_COHERENCE = 1e-7  # 1 − γ² that a file's rounding leaves
+_FEWEST_NUMBERS = 12  # of a channel, below which its errors are one size
+_SPREAD = 1e-4  # of the largest response: where the search for the errors' sizes begins
+_SMALLEST = 1e-12  # of a channel's residuals: errors of responses without any
 _SAME_FREQUENCY = 1e-9  # relative
 
 
@@ -31,7 +36,7 @@ class ResponseData(NamedTuple):
     reference: Channel
     source: ErrorSource
     averages: int | None
-    notes: tuple[str, ...]
+    notes: tuple[Fact | str, ...]
 
     @property
     def measured_size(self) -> Float[np.ndarray, "channel line"]:
@@ -72,7 +77,7 @@ def response_data(
     high = np.inf if to_frequency is None else to_frequency
     if not low < high:
         raise ValueError(
-            f"the band must rise, but is from {low / _HERTZ:.6g} to {high / _HERTZ:.6g} Hz."
+            f"the band must rise, but is from {low / HERTZ:.6g} to {high / HERTZ:.6g} Hz."
         )
     omega = responses.frequency
     keep = (omega > 0) & (omega >= low * (1 - 1e-12)) & (omega <= high * (1 + 1e-12))
@@ -92,7 +97,7 @@ def response_data(
         k, line = bad[0]
         raise ValueError(
             f"a coherence must be from 0 to 1, but that of {responses.responses[k].name} at "
-            f"{omega[keep][line] / _HERTZ:.6g} Hz is {coherence[k, line]:.6g}."
+            f"{omega[keep][line] / HERTZ:.6g} Hz is {coherence[k, line]:.6g}."
         )
     powers = tuple(_POWERS[one.quantity] for one in responses.responses)
     size = omega[keep] ** np.array(powers)[:, None]
@@ -124,9 +129,9 @@ def joined_responses(parts: Sequence[FrequencyResponses]) -> FrequencyResponses:
         ):
             raise ValueError(
                 f"responses of one test must share their frequencies, but {place} has "
-                f"{len(one.frequency)} lines to {one.frequency[-1] / _HERTZ:.6g} Hz and "
+                f"{len(one.frequency)} lines to {one.frequency[-1] / HERTZ:.6g} Hz and "
                 f"{first.name or 'the first'} {len(first.frequency)} to "
-                f"{first.frequency[-1] / _HERTZ:.6g} Hz."
+                f"{first.frequency[-1] / HERTZ:.6g} Hz."
             )
         if [r.name for r in one.references] != [r.name for r in first.references]:
             raise ValueError(
@@ -177,7 +182,7 @@ def _errors(
     coherence: np.ndarray,
     std: np.ndarray | None,
     keep: np.ndarray,
-) -> tuple[np.ndarray, ErrorSource, list[str]]:
+) -> tuple[np.ndarray, ErrorSource, list[Fact]]:
     """1σ of real and imaginary part, in the unit of what was measured."""
     unknown = np.full(raw.shape, np.nan)
     if std is not None:
@@ -195,9 +200,9 @@ def _errors(
     if not stated.any():
         return unknown, "residuals", []
     if np.any(~stated & np.isfinite(raw)):
-        return unknown, "residuals", ["the coherence is stated in part and not used"]
+        return unknown, "residuals", [Fact("coherence_in_part")]
     if np.median(coherence[stated]) > 1 - _LEAST_MISSING_COHERENCE:
-        return unknown, "residuals", ["the coherence is 1 at most lines: it says nothing of errors"]
+        return unknown, "residuals", [Fact("coherence_is_one")]
     if np.median(coherence[stated]) <= 0:
         raise ValueError("the coherence is zero at most lines: nothing follows the reference.")
     return coherence_std(np.abs(raw), coherence, responses.averages), "coherence", []
@@ -216,3 +221,41 @@ def coherence_std(
     """
     kept = np.clip(coherence, 1e-6, 1 - _LEAST_MISSING_COHERENCE)
     return size * np.sqrt((1 - kept) / kept / 2 / (averages or 1))
+
+
+def std_from_residuals(
+    data: ResponseData,
+    residuals: Float[np.ndarray, "channel line"],
+    fitted: Float[np.ndarray, "channel line"],
+) -> Float[np.ndarray, "channel line"]:
+    """1σ of each part by σ² = a² + b²|H|² of what was measured, a and b by maximum likelihood.
+
+    Arguments: complex residuals and sizes of the fit, receptances; NaN where not measured.
+    """
+    size = data.measured_size
+    found = np.full(residuals.shape, np.nan)
+    for k in range(len(residuals)):
+        good = np.isfinite(residuals[k])
+        left = 0.5 * np.abs(residuals[k][good] * size[k][good]) ** 2
+        model = (np.abs(fitted[k]) * size[k]) ** 2
+        floor = max(_SMALLEST**2 * float(model[good].max()), float(np.mean(left)) * _SMALLEST)
+        scale = float(np.mean(left)) + floor
+        if 2 * good.sum() < _FEWEST_NUMBERS:
+            found[k] = np.sqrt(scale) / size[k]
+            continue
+        relative = model / np.mean(model[good])
+
+        def unlikely(logs: np.ndarray, of: np.ndarray, at: np.ndarray) -> float:
+            variance = np.exp(logs[0]) + np.exp(logs[1]) * at + _SPREAD**2
+            return float(np.sum(np.log(variance) + of / variance))
+
+        best = minimize(
+            unlikely,
+            np.log([0.5, 0.5]),
+            args=(left / scale, relative[good]),
+            method="L-BFGS-B",
+            bounds=[(-20.0, 10.0)] * 2,
+        )
+        variance = np.exp(best.x[0]) + np.exp(best.x[1]) * relative + _SPREAD**2
+        found[k] = np.sqrt(variance * scale) / size[k]
+    return found

@@ -11,17 +11,10 @@ from snrmjax.identify.modal.modal_fit import LinearModalFit
 from snrmjax.identify.scaling.added_mass import squared_shapes
 from snrmjax.identify.scaling.rigid_body import rigid_body_mode
 from snrmjax.identify.scaling.scaled_modes import ScaledModes
+from snrmjax.numerics.facts import Fact
 
 _PER = {"force": "N", "voltage": "V", "acceleration": "m/s²"}
 _CERTAIN = 3.0  # standard errors of a drive point's residue, without which it gives no scale
-_NOT_SCALED = (
-    "shapes and participations are not mass-normalised: only frequencies, damping ratios and "
-    "ratios of a shape hold; the gain of the force must be free in what follows"
-)
-_PER_VOLT = (
-    "participations are per volt: states with `drive_v` and the gain of the force in newtons per "
-    "volt free, or fixed to one, fit this model"
-)
 _DRIVE_NAMES = ("drive_point", "drive point", "driving_point", "driving point")
 
 
@@ -32,8 +25,8 @@ class _Scaled(NamedTuple):
     relative_std: Float[np.ndarray, " mode"]  # of it, beside the residues' errors
     by_residues: Float[np.ndarray, "mode sensor"]  # d ln p / d residue
     keep: Bool[np.ndarray, " mode"]
-    by: str
-    notes: tuple[str, ...]
+    by: Fact
+    notes: tuple[Fact, ...]
     # An error of response over force enters ln φ with this exponent and ln p with the rest.
     exponent: float
 
@@ -73,13 +66,13 @@ class DrivePoint(NamedTuple):
                 f"the residues at the drive point {fit.sensor_names[d]} are within three standard "
                 "errors of zero: it lies at a node of all modes and gives no scale."
             )
+        left_out = np.stack([hertz, own, std], axis=1)[~keep].tolist()
         notes = tuple(
-            f"mode at {hertz[k]:.6g} Hz left out: its residue at the drive point is {own[k]:.3g} ± "
-            f"{1.96 * std[k]:.2g} 1/kg (95 %), from which no shape follows"
-            for k in np.flatnonzero(~keep)
+            Fact("mode_not_scaled", frequency_hz=at, residue=value, std=spread)
+            for at, value, spread in left_out
         )
         participation = np.sqrt(np.where(keep, own, 1.0))
-        by = f"scaled by the drive point {fit.sensor_names[d]}"
+        by = Fact("scaled_by_drive_point", sensor=fit.sensor_names[d])
         slopes = 0.5 * _by_one(residue, d)
         return _Scaled(participation, np.zeros(len(own)), slopes, keep, by, notes, 0.5)
 
@@ -116,7 +109,7 @@ class AddedMassTest(NamedTuple):
             0.5 * found.squared_std / found.squared,
             _by_one(residue, place),
             np.ones(len(shape), dtype=bool),
-            f"scaled by an added mass of {self.mass:.4g} kg at {self.sensor}",
+            Fact("scaled_by_added_mass", mass_kg=self.mass, sensor=self.sensor),
             found.notes,
             0.0,
         )
@@ -166,16 +159,16 @@ class SensorMasses(NamedTuple):
                 "turned, or the responses are absolute where relative ones were said."
             )
         size = np.sqrt(-total / fixture)
-        note = f"the forced fixture of {fixture:.4g} kg moves as the sensors' masses balance it"
+        note = Fact("forced_fixture", mass_kg=fixture)
         if base:
-            listed = ", ".join(f"{value:.4g}" for value in -total)
-            note = f"effective masses: {listed} kg by modes, of {mass.sum():.4g} kg at the sensors"
+            masses = tuple((-total).tolist())
+            note = Fact("effective_masses", masses_kg=masses, at_sensors_kg=float(mass.sum()))
         return _Scaled(
             -size if base else size,
             np.zeros(len(size)),
             0.5 * mass[None] / total[:, None],
             np.ones(len(size), dtype=bool),
-            "scaled by the masses at the sensors",
+            Fact("scaled_by_sensor_masses"),
             (note,),
             0.5,
         )
@@ -196,13 +189,13 @@ class KnownShape(NamedTuple):
                 f"the known shape at {self.sensor} must be finite and not zero, but is "
                 f"{self.value:g}."
             )
-        note = f"the shape {self.value:.6g} at {self.sensor} was taken for every mode"
+        note = Fact("shape_for_all_modes", value=self.value, sensor=self.sensor)
         return _Scaled(
             residue[place] / self.value,
             np.full(n, abs(self.std / self.value)),
             _by_one(residue, place),
             np.ones(n, dtype=bool),
-            f"scaled by the shape stated at {self.sensor}",
+            Fact("scaled_by_known_shape", sensor=self.sensor),
             () if n == 1 else (note,),
             0.0,
         )
@@ -279,7 +272,7 @@ def scale_modes(
         *(_drive_point_of(fit), scaled.by),
     )
     per = "N" if gain != 1.0 else per
-    volts = (_PER_VOLT,) if per == "V" else ()
+    volts = (Fact("participations_per_volt"),) if per == "V" else ()
     return ScaledModes(
         natural_frequency=fit.natural_frequency[keep],
         natural_frequency_std=fit.natural_frequency_std[keep],
@@ -339,10 +332,10 @@ def _unscaled(
         rigid_shape=None,
         rigid_participation=0.0,
         sensors=found.sensor_names,
-        scaled_by="not scaled",
+        scaled_by=Fact("not_scaled"),
         per=per,
         mass_normalised=False,
-        notes=(*found.notes, _NOT_SCALED),
+        notes=(*found.notes, Fact("shapes_not_scaled")),
     )
 
 

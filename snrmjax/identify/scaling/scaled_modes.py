@@ -7,9 +7,10 @@ import numpy as np
 from jaxtyping import Float
 
 from snrmjax.model.modes import LinearModes, LinearModesStd, RigidBodyModes, linear_modes
+from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.units import HERTZ
 
-_HERTZ = 2 * np.pi
 _WIDE = 1.96  # standard deviations of a 95 % band
 
 
@@ -35,10 +36,10 @@ class ScaledModes(AbstractResult):
     rigid_shape: Float[np.ndarray, " sensor"] | None  # kg^-1/2; None: no rigid-body mode
     rigid_participation: float
     sensors: tuple[str, ...] = eqx.field(static=True)
-    scaled_by: str = eqx.field(static=True)
+    scaled_by: Fact = eqx.field(static=True)
     per: str = eqx.field(static=True, default="N")
     mass_normalised: bool = eqx.field(static=True, default=True)
-    notes: tuple[str, ...] = eqx.field(static=True, default=())
+    notes: tuple[Fact | str, ...] = eqx.field(static=True, default=())
 
     @property
     def n_modes(self) -> int:
@@ -83,8 +84,8 @@ class ScaledModes(AbstractResult):
         for k in range(self.n_modes):
             top = int(np.argmax(np.abs(self.shape[:, k])))
             lines.append(
-                f"mode {k + 1}: {self.natural_frequency[k] / _HERTZ:.7g} ± "
-                f"{_WIDE * self.natural_frequency_std[k] / _HERTZ:.2g} Hz, damping "
+                f"mode {k + 1}: {self.natural_frequency[k] / HERTZ:.7g} ± "
+                f"{_WIDE * self.natural_frequency_std[k] / HERTZ:.2g} Hz, damping "
                 f"{100 * self.damping_ratio[k]:.4g} ± "
                 f"{_WIDE * 100 * self.damping_ratio_std[k]:.2g} %, shape "
                 f"{self.shape[top, k]:.5g} at {self.sensors[top]}, participation "
@@ -100,10 +101,10 @@ class ScaledModes(AbstractResult):
             "mode": Variable(mode, np.arange(1, self.n_modes + 1), "1", "mode"),
             "sensor": Variable(("sensor",), np.array(self.sensors), "", "sensor"),
             "natural_frequency_hz": Variable(
-                mode, self.natural_frequency / _HERTZ, "Hz", "natural frequency"
+                mode, self.natural_frequency / HERTZ, "Hz", "natural frequency"
             ),
             "natural_frequency_std_hz": Variable(
-                mode, self.natural_frequency_std / _HERTZ, "Hz", "its 1σ"
+                mode, self.natural_frequency_std / HERTZ, "Hz", "its 1σ"
             ),
             "damping_ratio": Variable(mode, self.damping_ratio, "1", "damping ratio"),
             "damping_ratio_std": Variable(mode, self.damping_ratio_std, "1", "its 1σ"),
@@ -118,4 +119,5 @@ class ScaledModes(AbstractResult):
 
     def attributes(self) -> dict[str, str | float | int]:
         """See `AbstractResult`."""
-        return {"scaled_by": self.scaled_by, "per": self.per, "notes": "\n".join(self.notes)}
+        notes = "\n".join(map(str, self.notes))
+        return {"scaled_by": str(self.scaled_by), "per": self.per, "notes": notes}

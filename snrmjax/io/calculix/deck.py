@@ -7,7 +7,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from snrmjax.io.calculix.blocks import Block, Line, read_blocks
-from snrmjax.io.calculix.flatten import flattened
 from snrmjax.io.files import FilePath, file_name, shown
 
 # CalculiX reads a coordinate from this many characters and drops the rest without a word.
@@ -24,6 +23,8 @@ _REFUSED = {
     "TRANSFORM": "displacements in local systems cannot be read back; write the supports in "
     "global directions or with *EQUATION",
     "USER ELEMENT": "user elements are linear",
+    "PART": "CalculiX reads no parts and assemblies; in Abaqus/CAE choose `Do not use parts and "
+    "assemblies in input files`",
 }
 # What steps say that changes nothing about the structure, and need not be said to be left out.
 _QUIET = {
@@ -69,17 +70,16 @@ class Deck(eqx.Module):
 
 
 def read_deck(path: FilePath) -> Deck:
-    """Read a CalculiX (or Abaqus) input deck with beam, shell or solid elements.
+    """Read a CalculiX input deck (or one of Abaqus without parts) of beams, shells or solids.
 
-    Keywords that are not known here are kept as they stand. *INCLUDE files are read in their
-    place; one part with one instance is written flat.
+    Keywords that are not known here are kept as they stand, *INCLUDE files read in their place.
 
     Arguments: `path` of the deck. Returns the `Deck`. Raises `ValueError`, with file and line, for
     what a condensation cannot use: no mesh, an element or a support with a missing node, a
     prescribed displacement, a material without density or elastic law, plasticity and other
     materials with losses, contact, local coordinate systems.
     """
-    blocks = flattened(read_blocks(path))
+    blocks = read_blocks(path)
     name = file_name(path)
     model, supports, left_out = _split(blocks)
     nodes = _nodes(model, name)

@@ -20,6 +20,7 @@ from snrmjax.measure.recordings.time_recording import (
     TimeRecording,
     time_recording,
 )
+from snrmjax.numerics.facts import Fact
 
 _UNITS = ("unit_string", "NI_UnitDescription", "Unit", "unit", "Units")
 _MOST_CHANNELS = 4096
@@ -57,7 +58,7 @@ def read_tdms(path: Path) -> LaboratoryFile:
     size = path.stat().st_size
     recordings: list[TimeRecording] = []
     tables: list[NumberTable] = []
-    notes: list[str] = []
+    notes: list[Fact] = []
     with damaged_if_it_fails(path.name, "a TDMS file"), open(path, "rb") as file:
         source = _contents(file)
         groups = [(group.name, list(group.channels())) for group in source.groups()]
@@ -70,7 +71,7 @@ def read_tdms(path: Path) -> LaboratoryFile:
         loose: dict[str, Node] = {}
         for one in channels:
             if not len(one) or one.dtype.kind not in "biufc":
-                notes.append(f"channel {one.name} {_why_not(one)} and is not read.")
+                notes.append(Fact("not_read", name=f"channel {one.name}", why=_why_not(one)))
                 continue
             step = _number(one, "wf_increment")
             start = _number(one, "wf_start_offset") or 0.0
@@ -166,8 +167,8 @@ def _is_spectrum(one: Any) -> bool:
 def _why_not(one: Any) -> str:
     """What a channel holds that is not read."""
     if not len(one):
-        return "is empty"
-    return "holds times of day" if one.dtype.kind in "MV" else "holds no numbers"
+        return "empty"
+    return "times_of_day" if one.dtype.kind in "MV" else "type"
 
 
 def _unit(one: Any) -> str:

@@ -54,7 +54,6 @@ class AbstractComputation(eqx.Module):
 
     kind: ClassVar[str]
     members_a_chunk: ClassVar[int]  # small enough to lose, large enough to be worth a file
-    driven: ClassVar[bool]  # by forces: `forces_n` is needed, or `force_n` varies
 
     @abc.abstractmethod
     def outputs(self) -> dict[str, Output]:
@@ -99,18 +98,23 @@ class OfForces(eqx.Module):
         return values.reshape(-1, len(np.asarray(self.values)), *values.shape[1:])
 
 
+def of_forces(values: OfForces | Sequence[float] | np.ndarray | None) -> OfForces:
+    """The forces of a study from their values in N."""
+    if isinstance(values, OfForces):
+        return values
+    return OfForces(None if values is None else np.asarray(values, dtype=np.float64))
+
+
 def blank_rows(outputs: dict[str, Output], sizes: dict[str, int], status: str) -> dict[str, Any]:
     """Rows of members for which there is nothing but a status."""
-    found = {}
-    for name, one in outputs.items():
-        shape = tuple(sizes.get(dimension, 0) for dimension in one.dimensions)
-        if one.kind == TEXT:
-            found[name] = np.full(shape, status if name == "status" else "")
-        elif one.kind.startswith("f"):
-            found[name] = np.full(shape, np.nan)
+    rows = {}
+    for name, output in outputs.items():
+        shape = tuple(sizes.get(dimension, 0) for dimension in output.dimensions)
+        if output.kind == TEXT:
+            rows[name] = np.full(shape, status if name == "status" else "")
         else:
-            found[name] = np.zeros(shape, dtype=one.kind)
-    return found
+            rows[name] = np.full(shape, np.nan if output.kind == "f8" else 0, output.kind)
+    return rows
 
 
 def with_refused(

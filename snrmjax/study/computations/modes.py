@@ -35,7 +35,6 @@ class AbstractModes(AbstractComputation):
     """A nonlinear mode of every member, point by point."""
 
     members_a_chunk: ClassVar[int] = 32
-    driven: ClassVar[bool] = False
     further: ClassVar[tuple[str, str, str]]  # what a point has beside frequency and velocity
 
     def outputs(self) -> dict[str, Output]:

@@ -23,9 +23,10 @@ from snrmjax.study.computations.base import (
     Members,
     OfForces,
     Output,
+    of_forces,
 )
 
-_GRID = "frequency_hz"
+GRID = "frequency_hz"
 _ISOLATED = {
     "n_isolated": ("i4", "1", "isolated responses that were found"),
     "isolated_peak_velocity_m_s": ("f8", "m/s", "highest velocity of an isolated response"),
@@ -59,17 +60,17 @@ class Peaks(AbstractComputation):
     `no_peak_in_range`; one whose response is higher at an end than at its highest peak has
     `highest_at_range_end`: the resonance lies outside, and a wider range would have it.
 
-    With `grid_points` also the highest and the lowest velocity of the response at that many
-    frequencies: what the response bands of a report are made of. With `isolated` also the responses
-    that are not connected to those of small motion (takes several times as long).
+    `forces` in N; None: `force_n` varies. With `grid_points` also the highest and the lowest
+    velocity of the response at that many frequencies: what the response bands of a report are made
+    of. With `isolated` also the responses that are not connected to those of small motion (takes
+    several times as long).
     """
 
     kind: ClassVar[str] = "peaks"
     members_a_chunk: ClassVar[int] = 128
-    driven: ClassVar[bool] = True
 
     within: ResponseRange
-    forces: OfForces = OfForces()
+    forces: OfForces = eqx.field(default=None, converter=of_forces)
     grid_points: int = eqx.field(static=True, default=0)
     isolated: bool = eqx.field(static=True, default=False)
 
@@ -91,7 +92,7 @@ class Peaks(AbstractComputation):
         if self.grid_points:
             for name, which in (("upper", "highest"), ("lower", "lowest")):
                 text = f"{which} velocity of the response at this frequency"
-                named[f"{name}_velocity_m_s"] = Output((*at, _GRID), "f8", "m/s", text)
+                named[f"{name}_velocity_m_s"] = Output((*at, GRID), "f8", "m/s", text)
         if self.isolated:
             named |= {name: Output(at, *rest) for name, rest in _ISOLATED.items()}
         return named
@@ -100,7 +101,7 @@ class Peaks(AbstractComputation):
         """See `AbstractComputation.axes`."""
         axes = self.forces.axes()
         if self.grid_points:
-            axes[_GRID] = Axis(self._grid / HERTZ, "Hz", "frequency of the force")
+            axes[GRID] = Axis(self._grid / HERTZ, "Hz", "frequency of the force")
         return axes
 
     def rows(self, members: Members) -> dict[str, np.ndarray]:
@@ -143,14 +144,16 @@ class Peaks(AbstractComputation):
 
 
 class Curves(AbstractComputation):
-    """Whole forced responses, unstable parts included, point by point."""
+    """Whole forced responses, unstable parts included, point by point.
+
+    `forces` in N; None: `force_n` varies.
+    """
 
     kind: ClassVar[str] = "curves"
     members_a_chunk: ClassVar[int] = 64
-    driven: ClassVar[bool] = True
 
     within: ResponseRange
-    forces: OfForces = OfForces()
+    forces: OfForces = eqx.field(default=None, converter=of_forces)
 
     def outputs(self) -> dict[str, Output]:
         """See `AbstractComputation.outputs`."""

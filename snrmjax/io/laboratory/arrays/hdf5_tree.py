@@ -1,4 +1,9 @@
-"""HDF5, netCDF 4 and MATLAB v7.3 as a tree of named arrays, which stay in the file."""
+"""HDF5, netCDF 4 and MATLAB v7.3 as a tree of named arrays, which stay in the file.
+
+Files may be made to burst a reader: a few bytes may state numbers that no memory holds, and links
+may lead in circles or to other files. So sizes are compared with what the file can hold before
+anything is read, and only its own content is followed.
+"""
 
 import os
 from collections.abc import Callable
@@ -7,9 +12,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from snrmjax.io.laboratory.arrays.structs import file_of_tree
 from snrmjax.io.laboratory.arrays.value_tree import Node, Numbers, Selection, held
+from snrmjax.io.laboratory.contents import LaboratoryFile
 from snrmjax.io.laboratory.libraries import damaged_if_it_fails, library
 from snrmjax.io.laboratory.names import role_of
+from snrmjax.numerics.facts import Fact
+
+NETCDF = (".nc", ".nc4", ".cdf")
+"""Endings of HDF5 files that are called netCDF."""
 
 _MOST_OBJECTS = 20_000
 _DEEPEST = 24
@@ -25,41 +36,55 @@ class _Walk(NamedTuple):
     h5py: Any
     path: Path
     size: int
-    notes: list[str]
+    notes: list[Fact]
     seen: list[Any]  # addresses of groups above, against links in a circle
     objects: list[int]
 
+    def leave_out(self, name: str, why: str) -> None:
+        """Note that something is not read."""
+        self.notes.append(Fact("not_read", name=name, why=why))
 
-def open_tree(path: Path) -> tuple[dict[str, Node], list[str]]:
+    def count(self) -> None:
+        """One more object. Raises `ValueError` where that are too many."""
+        self.objects[0] += 1
+        if self.objects[0] > _MOST_OBJECTS:
+            raise ValueError(f"it has more than {_MOST_OBJECTS} objects")
+
+
+def open_tree(path: Path) -> tuple[dict[str, Node], list[Fact]]:
     """The tree of an HDF5 file and what was not read. The file is closed again.
 
     Links to other files, virtual and external data are not followed: a file is read alone.
     Raises `ValueError` for a damaged file and for more than 20 000 objects.
     """
     h5py = library("h5py", "reading HDF5, netCDF and MATLAB v7.3")
-    notes: list[str] = []
+    notes: list[Fact] = []
     walk = _Walk(h5py, path, os.path.getsize(path), notes, [], [0])
     with damaged_if_it_fails(path.name, "an HDF5 file"), h5py.File(path, "r") as file:
         return _group(walk, file), notes
+
+
+def read_hdf5(path: Path) -> LaboratoryFile:
+    """An HDF5 or netCDF 4 file. Raises `ValueError` as `read_laboratory_file` does."""
+    netcdf = path.suffix.lower() in NETCDF
+    return file_of_tree(path.name, "netcdf" if netcdf else "hdf5", *open_tree(path))
 
 
 def _group(walk: _Walk, group: Any) -> dict[str, Node]:
     """A group as a struct. Its attributes that state a rate are numbers of it."""
     address = walk.h5py.h5o.get_info(group.id).addr
     if address in walk.seen or len(walk.seen) > _DEEPEST:
-        walk.notes.append(f"{group.name} links in a circle or nests too deeply and is not read.")
+        walk.leave_out(group.name, "circle")
         return {}
     walk.seen.append(address)
     fields: dict[str, Node] = dict(_rates(group))
     for name in group:
         if name in _HIDDEN:
             continue
-        walk.objects[0] += 1
-        if walk.objects[0] > _MOST_OBJECTS:
-            raise ValueError(f"it has more than {_MOST_OBJECTS} objects")
+        walk.count()
         link = group.get(name, getlink=True)
         if isinstance(link, walk.h5py.ExternalLink):
-            walk.notes.append(f"{name} is a link to another file and is not read.")
+            walk.leave_out(name, "other_file")
             continue
         one = group.get(name)
         node = None if one is None else _object(walk, one, name)
@@ -89,11 +114,7 @@ def _object(walk: _Walk, one: Any, name: str) -> Node | None:
     """A group or data set as a node, or None with a note."""
     kind = _attribute(one, "MATLAB_class")
     if "MATLAB_object_decode" in one.attrs or kind in ("function_handle", "opaque"):
-        walk.notes.append(
-            f"variable {name} is a function handle or an object (string, table, …), which is not "
-            "read: save numbers, text, structs and cells instead."
-        )
-        return None
+        return walk.leave_out(name, "object")
     if isinstance(one, walk.h5py.Group):
         return _structs(_group(walk, one)) if kind == "struct" else _group(walk, one)
     if not isinstance(one, walk.h5py.Dataset) or "MATLAB_empty" in one.attrs:
@@ -105,13 +126,11 @@ def _object(walk: _Walk, one: Any, name: str) -> Node | None:
         return _references(walk, one, name)
     if walk.h5py.check_string_dtype(one.dtype) is not None or kind == "char":
         if one.size > _LONGEST_TEXT:
-            walk.notes.append(f"{name} has more than {_LONGEST_TEXT} texts and is not read.")
-            return None
+            return walk.leave_out(name, "too_many_texts")
         return _text(one, is_matlab=kind == "char")
     why = _cannot_hold(walk, one)
     if why:
-        walk.notes.append(f"{name} {why} and is not read.")
-        return None
+        return walk.leave_out(name, why)
     if one.dtype.names and set(one.dtype.names) not in ({"real", "imag"}, {"r", "i"}):
         return {
             field: _numbers(walk, one, field=field)
@@ -119,8 +138,7 @@ def _object(walk: _Walk, one: Any, name: str) -> Node | None:
             if one.dtype[field].kind in "biuf" and one.ndim == 1
         }
     if one.dtype.names is None and one.dtype.kind not in "biufc":
-        walk.notes.append(f"{name} is of type {one.dtype} and is not read.")
-        return None
+        return walk.leave_out(name, "type")
     return _numbers(walk, one, transposed=bool(kind)) if one.size else None
 
 
@@ -146,9 +164,7 @@ def _references(walk: _Walk, one: Any, name: str) -> Node | None:
     for row in np.atleast_2d(one[()]).T:
         line: list[Node] = []
         for reference in row:
-            walk.objects[0] += 1
-            if walk.objects[0] > _MOST_OBJECTS:
-                raise ValueError(f"it has more than {_MOST_OBJECTS} objects")
+            walk.count()
             inner = one.file[reference] if reference else None
             node = None if inner is None else _object(walk, inner, name)
             if node is not None:
@@ -176,17 +192,14 @@ def _text(one: Any, *, is_matlab: bool) -> Node:
 def _cannot_hold(walk: _Walk, one: Any) -> str:
     """Why the numbers of a data set cannot be in this file, or nothing."""
     if one.is_virtual or one.external:
-        return "lies in other files"
+        return "elsewhere"
     stored, wanted = one.id.get_storage_size(), one.size * one.dtype.itemsize
     if one.size and not stored:
-        return "was declared but never written"
-    if stored > walk.size:
-        return f"states {stored} bytes in a file of {walk.size}"
-    if wanted > (_INFLATES * stored if one.chunks else stored):
-        return f"states {one.size} numbers, which the file cannot hold,"
-    if one.chunks and int(np.prod(one.chunks, dtype=object)) * one.dtype.itemsize > _LARGEST_CHUNK:
-        return f"is stored in pieces of more than {_LARGEST_CHUNK // 2**20} MiB"
-    return ""
+        return "never_written"
+    if stored > walk.size or wanted > (_INFLATES * stored if one.chunks else stored):
+        return "larger_than_file"
+    pieces = int(np.prod(one.chunks, dtype=object)) if one.chunks else 0
+    return "large_pieces" if pieces * one.dtype.itemsize > _LARGEST_CHUNK else ""
 
 
 def _numbers(walk: _Walk, one: Any, *, transposed: bool = False, field: str = "") -> Numbers:

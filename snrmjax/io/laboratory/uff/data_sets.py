@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from snrmjax.io.laboratory.libraries import damaged_if_it_fails, library
+from snrmjax.numerics.facts import Fact
 
 _LARGEST = 2**29  # bytes: pyuff holds all of a file, and each number as an object for a while
 _READ = {58: "function", 151: "header", 164: "units"}
@@ -32,7 +33,7 @@ class DataSets(NamedTuple):
     """Data sets of a universal file in order, as pyuff's dictionaries, and what was not read."""
 
     sets: tuple[Mapping[str, Any], ...]
-    notes: tuple[str, ...]
+    notes: tuple[Fact, ...]
 
     def of_type(self, number: int) -> tuple[Mapping[str, Any], ...]:
         """Those of one type."""
@@ -83,16 +84,11 @@ def read_data_sets(path: Path) -> DataSets:
         if number == 58:
             one = _with_letters(_checked_function(one, file, k + 1), heads[k])
         found.append(one)
-    notes = tuple(
-        f"{count} data set{'s' * (count > 1)} of type {number}{_meaning(number)} not read."
+    notes = [
+        Fact("data_sets_not_read", n=count, type=number, meaning=_OTHERS.get(number, ""))
         for number, count in sorted(left_out.items())
-    )
-    return DataSets(tuple(found), notes)
-
-
-def _meaning(number: int) -> str:
-    """What a type of data set holds, in brackets."""
-    return f" ({_OTHERS[number]})" if number in _OTHERS else ""
+    ]
+    return DataSets(tuple(found), tuple(notes))
 
 
 def direction_of(code: int) -> str:
