@@ -38,10 +38,10 @@ def bootstrap(
                 mine = np.flatnonzero(level == number)
                 np.add.at(row, rng.choice(mine, size=mine.size), 1.0)
     weights = weights * np.asarray(fit.data.weight)
-    refit, own = _refit_of(fit)
+    refit, places = _refit_of(fit)
     room = len(refit.problem.data.level)
-    every = np.stack([filled(row, room, 0.0) for row in weights])
-    return np.asarray(_resampled(refit, jnp.asarray(every)))[:, own]
+    padded_weights = np.stack([filled(row, room, 0.0) for row in weights])
+    return np.asarray(_resampled(refit, jnp.asarray(padded_weights)))[:, places]
 
 
 class _Refit(eqx.Module):
@@ -55,14 +55,14 @@ class _Refit(eqx.Module):
     def solved(self, residuals: Callable[[Array], Array], start: Array) -> Float[Array, " entry"]:
         """The unknowns that make residuals least, from a start on; NaN if none are found."""
         unit = jnp.where(self.std > 0, self.std, 1.0)
-        found: optx.Solution = optx.least_squares(
+        solution: optx.Solution = optx.least_squares(
             lambda y, _: residuals(self.vector + y * unit),
             *(SOLVER, (start - self.vector) / unit),
             max_steps=_MOST_STEPS,
             throw=False,
         )
-        good = found.result == optx.RESULTS.successful
-        return jnp.where(good, self.vector + found.value * unit, jnp.nan)
+        good = solution.result == optx.RESULTS.successful
+        return jnp.where(good, self.vector + solution.value * unit, jnp.nan)
 
 
 def _refit_of(fit: JointFit) -> tuple[_Refit, Int[np.ndarray, " unknown"]]:

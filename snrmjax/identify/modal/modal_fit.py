@@ -54,7 +54,7 @@ class AbstractModalFit(AbstractResult):
     @property
     def sensor_names(self) -> tuple[str, ...]:
         """Names of the responses in order."""
-        return tuple(one.name for one in self.sensors)
+        return tuple(sensor.name for sensor in self.sensors)
 
     @property
     def natural_frequency_std(self) -> Float[np.ndarray, " mode"]:
@@ -114,9 +114,9 @@ def phase_collinearity(
     """
     a, b = shape.real, shape.imag
     xx, yy, xy = np.sum(a * a, axis=0), np.sum(b * b, axis=0), np.sum(a * b, axis=0)
-    found = ((xx - yy) ** 2 + 4 * xy**2) / np.maximum(xx + yy, 1e-300) ** 2
+    collinearity = ((xx - yy) ** 2 + 4 * xy**2) / np.maximum(xx + yy, 1e-300) ** 2
     angle = 0.5 * np.arctan2(2 * xy, xx - yy)
-    return found if len(shape) > 1 else np.full(shape.shape[1], np.nan), angle
+    return collinearity if len(shape) > 1 else np.full(shape.shape[1], np.nan), angle
 
 
 class LinearModalFit(AbstractModalFit):
