@@ -16,7 +16,7 @@ from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.least_squares import inverse_of
 from snrmjax.numerics.levenberg_marquardt import MinimisationStatus, StepRule, minimise
-from snrmjax.numerics.result import Variable
+from snrmjax.numerics.result import Variable, quantity
 from snrmjax.simulate.balance.labelled import HERTZ
 from snrmjax.simulate.solutions.mode_at_velocities import normal_mode_at_velocities
 
@@ -45,24 +45,28 @@ class BackboneCalibration(AbstractCalibration):
     """
 
     measured: MeasuredBackbone
-    fitted: Float[np.ndarray, " point"]  # rad/s, at the measured velocities
-    fitted_std: Float[np.ndarray, " point"]  # rad/s
-    residuals: Float[np.ndarray, " point"]
+    # At the measured velocities.
+    fitted: Float[np.ndarray, " point"] = quantity(
+        "point", "Hz", "fitted", name="fitted_frequency_hz"
+    )
+    fitted_std: Float[np.ndarray, " point"] = quantity(
+        "point", "Hz", "its 1σ", name="fitted_frequency_std_hz"
+    )
+    residuals: Float[np.ndarray, " point"] = quantity(
+        "point", "1", "residual in units of 1σ", name="residual"
+    )
 
     def data_in_words(self) -> str:
         """See `AbstractCalibration`."""
         return f"{len(self.fitted)} points of a backbone"
 
     def variables(self) -> dict[str, Variable]:
-        """The parameters, and the backbone, measured and fitted."""
-        at, measured = ("point",), self.measured.frequency / HERTZ
+        """Those of the fields, with the measured backbone."""
+        point, hertz = ("point",), self.measured.frequency / HERTZ
         return {
             **super().variables(),
-            "velocity_m_s": Variable(at, self.measured.velocity, "m/s", "velocity amplitude"),
-            "natural_frequency_hz": Variable(at, measured, "Hz", "measured natural frequency"),
-            "fitted_frequency_hz": Variable(at, self.fitted / HERTZ, "Hz", "fitted"),
-            "fitted_frequency_std_hz": Variable(at, self.fitted_std / HERTZ, "Hz", "its 1σ"),
-            "residual": Variable(at, self.residuals, "1", "residual in units of 1σ"),
+            "velocity_m_s": Variable(point, self.measured.velocity, "m/s", "velocity amplitude"),
+            "natural_frequency_hz": Variable(point, hertz, "Hz", "measured natural frequency"),
         }
 
 

@@ -22,7 +22,7 @@ from snrmjax.identify.joint.force_balance import (
 from snrmjax.identify.joint.notes import NoiseEstimate
 from snrmjax.identify.test_model.curve_basis import MOST_KNOTS
 from snrmjax.identify.test_model.hyper import MASS, OFFSET, PHASE
-from snrmjax.identify.test_model.posterior import TestPosterior, few_levels_factor, fit_test
+from snrmjax.identify.test_model.posterior import TestPosterior, fit_test, students_factor
 from snrmjax.identify.test_model.priors import OFF_RESONANCE
 from snrmjax.identify.test_model.states import TestStates
 from snrmjax.identify.test_model.walk import Rounds
@@ -103,7 +103,7 @@ def view_of(
         size * posterior.states.errors,
         posterior.corrections,
     )
-    unstated = few_levels_factor(posterior.states.n_levels) * noise.level_std
+    unstated = students_factor(posterior.states.n_levels - 1) * noise.level_std
     level = np.where(np.asarray(problem.prior.level) > 0, problem.prior.level, unstated)
     problem = dataclasses.replace(
         problem.with_data(

@@ -23,7 +23,7 @@ from snrmjax.identify.modal.separable_fit import (
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.numerics.facts import Fact
-from snrmjax.numerics.result import Variable
+from snrmjax.numerics.result import quantity
 from snrmjax.numerics.units import HERTZ
 
 _MOTIONS = ("displacement", "velocity", "acceleration")
@@ -53,8 +53,10 @@ class DecayModes(AbstractModalFit):
     the first decay; shapes are its ratios.
     """
 
-    shape: Float[np.ndarray, "sensor mode"]  # one at the largest sensor
-    shape_std: Float[np.ndarray, "sensor mode"]
+    shape: Float[np.ndarray, "sensor mode"] = quantity(
+        "sensor mode", "1", "shape, one at its largest sensor"
+    )
+    shape_std: Float[np.ndarray, "sensor mode"] = quantity("sensor mode", "1", "its 1σ")
     amplitude: Complex[np.ndarray, "sensor mode"]
     curves: DecayCurves
 
@@ -62,15 +64,6 @@ class DecayModes(AbstractModalFit):
         """See `AbstractModalFit`."""
         duration = self.curves.time[-1] - self.curves.time[0]
         return f"at {', '.join(self.sensor_names)} from {duration:.4g} s"
-
-    def variables(self) -> dict[str, Variable]:
-        """See `AbstractResult`."""
-        both = ("sensor", "mode")
-        return {
-            **super().variables(),
-            "shape": Variable(both, self.shape, "1", "shape, one at its largest sensor"),
-            "shape_std": Variable(both, self.shape_std, "1", "its 1σ"),
-        }
 
 
 def fit_free_decay(

@@ -224,15 +224,9 @@ def fit_test(
     )
 
 
-def few_levels_factor(n_levels: int) -> float:
-    """By how much a 95 % band is wider whose 1σ had to be found from so few levels.
-
-    Student's t over the normal. Two levels count as three: with t of one degree no band would be of
-    use.
-    """
-    return students_factor(n_levels - 1)
-
-
 def students_factor(freedom: float) -> float:
-    """By how much a 95 % band is wider whose 1σ was found with so many degrees of freedom."""
+    """By how much a 95 % band is wider whose 1σ was found with so many degrees of freedom.
+
+    Student's t over the normal. One counts as two: with t of one no band would be of use.
+    """
     return float(stdtrit(max(freedom, 2), 0.975) / ndtri(0.975))
