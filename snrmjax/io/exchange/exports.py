@@ -28,10 +28,10 @@ def write_netcdf(path: FilePath, record: TimeRecording) -> None:
     width = len(record.channels)
     words = {
         "channels": record.channel_names,
-        "quantity": [one.quantity for one in record.channels],
-        "unit": [one.si_unit for one in record.channels],
-        "point": [one.point for one in record.channels],
-        "direction": [one.direction for one in record.channels],
+        "quantity": [channel.quantity for channel in record.channels],
+        "unit": [channel.si_unit for channel in record.channels],
+        "point": [channel.point for channel in record.channels],
+        "direction": [channel.direction for channel in record.channels],
     }
     numbers = {"sampling_rate_hz": record.sampling_rate, "start_time_s": record.start_time}
     with written_whole(path) as new, h5netcdf.File(new, "w") as target:
@@ -65,7 +65,9 @@ def write_import(folder: Path, found: Imported, files: Sequence[str] = ()) -> li
             write_netcdf(folder / f"{stem}.nc", record)
             written.append(f"{stem}.nc")
             continue
-        values = np.vstack([record.time(), record.values([one.name for one in columns.values()])])
+        values = np.vstack(
+            [record.time(), record.values([channel.name for channel in columns.values()])]
+        )
         lines = [",".join(("time_s", *columns))]
         lines += [",".join(map(repr, row)) for row in values.T.tolist()]
         write_atomically(folder / f"{stem}.csv", "\n".join(lines) + "\n")

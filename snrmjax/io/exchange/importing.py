@@ -72,10 +72,9 @@ def import_files(paths: Sequence[Path], mapping: ImportMap) -> Imported:
     if mapping.dataset == "" and len(datasets) == 1:
         mapping = mapping._replace(dataset=datasets[0].name)
     file = datasets[0].file
-    records = [
-        (one.content, one.file) for one in datasets if isinstance(one.content, TimeRecording)
-    ]
-    tables = [(one.content, one.file) for one in datasets if isinstance(one.content, NumberTable)]
+    contents = [(dataset.content, dataset.file) for dataset in datasets]
+    records = [(content, name) for content, name in contents if isinstance(content, TimeRecording)]
+    tables = [(content, name) for content, name in contents if isinstance(content, NumberTable)]
     if records:
         return _records(records, mapping, assumed, notes)
     own = [(table, name) for table, name in tables if is_ours(table.columns)]
@@ -84,9 +83,9 @@ def import_files(paths: Sequence[Path], mapping: ImportMap) -> Imported:
         notes.append(restated_how(mapping))
         return Imported(join_steady_states(parts), (), mapping, assumed, tuple(notes))
     imported = [import_table(table, mapping, name, assumed) for table, name in tables] or [
-        import_responses(one.content, one.z, mapping, one.file, assumed)
-        for one in datasets
-        if isinstance(one.content, tuple)
+        import_responses(content, z, mapping, name, assumed)
+        for _, name, content, z in datasets
+        if not isinstance(content, TimeRecording | NumberTable)
     ]
     used, force = imported[-1][1:3]
     measured = [part for part, *_ in imported]
