@@ -101,8 +101,11 @@ def _value_and_slope(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     Terms have no derivative: they are chosen, not fitted.
     """
     by_x, by_parameters, _ = tangents
-    drawn = _drawn(*primals, jnp)
-    return _value(*primals), drawn.by_amplitude * by_x + drawn.by_parameters @ by_parameters
+    x, parameters, terms = primals
+    drawn = _drawn(x, parameters, terms, jnp)
+    return _value(
+        x, parameters, terms
+    ), drawn.by_amplitude * by_x + drawn.by_parameters @ by_parameters
 
 
 def hats(u: Any, knots: Any, xp: Any) -> tuple[Any, Any]:
@@ -165,7 +168,7 @@ class PackedCurve(AbstractCurve):
 
     def prior_residuals(self) -> Float[Array, " row"]:
         """What is expected to be near zero of a curve, in its own 1σ."""
-        return self.made_of.prior @ self.parameters
+        return jnp.asarray(self.made_of.prior @ self.parameters)
 
 
 class AbstractFamily(AbstractCurve):
@@ -216,7 +219,7 @@ class AbstractFamily(AbstractCurve):
 
     def prior_residuals(self) -> Float[Array, " row"]:
         """What is expected to be near zero of a curve, in its own 1σ."""
-        return self.terms().prior @ self.parameters
+        return jnp.asarray(self.terms().prior @ self.parameters)
 
     @property
     def label(self) -> str:

@@ -30,8 +30,7 @@ from snrmjax.identify.prediction.resonance_distribution import (
 )
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import quantity
-
-_HERTZ = 2 * np.pi  # rad/s
+from snrmjax.numerics.units import HERTZ
 
 
 class FittedResponse(PredictedResponse):
@@ -51,12 +50,12 @@ class FittedResponse(PredictedResponse):
 
     def summary(self) -> tuple[str, ...]:
         """See `AbstractResult`."""
-        hertz, size = self.frequency / _HERTZ, np.abs(self.velocity)
+        hertz, size = self.frequency / HERTZ, np.abs(self.velocity)
         return (
             f"FittedResponse to {self.force:.4g} N: {len(hertz)} points from {hertz.min():.6g} to "
             f"{hertz.max():.6g} Hz, up to {size.max():.4g} m/s",
             *(
-                f"{one.kind} at {one.frequency / _HERTZ:.6g} ± {one.frequency_std / _HERTZ:.2g} Hz"
+                f"{one.kind} at {one.frequency / HERTZ:.6g} ± {one.frequency_std / HERTZ:.2g} Hz"
                 f", {one.velocity:.4g} ± {one.velocity_std:.2g} m/s"
                 for one in (*self.resonances, *self.folds)
             ),
@@ -139,7 +138,7 @@ def fitted_response(
 
 
 def _notes_on(missing: tuple[FittedPoint, ...], force: float) -> tuple[Fact, ...]:
-    points = tuple((one.kind, float(one.frequency) / _HERTZ) for one in missing)
+    points = tuple((one.kind, float(one.frequency) / HERTZ) for one in missing)
     return (Fact("points_not_located", points=points, force=force),) if points else ()
 
 

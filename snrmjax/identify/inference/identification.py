@@ -31,8 +31,8 @@ from snrmjax.model.structures import Structure, modes_of
 from snrmjax.numerics.blocks import on_one_core
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.units import HERTZ
 
-_HERTZ = 2 * np.pi
 _FEWEST = 2  # points, of which a curve can be told
 _SHAPE_MISSED = 0.1  # share of a motion that is not the mode's shape and worth a note
 _EXPLAINED, _WORTH = 0.3, 0.1  # by the phase: share of the damping's variance, and its change
@@ -71,7 +71,7 @@ class Identification(AbstractResult):
         scale = f"{noise.scale:.3g} times the stated noise"
         if not noise.stated:
             scale = f"{100 * noise.scale:.3g} % of the measured phasor (1σ)"
-        hertz, ratio = np.asarray(ends.natural_frequency) / _HERTZ, np.asarray(ends.damping_ratio)
+        hertz, ratio = np.asarray(ends.natural_frequency) / HERTZ, np.asarray(ends.damping_ratio)
         speed = np.asarray(ends.velocity)
         status, counts = np.unique(np.asarray(points.status), return_counts=True)
         outcomes = (PointStatus(int(kind)).message for kind in status)
@@ -83,7 +83,7 @@ class Identification(AbstractResult):
             f"damping ratio {100 * np.nanmin(ratio):.4g} to {100 * np.nanmax(ratio):.4g} %",
             f"velocity {np.nanmin(speed):.4g} to {np.nanmax(speed):.4g} m/s",
             f"scatter of states about the curves: {scale}",
-            f"level to level: {self.level_frequency_std / _HERTZ:.2g} Hz and "
+            f"level to level: {self.level_frequency_std / HERTZ:.2g} Hz and "
             f"{100 * self.level_damping_std:.2g} % of critical damping (1σ)",
             *(f"note: {note}" for note in self.notes),
         )
@@ -102,7 +102,7 @@ class Identification(AbstractResult):
         return {
             **self.backbone.attributes(),
             "noise_stated": int(self.fit.noise.stated),
-            "level_frequency_std_hz": self.level_frequency_std / _HERTZ,
+            "level_frequency_std_hz": self.level_frequency_std / HERTZ,
             "level_damping_ratio_std": self.level_damping_std,
             "notes": "\n".join(map(str, self.notes)),
         }

@@ -29,11 +29,11 @@ from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import Variable, setting
 from snrmjax.numerics.status import Status
+from snrmjax.numerics.units import HERTZ
 
 Target = Literal["curves", "frequency", "damping"]
 
 _CURVES = ("natural frequency", "damping")
-_HERTZ = 2 * np.pi  # rad/s
 _SHOWN = 12  # advised states on one screen
 _PER_FORCE = 96  # candidate states of one force
 _TARGETS = 25  # amplitudes at which the band of a curve counts
@@ -81,7 +81,7 @@ class NextMeasurements(AbstractTable[NextMeasurement]):
         "rank": (lambda row: row.rank, "1", "rank, the best first"),
         "force_n": (lambda row: row.force, "N", "force"),
         "drive_v": (lambda row: row.drive, "V", "drive voltage"),
-        "frequency_hz": (lambda row: row.frequency / _HERTZ, "Hz", "frequency"),
+        "frequency_hz": (lambda row: row.frequency / HERTZ, "Hz", "frequency"),
         "velocity_m_s": (lambda row: row.velocity, "m/s", "expected velocity"),
         "phase_deg": (lambda row: np.degrees(row.phase), "deg", "phase"),
         "expected_band_ratio": (
@@ -108,7 +108,7 @@ class NextMeasurements(AbstractTable[NextMeasurement]):
         lines = [f"NextMeasurements: {len(self)} states that narrow the band of {self.target} most"]
         for one in self.rows[:_SHOWN]:
             load = f"force {one.force:.4g} N" if one.drive is None else f"drive {one.drive:.4g} V"
-            place = f"{load}, {one.frequency / _HERTZ:.6g} Hz (expected {one.expected})"
+            place = f"{load}, {one.frequency / HERTZ:.6g} Hz (expected {one.expected})"
             lines.append(f"{one.rank}: {place}: {one.reason}")
         if len(self) > _SHOWN:
             lines.append(f"and {len(self) - _SHOWN} more")

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
-from snrmjax.identify.curves.family_base import AbstractCurve, AbstractFamily
+from snrmjax.identify.curves.family_base import AbstractFamily, PackedCurve
 from snrmjax.identify.pointwise.backbone_points import modal_filter, off_resonance_error_factor
 from snrmjax.identify.pointwise.snrm import reference_sensor
 from snrmjax.identify.test_model.priors import FORCE_TO_VELOCITY
@@ -213,7 +213,7 @@ class Motion(eqx.Module):
     displacement: Float[Array, " state"]  # m
     force: Float[Array, " state"]  # N
 
-    def amplitude(self, curve: AbstractCurve) -> Float[Array, " state"]:
+    def amplitude(self, curve: AbstractFamily | PackedCurve) -> Float[Array, " state"]:
         """The amplitude that a curve is a function of."""
         return curve.amplitude(self.displacement, jnp.abs(self.velocity))
 

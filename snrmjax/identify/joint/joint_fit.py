@@ -58,8 +58,8 @@ from snrmjax.model.structures import Structure, modes_of
 from snrmjax.numerics.blocks import on_one_core
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.units import HERTZ
 
-_HERTZ = 2 * np.pi  # rad/s
 _MOVED = 2.0  # standard deviations of a level's error, from which on the fit says so
 
 
@@ -188,7 +188,7 @@ class JointFit(AbstractResult):
             f"JointFit: natural frequency: {squared.words}; damping: {damping.words}",
             f"{len(self.data.level)} steady states of {self.data.n_levels} levels at "
             f"{self.modes.sensors[self.data.sensor]!r}, {size.min():.3g} to {size.max():.3g} m/s",
-            f"natural frequency {omega.min() / _HERTZ:.6g} to {omega.max() / _HERTZ:.6g} Hz, "
+            f"natural frequency {omega.min() / HERTZ:.6g} to {omega.max() / HERTZ:.6g} Hz, "
             f"damping ratio {100 * ratio.min():.3g} to {100 * ratio.max():.3g} %",
             f"residuals: {noise}",
             f"status: {self.status.message}",
@@ -207,7 +207,7 @@ class JointFit(AbstractResult):
             "std": Variable(per, std, "", "1σ, in `unit`"),
             "unit": Variable(per, np.array(self.units()), "", "unit of the parameter"),
             "level": Variable(state, numbers[np.asarray(data.level)], "1", "level"),
-            "frequency_hz": Variable(state, np.asarray(data.frequency) / _HERTZ, "Hz", "frequency"),
+            "frequency_hz": Variable(state, np.asarray(data.frequency) / HERTZ, "Hz", "frequency"),
             "drive_v" if force == "V" else "force_n": Variable(state, measured, force, "force"),
             "velocity_m_s": Variable(
                 state, np.abs(np.asarray(self.motion().velocity)), "m/s", "velocity of the mode"

@@ -24,8 +24,8 @@ from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import Variable
+from snrmjax.numerics.units import HERTZ
 
-_HERTZ = 2 * np.pi
 _MOTIONS = ("displacement", "velocity", "acceleration")
 _HIGHEST = 30  # half the model order
 _MOST_ROWS, _MOST_COLUMNS = 240, 3000  # of a Hankel matrix
@@ -104,7 +104,7 @@ def fit_free_decay(
     length = min(part.shape[1] for part in parts)
     values = np.concatenate([part[:, :length] for part in parts])
     if to_frequency is not None:
-        step = max(1, int(rate / (_SAMPLES_PER_CYCLE * to_frequency / _HERTZ)))
+        step = max(1, int(rate / (_SAMPLES_PER_CYCLE * to_frequency / HERTZ)))
         for factor in _factors(step):
             values = decimate(values, factor, axis=1, zero_phase=True)
             rate /= factor
@@ -209,8 +209,8 @@ def _start(
         damped = orders.pole[(orders.pole.real < 0) & (orders.damping_ratio < 0.25)]
         if not wanted.size or np.any(wanted <= 0) or np.any(wanted >= top) or not damped.size:
             raise ValueError(
-                f"poles must be from 0 to {top / _HERTZ:.6g} Hz, where the decay shows some, but "
-                f"are {', '.join(f'{one / _HERTZ:.6g}' for one in wanted) or 'none'}."
+                f"poles must be from 0 to {top / HERTZ:.6g} Hz, where the decay shows some, but "
+                f"are {', '.join(f'{one / HERTZ:.6g}' for one in wanted) or 'none'}."
             )
         return np.array([damped[np.argmin(np.abs(np.abs(damped) - one))] for one in wanted])
     found = clusters(orders, (0.0, top))
@@ -307,7 +307,7 @@ def _result(
     shape_std[top, np.arange(n)] = 0.0
     collinearity, _ = phase_collinearity(ratio)
     notes = [
-        Fact("complex_mode", mode=k + 1, frequency_hz=float(omega) / _HERTZ, collinearity=value)
+        Fact("complex_mode", mode=k + 1, frequency_hz=float(omega) / HERTZ, collinearity=value)
         for k, (omega, value) in enumerate(
             zip(unknowns[:n][rank], collinearity.tolist(), strict=True)
         )

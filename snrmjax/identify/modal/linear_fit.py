@@ -33,10 +33,10 @@ from snrmjax.identify.modal.separable_fit import (
     fit_separable,
 )
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
+from snrmjax.numerics.units import HERTZ
 
 ResidualTerms = Literal["auto", "both", "lower", "upper", "none"]
 
-_HERTZ = 2 * np.pi
 _HIGHEST = 40  # order, where there are lines enough
 _LINES_PER_ORDER = 4
 _MOST_DAMPED = 0.9
@@ -195,10 +195,10 @@ def _start(
     damped, growing = found[found.real < 0], found[found.real > 0]
     if damped.size:
         return damped
-    where = f"between {band[0] / _HERTZ:.6g} and {band[1] / _HERTZ:.6g} Hz"
+    where = f"between {band[0] / HERTZ:.6g} and {band[1] / HERTZ:.6g} Hz"
     if growing.size:
         listed = ", ".join(
-            f"{100 * -p.real / abs(p):.3g} % at {abs(p) / _HERTZ:.6g} Hz" for p in growing[:3]
+            f"{100 * -p.real / abs(p):.3g} % at {abs(p) / HERTZ:.6g} Hz" for p in growing[:3]
         )
         raise ValueError(
             f"all modes {where} have negative damping ({listed}): the responses seem to be "
@@ -219,8 +219,8 @@ def _by_hand(
     for omega in np.sort(wanted):
         if not band[0] <= omega <= band[1]:
             raise ValueError(
-                f"a pole must lie in the band, {band[0] / _HERTZ:.6g} to {band[1] / _HERTZ:.6g} "
-                f"Hz, but {omega / _HERTZ:.6g} Hz was given."
+                f"a pole must lie in the band, {band[0] / HERTZ:.6g} to {band[1] / HERTZ:.6g} "
+                f"Hz, but {omega / HERTZ:.6g} Hz was given."
             )
         damped = orders.pole[(orders.pole.real < 0) & (orders.damping_ratio < 0.25)]
         away = np.abs(np.abs(damped) - omega)
@@ -357,13 +357,13 @@ def _check_found(fit: SeparableFit, settings: BasisSettings) -> None:
     if np.all(ratio < 0):
         raise ValueError(
             f"all modes have negative damping ({100 * ratio[0]:.3g} % at "
-            f"{natural[0] / _HERTZ:.6g} Hz): the responses seem to be conjugated (time dependence "
+            f"{natural[0] / HERTZ:.6g} Hz): the responses seem to be conjugated (time dependence "
             "e^(-iΩt)); change the sign of their imaginary parts."
         )
     if np.any(ratio <= 0) or np.any(ratio >= _MOST_DAMPED):
         k = int(np.argmax((ratio <= 0) | (ratio >= _MOST_DAMPED)))
         raise ValueError(
-            f"the mode at {natural[k] / _HERTZ:.6g} Hz has the damping ratio {ratio[k]:.3g}: the "
+            f"the mode at {natural[k] / HERTZ:.6g} Hz has the damping ratio {ratio[k]:.3g}: the "
             "responses do not show such a mode; give other poles or another band."
         )
 

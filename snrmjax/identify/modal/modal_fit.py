@@ -13,8 +13,8 @@ from snrmjax.measure.recordings.channels import Channel
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
 from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.units import HERTZ
 
-_HERTZ = 2 * np.pi
 _WIDE = 1.96  # standard deviations of a 95 % band
 REAL = 0.9
 """Phase collinearity below which a mode is called complex."""
@@ -73,8 +73,8 @@ class AbstractModalFit(AbstractResult):
     def summary(self) -> tuple[str, ...]:
         """See `AbstractResult`; 95 % bands."""
         rows = zip(
-            self.natural_frequency / _HERTZ,
-            _WIDE * self.natural_frequency_std / _HERTZ,
+            self.natural_frequency / HERTZ,
+            _WIDE * self.natural_frequency_std / HERTZ,
             100 * self.damping_ratio,
             _WIDE * 100 * self.damping_ratio_std,
             strict=True,
@@ -92,8 +92,8 @@ class AbstractModalFit(AbstractResult):
     def variables(self) -> dict[str, Variable]:
         """See `AbstractResult`."""
         columns = {
-            "natural_frequency_hz": (self.natural_frequency / _HERTZ, "Hz", "natural frequency"),
-            "natural_frequency_std_hz": (self.natural_frequency_std / _HERTZ, "Hz", "its 1σ"),
+            "natural_frequency_hz": (self.natural_frequency / HERTZ, "Hz", "natural frequency"),
+            "natural_frequency_std_hz": (self.natural_frequency_std / HERTZ, "Hz", "its 1σ"),
             "damping_ratio": (self.damping_ratio, "1", "damping ratio"),
             "damping_ratio_std": (self.damping_ratio_std, "1", "its 1σ"),
             "phase_collinearity": (self.collinearity, "1", "modal phase collinearity"),
@@ -157,7 +157,7 @@ class LinearModalFit(AbstractModalFit):
 
     def source_in_words(self) -> str:
         """See `AbstractModalFit`."""
-        omega = self.curves.omega / _HERTZ
+        omega = self.curves.omega / HERTZ
         return (
             f"at {len(self.sensors)} sensors over {self.reference.name}, {omega[0]:.6g} to "
             f"{omega[-1]:.6g} Hz"

@@ -13,8 +13,8 @@ from snrmjax.identify.modal.modal_fit import REAL, LinearModalFit, phase_colline
 from snrmjax.identify.modal.response_data import ResponseData
 from snrmjax.identify.modal.separable_fit import ChannelRows, SeparableFit, fit_separable
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.units import HERTZ
 
-_HERTZ = 2 * np.pi
 _FEW_LINES = 8.0  # in the half-power band, below which leakage may count
 _BIASED = 0.01  # relative bias of damping that is worth a note
 _TURNED = np.radians(5.0)  # mean phase that is worth a note
@@ -110,7 +110,7 @@ def fit_notes(
     notes = []
     averaged = data.source == "coherence" or data.averages is not None
     few = found.lines_in_band < _FEW_LINES
-    hertz = (found.natural_frequency / _HERTZ).tolist()
+    hertz = (found.natural_frequency / HERTZ).tolist()
     if settings.window_time is None and averaged and few.any():
         bias = np.where(few, leakage_bias(data, settings, fit, found.curves.std)[rank], 0.0)
         for k in np.flatnonzero(np.abs(bias) > _BIASED).tolist():

@@ -11,11 +11,11 @@ from scipy.optimize import minimize
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.units import HERTZ
 
 ErrorSource = Literal["stated", "coherence", "residuals"]
 """Where the weights come from: stated 1σ, coherence, or the residuals themselves."""
 
-_HERTZ = 2 * np.pi
 _FEWEST_LINES = 6
 _POWERS = {"displacement": 0, "velocity": 1, "acceleration": 2}
 _LEAST_MISSING_COHERENCE = 1e-7  # 1 − γ² that a file's rounding leaves
@@ -77,7 +77,7 @@ def response_data(
     high = np.inf if to_frequency is None else to_frequency
     if not low < high:
         raise ValueError(
-            f"the band must rise, but is from {low / _HERTZ:.6g} to {high / _HERTZ:.6g} Hz."
+            f"the band must rise, but is from {low / HERTZ:.6g} to {high / HERTZ:.6g} Hz."
         )
     omega = responses.frequency
     keep = (omega > 0) & (omega >= low * (1 - 1e-12)) & (omega <= high * (1 + 1e-12))
@@ -97,7 +97,7 @@ def response_data(
         k, line = bad[0]
         raise ValueError(
             f"a coherence must be from 0 to 1, but that of {responses.responses[k].name} at "
-            f"{omega[keep][line] / _HERTZ:.6g} Hz is {coherence[k, line]:.6g}."
+            f"{omega[keep][line] / HERTZ:.6g} Hz is {coherence[k, line]:.6g}."
         )
     powers = tuple(_POWERS[one.quantity] for one in responses.responses)
     size = omega[keep] ** np.array(powers)[:, None]
@@ -129,9 +129,9 @@ def joined_responses(parts: Sequence[FrequencyResponses]) -> FrequencyResponses:
         ):
             raise ValueError(
                 f"responses of one test must share their frequencies, but {place} has "
-                f"{len(one.frequency)} lines to {one.frequency[-1] / _HERTZ:.6g} Hz and "
+                f"{len(one.frequency)} lines to {one.frequency[-1] / HERTZ:.6g} Hz and "
                 f"{first.name or 'the first'} {len(first.frequency)} to "
-                f"{first.frequency[-1] / _HERTZ:.6g} Hz."
+                f"{first.frequency[-1] / HERTZ:.6g} Hz."
             )
         if [r.name for r in one.references] != [r.name for r in first.references]:
             raise ValueError(

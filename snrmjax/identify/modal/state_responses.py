@@ -11,8 +11,8 @@ from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses, frequency_responses
 from snrmjax.measure.states import SteadyStates, relative_errors
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.units import HERTZ
 
-_HERTZ = 2 * np.pi
 _CERTAIN = 2.0  # standard errors of a difference between levels
 
 
@@ -107,7 +107,7 @@ def amplitude_dependence(
             allowed = _CERTAIN * float(np.hypot(errors[1][other], errors[0][k]))
             if abs(change) > allowed:
                 added[row, k] = abs(change) * rest
-                at = {"mode": k + 1, "frequency_hz": omega / _HERTZ, "of_damping": row == 1}
+                at = {"mode": k + 1, "frequency_hz": omega / HERTZ, "of_damping": row == 1}
                 sizes = {"change": change, "allowed": allowed, "left": float(added[row, k])}
                 notes.append(Fact("amplitude_dependence", **at, **sizes, velocities=velocities))
     if not notes:

@@ -7,11 +7,11 @@ from jaxtyping import Float
 
 from snrmjax.identify.pointwise.backbone import Backbone
 from snrmjax.measure.states import SteadyStates
+from snrmjax.numerics.units import HERTZ
 
 _SAME_FORCE = 0.05  # relative difference of a level's force from the one that was asked for
 _ONE_BRANCH = np.radians(45.0)  # of phase, that states beside a resonance may be apart
 _STEEPER = 2.0  # times as steep as beside it, from which on tan φ jumps
-_HERTZ = 2 * np.pi
 
 
 class MeasuredResonance(NamedTuple):
@@ -42,7 +42,7 @@ def measured_resonances(data: SteadyStates, sensor: int, sign: float) -> list[Me
         rows = np.sort(tangent)
         if jump_at_resonance(rows, frequency[order]) is not None:
             continue
-        columns = (force, frequency / _HERTZ, np.abs(velocity))
+        columns = (force, frequency / HERTZ, np.abs(velocity))
         at = (float(np.interp(0.0, rows, column[order])) for column in columns)
         found.append(MeasuredResonance(int(number), *at))
     return found

@@ -275,7 +275,7 @@ def _one_curve(
 def _part(curve: PredictedResponse, keep: np.ndarray, backbone: Backbone) -> PredictedResponse:
     """Some points of a curve, and the note on those that extrapolate the backbone."""
     amplitude, continued = curve.amplitude[keep], curve.continued[keep]
-    notes = ()
+    notes: tuple[Fact, ...] = ()
     if continued.any():
         ratio = float(amplitude.max() / float(backbone.largest))
         count = {"n_points": int(continued.sum()), "of": len(continued)}

@@ -9,15 +9,15 @@ from snrmjax.identify.pointwise.backbone import BackboneValues
 from snrmjax.identify.prediction.new_level import LevelTrend
 from snrmjax.identify.prediction.resonance_distribution import ResonanceDistribution
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.units import HERTZ
 
-_HERTZ = 2 * np.pi
 _SURE = 0.975  # probability of a resonance that needs no word
 _WORTH = 0.025  # probability of negative damping that needs one
 
 
 def where_in_words(one: ResonanceDistribution) -> Fact:
     """Whether a further level has the resonance, and its 95 % ranges."""
-    low, high = (one.frequency[[0, -1]] / _HERTZ).tolist()
+    low, high = (one.frequency[[0, -1]] / HERTZ).tolist()
     slow, fast = one.velocity[[0, -1]].tolist()
     return Fact(
         "resonance_of_a_level",
@@ -30,14 +30,14 @@ def where_in_words(one: ResonanceDistribution) -> Fact:
     )
 
 
-def notes_on_resonance(one: ResonanceDistribution, load: str) -> list[Fact]:
+def notes_on_resonance(one: ResonanceDistribution, load: Fact) -> list[Fact]:
     """Which curves were left out."""
     if not one.negative_damping > _WORTH:
         return []
     return [Fact("negative_damping_left_out", load=load, share=one.negative_damping)]
 
 
-def notes_on_trends(trends: Sequence[LevelTrend], load: str) -> list[Fact]:
+def notes_on_trends(trends: Sequence[LevelTrend], load: Fact) -> list[Fact]:
     """Which errors of levels change steadily with their force, and what that comes to."""
     return [
         Fact(

@@ -9,8 +9,8 @@ from jaxtyping import Float
 from snrmjax.model.modes import LinearModes, LinearModesStd, RigidBodyModes, linear_modes
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.units import HERTZ
 
-_HERTZ = 2 * np.pi
 _WIDE = 1.96  # standard deviations of a 95 % band
 
 
@@ -84,8 +84,8 @@ class ScaledModes(AbstractResult):
         for k in range(self.n_modes):
             top = int(np.argmax(np.abs(self.shape[:, k])))
             lines.append(
-                f"mode {k + 1}: {self.natural_frequency[k] / _HERTZ:.7g} ± "
-                f"{_WIDE * self.natural_frequency_std[k] / _HERTZ:.2g} Hz, damping "
+                f"mode {k + 1}: {self.natural_frequency[k] / HERTZ:.7g} ± "
+                f"{_WIDE * self.natural_frequency_std[k] / HERTZ:.2g} Hz, damping "
                 f"{100 * self.damping_ratio[k]:.4g} ± "
                 f"{_WIDE * 100 * self.damping_ratio_std[k]:.2g} %, shape "
                 f"{self.shape[top, k]:.5g} at {self.sensors[top]}, participation "
@@ -101,10 +101,10 @@ class ScaledModes(AbstractResult):
             "mode": Variable(mode, np.arange(1, self.n_modes + 1), "1", "mode"),
             "sensor": Variable(("sensor",), np.array(self.sensors), "", "sensor"),
             "natural_frequency_hz": Variable(
-                mode, self.natural_frequency / _HERTZ, "Hz", "natural frequency"
+                mode, self.natural_frequency / HERTZ, "Hz", "natural frequency"
             ),
             "natural_frequency_std_hz": Variable(
-                mode, self.natural_frequency_std / _HERTZ, "Hz", "its 1σ"
+                mode, self.natural_frequency_std / HERTZ, "Hz", "its 1σ"
             ),
             "damping_ratio": Variable(mode, self.damping_ratio, "1", "damping ratio"),
             "damping_ratio_std": Variable(mode, self.damping_ratio_std, "1", "its 1σ"),

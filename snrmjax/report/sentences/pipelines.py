@@ -23,6 +23,10 @@ def _equilibria(sensor: str, displacement: tuple[float, ...], stable: tuple[bool
     )
 
 
+def _load(force: float, drive: float | None) -> str:
+    return f"{force:g} N" if drive is None else f"{drive:.5g} V ({force:.4g} N)"
+
+
 def _load_scale(stated: float, coefficient: str, change: float, chosen: float) -> str:
     return (
         f"with `load_scale` = {stated:g} thicknesses the coefficient {coefficient} differs by "
@@ -32,6 +36,7 @@ def _load_scale(stated: float, coefficient: str, change: float, chosen: float) -
 
 
 SENTENCES: dict[str, Wording] = {
+    "load": _load,
     "level_missed_by_curves": (
         "level {level} has its resonance under {force:.4g} N, measured at {frequency_hz:.5g} Hz, "
         "{velocity:.3g} m/s: the curves miss this level."
