@@ -95,12 +95,12 @@ class Assumptions(dict[str, Assumption]):
         """Record an assumption."""
         self[key] = Assumption(why, value)
 
-    def unit(self, key: str, told: str, file_unit: str) -> None:
+    def unit(self, key: str, stated: str, file_unit: str) -> None:
         """Record where a unit comes from: the map wins over the file."""
-        if not told and file_unit:
+        if not stated and file_unit:
             self.add(key, Fact("unit_of_file"), file_unit)
-        elif told and file_unit and told != file_unit:
-            self.add(key, Fact("unit_stated_over_file", unit=file_unit), told)
+        elif stated and file_unit and stated != file_unit:
+            self.add(key, Fact("unit_stated_over_file", unit=file_unit), stated)
 
 
 class ResponseMap(NamedTuple):
@@ -230,7 +230,7 @@ def _option(key: str) -> str:
 def _stated_amplitudes(words: Sequence[str]) -> tuple[str, ...]:
     if list(words) == ["z"]:
         return ("z",)
-    found = []
+    amplitudes = []
     for word in words:
         try:
             number = float(word)
@@ -241,8 +241,8 @@ def _stated_amplitudes(words: Sequence[str]) -> tuple[str, ...]:
                 f"--force-amplitude must be a positive number in N, or z alone, but is "
                 f"{shown(word)}."
             )
-        found.append(repr(number))
-    return tuple(found)
+        amplitudes.append(repr(number))
+    return tuple(amplitudes)
 
 
 def read_import_map(path: FilePath) -> ImportMap:
@@ -250,14 +250,14 @@ def read_import_map(path: FilePath) -> ImportMap:
     file = file_name(path)
     table = parsed_toml(read_text(path), file)
     table.check_keys((), (*KEYS, "response", "steps"))
-    found = {key: _value(table, key) for key in KEYS if key in table.entries}
+    values = {key: _value(table, key) for key in KEYS if key in table.entries}
     responses = []
     for response in table.tables("response", file):
         response.check_keys(("channel",), ResponseMap._fields[1:])
         if "quantity" in response.entries:
             response.choice("quantity", ("", *_MOTIONS))
         responses.append(ResponseMap(**{key: response.text(key) for key in response.entries}))
-    return ImportMap(tuple(responses), **found)
+    return ImportMap(tuple(responses), **values)
 
 
 def _value(table: TomlTable, key: str) -> Any:

@@ -69,8 +69,8 @@ def _columns(table: NumberTable) -> list[str]:
         size = np.abs(table.columns[force])
         if np.all(size > 0) and np.isfinite(size).all():
             number, rule = number_levels("auto", size, None, np.real(table.columns[frequency]))
-            found = Fact("levels_counted", n=len(np.unique(number)), by=rule)
-            lines.append(f"    found: {found}")
+            fact = Fact("levels_counted", n=len(np.unique(number)), by=rule)
+            lines.append(f"    found: {fact}")
     lines += [
         f"    {name}: text, {', '.join(list(dict.fromkeys(words))[:4])}"
         for name, words in table.words.items()
@@ -137,8 +137,8 @@ def _channels_of_import(
     known = sorted(candidates, key=lambda candidate: not candidate.unit)
 
     def likeliest(*kinds: str) -> _Candidate:
-        found = (candidate for kind in kinds for candidate in known if candidate.kind == kind)
-        return next(found, _Candidate("CHANNEL", "", ""))
+        matching = (candidate for kind in kinds for candidate in known if candidate.kind == kind)
+        return next(matching, _Candidate("CHANNEL", "", ""))
 
     if ratios:
         known_level = levels and np.isfinite(levels[0]) and levels[0] > 0

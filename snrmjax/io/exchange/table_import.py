@@ -130,14 +130,14 @@ def import_table(
 
 def _frequency_column(source: _Source) -> str:
     """The only column that is a frequency by its name."""
-    found = source.with_role("frequency")
-    if len(found) != 1:
+    columns = source.with_role("frequency")
+    if len(columns) != 1:
         raise ValueError(
             f"which column of {source.file} is the frequency? --frequency names it, of "
-            f"{', '.join(found) or source.listed}."
+            f"{', '.join(columns) or source.listed}."
         )
     source.assumed.add("frequency", Fact("column_by_name"))
-    return found[0]
+    return columns[0]
 
 
 def _force(source: _Source) -> tuple[Complex[np.ndarray, " row"], Force]:
@@ -232,9 +232,9 @@ def _partner(source: _Source, channel: str) -> tuple[str, str]:
 def _swap(name: str) -> str:
     """The name of an imaginary part beside that of a real part."""
     for old, new in (("real", "imag"), ("Real", "Imag"), ("re", "im"), ("Re", "Im")):
-        found = re.sub(rf"(?<![A-Za-z]){old}(?![A-Za-z])|(?<=_){old}(?=_|$)", new, name)
-        if found != name:
-            return found
+        swapped = re.sub(rf"(?<![A-Za-z]){old}(?![A-Za-z])|(?<=_){old}(?=_|$)", new, name)
+        if swapped != name:
+            return swapped
     last = {"X": "Y", "x": "y"}.get(name[-1:], "")
     return last and name[:-1] + last
 
@@ -278,13 +278,13 @@ def _with_errors_by_name(source: _Source, response: ResponseMap, number: int) ->
     """A response with the columns of its errors: those that are named after it and its phase."""
     phases = source.with_role("phase")
     phase = response.phase or (phases[0] if len(phases) == 1 else "")
-    found: dict[str, Any] = {}
+    named_columns: dict[str, Any] = {}
     for key, of in {"amplitude_std": response.channel, "phase_std": phase}.items():
         named = [name for name in source.with_role("deviation") if _bare(name) == _bare(of)]
         if of and not getattr(response, key) and len(named) == 1:
-            found[key] = named[0]
+            named_columns[key] = named[0]
             source.assumed.add(f"response {number}.{key}", Fact("deviation_of_one_row"))
-    return response._replace(**found)
+    return response._replace(**named_columns)
 
 
 def _errors(

@@ -100,10 +100,10 @@ def read_tdms(path: Path) -> LaboratoryFile:
                 loose[channel.name] = _numbers(path, name, channel)
         for (step, start, length), alike in waves.items():
             recordings.append(_recording(path, name, alike, step, start, length))
-        found = read_struct(name, loose)
-        recordings.extend(found.recordings)
-        tables.extend(table._replace(name=name) for table in found.numbered())
-        notes.extend(found.notes)
+        contents = read_struct(name, loose)
+        recordings.extend(contents.recordings)
+        tables.extend(table._replace(name=name) for table in contents.numbered())
+        notes.extend(contents.notes)
     return LaboratoryFile(
         path.name, "tdms", tuple(recordings), (), tuple(tables), tuple(dict.fromkeys(notes))
     )

@@ -99,15 +99,15 @@ def _group(walk: _Walk, group: Any) -> dict[str, Node]:
 
 def _rates(item: Any) -> dict[str, Numbers]:
     """Attributes that state a sampling rate or step, or the start of a record."""
-    found = {}
+    rates = {}
     for key in item.attrs:
         if role_of(key.removesuffix("_hz").removesuffix("_s")) in ("rate", "step") or key in (
             "start_time_s",
         ):
             value = np.asarray(item.attrs[key])
             if value.size == 1 and value.dtype.kind in "iuf":
-                found[key] = held(value.astype(float).reshape(1))
-    return found
+                rates[key] = held(value.astype(float).reshape(1))
+    return rates
 
 
 def _object(walk: _Walk, item: Any, name: str) -> Node | None:

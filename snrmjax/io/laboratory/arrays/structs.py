@@ -56,14 +56,14 @@ def file_of_tree(
     name: str, kind: Kind, tree: Mapping[str, Node], notes: Sequence[Fact]
 ) -> LaboratoryFile:
     """All that is found in a tree; `notes` say what of the file is not in it."""
-    found = read_struct("", tree)
-    every = [*notes, *found.notes]
-    if not (every or found.recordings or found.responses or found.tables):
+    contents = read_struct("", tree)
+    every = [*notes, *contents.notes]
+    if not (every or contents.recordings or contents.responses or contents.tables):
         every = [Fact("nothing_measured", names=tuple(tree)[:_MOST_NAMED])]
     return LaboratoryFile(
-        *(name, kind, tuple(found.recordings), tuple(found.responses), found.numbered()),
+        *(name, kind, tuple(contents.recordings), tuple(contents.responses), contents.numbered()),
         tuple(dict.fromkeys(every)),
-        tuple(np.nan for _ in found.responses),
+        tuple(np.nan for _ in contents.responses),
     )
 
 
@@ -73,7 +73,7 @@ def read_struct(name: str, fields: Mapping[str, Node], *, entry: bool = False) -
     Arguments: `name` as results are called; `entry` says that the struct is one of a list, whose
     single numbers hold for each of its rows.
     """
-    found = Struct([], [], {}, [])
+    contents = Struct([], [], {}, [])
     numbers = {key: node for key, node in fields.items() if isinstance(node, Numbers)}
     words: dict[str, list[str]] = {}
     for key, node in fields.items():
@@ -81,27 +81,27 @@ def read_struct(name: str, fields: Mapping[str, Node], *, entry: bool = False) -
         texts = [text for text in several if isinstance(text, str)]
         if 0 < len(texts) == len(several):
             words[key] = texts
-    _read_numbers(name, numbers, words, found, entry=entry)
+    _read_numbers(name, numbers, words, contents, entry=entry)
     cells: dict[int, dict[str, list[Node]]] = {}
     for key, node in fields.items():
         path = f"{name}.{key}" if name else key
         if isinstance(node, dict):
-            found.add(key, read_struct(path, node, entry=entry))
+            contents.add(key, read_struct(path, node, entry=entry))
         elif isinstance(node, list) and node and key not in words:
             structs = [item for item in node if isinstance(item, dict)]
             rows = [item for item in node if isinstance(item, list)]
             if len(structs) == len(node):
-                found.add(key, _entries(path, structs))
+                contents.add(key, _entries(path, structs))
             elif len(rows) == len(node):
                 named = [{str(k + 1): cell for k, cell in enumerate(row)} for row in rows]
-                found.add(key, _entries(path, named))
+                contents.add(key, _entries(path, named))
             elif any(isinstance(item, Numbers | dict) for item in node):
                 cells.setdefault(len(node), {})[key] = node
     for count, group in cells.items():
         each = [{key: nodes[k] for key, nodes in group.items()} for k in range(count)]
         key = next(iter(group)) if len(group) == 1 else "entries"
-        found.add(key, _entries(f"{name}.{key}" if name else key, each))
-    return found
+        contents.add(key, _entries(f"{name}.{key}" if name else key, each))
+    return contents
 
 
 def _entries(name: str, structs: Sequence[Mapping[str, Node]]) -> Struct:
@@ -109,16 +109,16 @@ def _entries(name: str, structs: Sequence[Mapping[str, Node]]) -> Struct:
     if len(structs) > _MOST_ENTRIES:
         raise ValueError(f"{name} is a list of {len(structs)} entries, more than {_MOST_ENTRIES}.")
     several = len(structs) > 1
-    found = Struct([], [], {}, [])
+    contents = Struct([], [], {}, [])
     parts: dict[str, list[tuple[int, Columns]]] = {}
     for k, fields in enumerate(structs, 1):
         below = read_struct(f"{name}({k})" if several else name, fields, entry=several)
-        found.add("", below._replace(tables={}))
+        contents.add("", below._replace(tables={}))
         for place, columns in below.tables.items():
             parts.setdefault(place, []).append((k, columns))
     for place, rows in parts.items():
-        found.tables[place] = _joined(rows) if several else rows[0][1]
-    return found
+        contents.tables[place] = _joined(rows) if several else rows[0][1]
+    return contents
 
 
 def _joined(parts: Sequence[tuple[int, Columns]]) -> Columns:
@@ -146,19 +146,19 @@ def _read_numbers(
     name: str,
     numbers: Mapping[str, Numbers],
     words: Mapping[str, Sequence[str]],
-    found: Struct,
+    contents: Struct,
     *,
     entry: bool,
 ) -> None:
     """The arrays of one struct: first time records, then responses, then tables."""
     record, used, notes = recording_of(name, numbers, words)
-    found.recordings.extend([] if record is None else [record])
-    found.notes.extend(notes)
+    contents.recordings.extend([] if record is None else [record])
+    contents.notes.extend(notes)
     rest = {key: array for key, array in numbers.items() if key not in used}
-    rest = _responses(name, rest, found)
+    rest = _responses(name, rest, contents)
     levels = _by_level(rest)
     if levels is not None:
-        found.add("", _entries(name, levels))
+        contents.add("", _entries(name, levels))
         return
     single = {key: array for key, array in rest.items() if array.size == 1}
     groups: dict[int, dict[str, Numbers]] = {}
@@ -167,7 +167,7 @@ def _read_numbers(
             groups.setdefault(array.length, {})[key] = array
     for key, array in rest.items():
         if array.length is None and array.size:
-            _spread(key, array, groups, words, found.notes)
+            _spread(key, array, groups, words, contents.notes)
     if not groups and single and (entry or any(role_of(key) == "frequency" for key in single)):
         groups[1] = {}
     for n, group in groups.items():
@@ -181,7 +181,7 @@ def _read_numbers(
             if (len(word) == n or (entry and len(word) == 1)) and key not in columns
         }
         in_order = {key: columns[key] for key in (*group, *repeated)}
-        found.tables["" if len(groups) == 1 else f"rows{n}"] = Columns(in_order, units, texts)
+        contents.tables["" if len(groups) == 1 else f"rows{n}"] = Columns(in_order, units, texts)
 
 
 def _spread(
@@ -246,7 +246,7 @@ def _by_level(numbers: Mapping[str, Numbers]) -> list[Mapping[str, Node]] | None
     return structs
 
 
-def _responses(name: str, numbers: Mapping[str, Numbers], found: Struct) -> dict[str, Numbers]:
+def _responses(name: str, numbers: Mapping[str, Numbers], contents: Struct) -> dict[str, Numbers]:
     """Complex matrices along a frequency axis as frequency responses; returns what is left."""
     left = dict(numbers)
     axes = [key for key, array in numbers.items() if role_of(key) == "frequency" and array.length]
@@ -262,7 +262,7 @@ def _responses(name: str, numbers: Mapping[str, Numbers], found: Struct) -> dict
         values = values.reshape(values.shape[0], -1, hertz.size)
         if not np.isfinite(values).any() or np.isinf(values).any():
             continue
-        found.responses.append(
+        contents.responses.append(
             frequency_responses(
                 hertz * (1.0 if numbers[axis].unit.lower().startswith("rad") else _HERTZ),
                 values,

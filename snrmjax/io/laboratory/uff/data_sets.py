@@ -56,12 +56,12 @@ def read_data_sets(path: Path) -> DataSets:
     content = path.read_bytes()
     if len(_TAG.findall(content)) % 2:
         raise ValueError(f"{file} is damaged: it ends within a data set (no closing -1).")
-    found: list[Mapping[str, Any]] = []
+    sets: list[Mapping[str, Any]] = []
     left_out: dict[int, int] = {}
     with damaged_if_it_fails(file, "a universal file"):
         source = pyuff.UFF(str(path))
         types = [int(number) for number in source.get_set_types()]
-    starts = [found.start() for found in _TAG.finditer(content)][::2]
+    starts = [tag.start() for tag in _TAG.finditer(content)][::2]
     heads = [content[at : at + _HEAD] for at in starts] + [b""] * len(types)
     for k, number in enumerate(types):
         if number not in _READ:
@@ -83,12 +83,12 @@ def read_data_sets(path: Path) -> DataSets:
             continue
         if number == 58:
             function = _with_letters(_checked_function(function, file, k + 1), heads[k])
-        found.append(function)
+        sets.append(function)
     notes = [
         Fact("data_sets_not_read", n=count, type=number, meaning=_OTHERS.get(number, ""))
         for number, count in sorted(left_out.items())
     ]
-    return DataSets(tuple(found), tuple(notes))
+    return DataSets(tuple(sets), tuple(notes))
 
 
 def direction_of(code: int) -> str:
