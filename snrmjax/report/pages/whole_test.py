@@ -93,8 +93,8 @@ def _report(found: WholeTest, stages: list[_Stage]) -> Report:
     ]
     for name, report in stages:
         sections += [
-            one._replace(heading=f"{name}: {one.heading[0].lower()}{one.heading[1:]}")
-            for one in report.sections
+            section._replace(heading=f"{name}: {section.heading[0].lower()}{section.heading[1:]}")
+            for section in report.sections
         ]
     notes = {str(note): "" for note in found.notes}
     for name, report in stages:  # each note once, of the stage that said it first
@@ -137,8 +137,8 @@ def _files(found: WholeTest) -> Section:
 def _check_section(checkup: Checkup) -> Section:
     header = ("severity", "what", "where", "evidence", "what mends it")
     rows = [
-        (one.severity, one.name, one.where, str(one.evidence), str(one.mend))
-        for one in checkup.findings
+        (finding.severity, finding.name, finding.where, str(finding.evidence), str(finding.mend))
+        for finding in checkup.findings
     ]
     text = [f"{_check(checkup).capitalize()}.", *map(str, checkup.notes)]
     return Section("Check", text, tables=[ReportTable(header, rows)] if rows else ())
