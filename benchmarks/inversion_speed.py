@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import snrmjax as sj
+from snrmjax.identify.pointwise.inversion_result import SnrmPoints
 
 
 def measurements(n: int, seed: int = 0) -> dict[str, np.ndarray]:
@@ -80,9 +81,7 @@ def median_time(function, *args: jax.Array) -> float:
     return float(np.median(times))
 
 
-def worst_residuals(
-    points: sj.identify.SnrmPoints, sample: dict[str, np.ndarray]
-) -> tuple[float, float]:
+def worst_residuals(points: SnrmPoints, sample: dict[str, np.ndarray]) -> tuple[float, float]:
     """Largest relative errors of Eq. (12) and of Eq. (17) among the answers, in NumPy."""
     good = np.isfinite(np.asarray(points.natural_frequency))
     omega, zeta = (np.asarray(p)[good] for p in (points.natural_frequency, points.damping_ratio))

@@ -27,7 +27,7 @@ from scipy.optimize import least_squares
 
 import snrmjax as sj
 from snrmjax.identify.joint.family_fit import MOST_STEPS, SOLVER
-from snrmjax.identify.joint.residuals import corrected_residuals
+from snrmjax.identify.joint.free_unknowns import corrected_residuals
 from snrmjax.numerics.compiled import compiled
 
 HERTZ = 2 * np.pi

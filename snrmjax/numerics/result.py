@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, dataclass_transform
 
 import equinox as eqx
 import jax
@@ -92,6 +92,7 @@ def setting(**settings: Any) -> Any:
     return eqx.field(static=True, metadata={"setting": True}, **settings)
 
 
+@dataclass_transform(field_specifiers=(eqx.field, quantity, setting))
 class AbstractResult(eqx.Module):
     """Base of results: a repr of one screen, `to_xarray()`, `to_pandas()` and `plot()`.
 

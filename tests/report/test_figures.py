@@ -15,6 +15,7 @@ from truths.beam_forces import FORCES
 from truths.printed_page import unreadable
 
 import snrmjax as sj
+from snrmjax.identify.pointwise.points_result import BackbonePoints
 from snrmjax.io.results import write_backbone
 from snrmjax.io.units import DEGREE, HERTZ
 from snrmjax.report import style as drawing
@@ -236,7 +237,7 @@ def test_many_points_are_drawn_small(identification, backbone):
 
 ARRAYS = [
     field.name
-    for field in dataclasses.fields(sj.identify.BackbonePoints)
+    for field in dataclasses.fields(BackbonePoints)
     if field.name not in ("sensor", "argument")
 ]
 

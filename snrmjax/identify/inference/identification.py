@@ -31,8 +31,8 @@ from snrmjax.model.structures import Structure, modes_of
 from snrmjax.numerics.blocks import on_one_core
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.units import HERTZ
 
-_HERTZ = 2 * np.pi
 _FEWEST = 2  # points, of which a curve can be told
 _SHAPE_MISSED = 0.1  # share of a motion that is not the mode's shape and worth a note
 _EXPLAINED, _WORTH = 0.3, 0.1  # by the phase: share of the damping's variance, and its change
@@ -55,8 +55,8 @@ class Identification(AbstractResult):
     def level_frequency_std(self) -> float:
         """1σ of the natural frequency (rad/s) that the states of a level share."""
         j = self.fit.modes.mode_of_interest
-        own = float(self.fit.modes.natural_frequency[j])
-        return 0.5 * float(self.fit.noise.level_std[2]) * own
+        natural = float(self.fit.modes.natural_frequency[j])
+        return 0.5 * float(self.fit.noise.level_std[2]) * natural
 
     @property
     def level_damping_std(self) -> float:
@@ -65,36 +65,44 @@ class Identification(AbstractResult):
         return float(self.fit.noise.level_std[3]) * float(self.fit.modes.damping_ratio[j])
 
     def summary(self) -> tuple[str, ...]:
-        """See `AbstractResult`."""
-        states, *_ = self.points.summary()
-        _, *curves = self.backbone.summary()
-        scale, unit = self.fit.noise.scale, "times the stated noise"
-        if not self.fit.noise.stated:
-            scale, unit = 100 * scale, "% of the measured phasor (1σ)"
+        """How many points, ranges of the curves, what states and levels scatter by, notes."""
+        points, ends = self.points, self.backbone.sampled()
+        n_levels, noise = len(np.unique(np.asarray(points.level))), self.fit.noise
+        scale = f"{noise.scale:.3g} times the stated noise"
+        if not noise.stated:
+            scale = f"{100 * noise.scale:.3g} % of the measured phasor (1σ)"
+        hertz, ratio = np.asarray(ends.natural_frequency) / HERTZ, np.asarray(ends.damping_ratio)
+        speed = np.asarray(ends.velocity)
+        status, counts = np.unique(np.asarray(points.status), return_counts=True)
+        outcomes = (PointStatus(int(kind)).message for kind in status)
         return (
-            states.replace("BackbonePoints", "Identification", 1),
-            *curves,
-            f"scatter of states about the curves: {scale:.3g} {unit}",
-            f"level to level: {self.level_frequency_std / _HERTZ:.2g} Hz and "
+            f"Identification: {len(points.status)} steady states of {n_levels} levels at "
+            f"{points.sensor!r}",
+            *(f"{n} {outcome}" for n, outcome in zip(counts, outcomes, strict=True)),
+            f"natural frequency {np.nanmin(hertz):.6g} to {np.nanmax(hertz):.6g} Hz",
+            f"damping ratio {100 * np.nanmin(ratio):.4g} to {100 * np.nanmax(ratio):.4g} %",
+            f"velocity {np.nanmin(speed):.4g} to {np.nanmax(speed):.4g} m/s",
+            f"scatter of states about the curves: {scale}",
+            f"level to level: {self.level_frequency_std / HERTZ:.2g} Hz and "
             f"{100 * self.level_damping_std:.2g} % of critical damping (1σ)",
             *(f"note: {note}" for note in self.notes),
         )
 
     def variables(self) -> dict[str, Variable]:
         """See `AbstractResult`; those of the points, and of the curves under `backbone_…`."""
-        own = dict(self.points.variables())
+        variables = dict(self.points.variables())
         for name, variable in self.backbone.variables().items():
             at = "backbone_amplitude_m_s"
             key = at if name == "velocity_m_s" else f"backbone_{name}"
-            own[key] = variable._replace(dimensions=(at,))
-        return own
+            variables[key] = variable._replace(dimensions=(at,))
+        return variables
 
     def attributes(self) -> dict[str, str | float | int]:
         """See `AbstractResult`."""
         return {
             **self.backbone.attributes(),
             "noise_stated": int(self.fit.noise.stated),
-            "level_frequency_std_hz": self.level_frequency_std / _HERTZ,
+            "level_frequency_std_hz": self.level_frequency_std / HERTZ,
             "level_damping_ratio_std": self.level_damping_std,
             "notes": "\n".join(map(str, self.notes)),
         }
@@ -141,8 +149,8 @@ def identify_backbone(
         )
     family = "auto" if n_knots is None else f"smoothing_spline:{n_knots}"
     fit = fit_jointly(states, modes, backbone=family, damping=family)
-    found = identification_of_fit(data, fit, amplitude=amplitude, measure=measure)
-    return dataclasses.replace(found, notes=(*data.notes, *found.notes))
+    identified = identification_of_fit(data, fit, amplitude=amplitude, measure=measure)
+    return dataclasses.replace(identified, notes=(*data.notes, *identified.notes))
 
 
 def identification_of_fit(
@@ -164,19 +172,19 @@ def identification_of_fit(
     """
     points = identify_points(data, fit.modes_found, amplitude=amplitude, measure=measure)
     curves = as_backbone(fit, argument=amplitude)
-    found = Identification(points, curves, fit, ())
+    identified = Identification(points, curves, fit, ())
     if not fit.noise.stated:
         gain, phase = map(float, fit.noise.level_std[:2])
         j = fit.modes.mode_of_interest
-        own = float(fit.modes.natural_frequency[j])
-        wandering = 0.5 * own * float(np.max(np.asarray(fit.data.std)[:, 3]))
+        natural = float(fit.modes.natural_frequency[j])
+        wandering = 0.5 * natural * float(np.max(np.asarray(fit.data.std)[:, 3]))
         points = errors_from_scatter(
             points,
             fit.noise.scale,
             level_gain=gain,
             level_phase=phase,
-            frequency_std=float(np.hypot(found.level_frequency_std, wandering)),
-            damping_std=found.level_damping_std,
+            frequency_std=float(np.hypot(identified.level_frequency_std, wandering)),
+            damping_std=identified.level_damping_std,
             modal_mass_std=fit.modes_found.own_modal_mass_std,
         )
     notes = (
@@ -209,10 +217,10 @@ def errors_from_scatter(
     scale = noise * off_resonance_error_factor(np.asarray(points.mode_velocity))
     shared = np.array([0.0, level_gain, level_phase])
     spread = np.hypot(scale[:, None, None] * np.array([0.0, 1.0, 1.0]), shared)
-    own = np.sum((sensitivity[:, :2] * spread) ** 2, axis=2)
+    variances = np.sum((sensitivity[:, :2] * spread) ** 2, axis=2)
     natural, damping = np.asarray(points.natural_frequency), np.asarray(points.damping_ratio)
-    natural_std = np.hypot(np.sqrt(own[:, 0]) / (2 * natural), frequency_std)
-    of_damping = np.hypot(np.sqrt(own[:, 1]) / (2 * natural), damping_std)
+    natural_std = np.hypot(np.sqrt(variances[:, 0]) / (2 * natural), frequency_std)
+    of_damping = np.hypot(np.sqrt(variances[:, 1]) / (2 * natural), damping_std)
     of_damping = np.hypot(of_damping, damping * natural_std / natural)
     if modal_mass_std is not None:
         of_mass = moved_by_modal_mass(natural, damping, np.asarray(points.frequency))
@@ -252,7 +260,7 @@ def notes_on_phases(
     level = points.level[use]
     sign = np.sign(float(curves.modal_constant))  # negative: the mode moves against force
     sine = sign * np.sin(np.angle(np.asarray(points.mode_velocity)))[use]
-    curve, _ = curves.modal_damping.values_and_slopes(np.asarray(points.amplitude)[use])
+    curve = curves.modal_damping.linearised(np.asarray(points.amplitude)[use]).value
     excess = np.asarray(points.modal_damping)[use] / curve - 1
     _, member = np.unique(level, return_inverse=True)
     count = np.bincount(member)

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -21,20 +21,19 @@ from snrmjax.identify.joint.force_balance import (
     no_errors,
     weighting_at,
 )
-from snrmjax.identify.joint.free_unknowns import Unravel, padded_levels
+from snrmjax.identify.joint.free_unknowns import Unravel, padded_levels, whitened
 from snrmjax.identify.joint.joint_fit import JointFit
-from snrmjax.identify.joint.residuals import whitened
 from snrmjax.identify.test_model.states import LEVEL_ERRORS
 from snrmjax.numerics.blocks import padded
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.facts import Fact
-from snrmjax.numerics.result import Variable
+from snrmjax.numerics.result import Variable, setting
 from snrmjax.numerics.status import Status
+from snrmjax.numerics.units import HERTZ
 
 Target = Literal["curves", "frequency", "damping"]
 
 _CURVES = ("natural frequency", "damping")
-_HERTZ = 2 * np.pi  # rad/s
 _SHOWN = 12  # advised states on one screen
 _PER_FORCE = 96  # candidate states of one force
 _TARGETS = 25  # amplitudes at which the band of a curve counts
@@ -78,13 +77,26 @@ class NextMeasurements(AbstractTable[NextMeasurement]):
     """Advised steady states, the best first; a sequence of `NextMeasurement`."""
 
     coordinates = ("rank",)
+    columns: ClassVar = {
+        "rank": (lambda row: row.rank, "1", "rank, the best first"),
+        "force_n": (lambda row: row.force, "N", "force"),
+        "drive_v": (lambda row: row.drive, "V", "drive voltage"),
+        "frequency_hz": (lambda row: row.frequency / HERTZ, "Hz", "frequency"),
+        "velocity_m_s": (lambda row: row.velocity, "m/s", "expected velocity"),
+        "phase_deg": (lambda row: np.degrees(row.phase), "deg", "phase"),
+        "expected_band_ratio": (
+            lambda row: row.expected_band_ratio,
+            *("1", "mean band after it, over today's"),
+        ),
+        "reason": (lambda row: str(row.reason), "", "why this state"),
+    }
 
     responses: tuple[FittedResponse, ...]  # the main curves under the advised forces
-    sensor: str = eqx.field(static=True)
-    target: str = eqx.field(static=True)
-    status: AdviceStatus = eqx.field(static=True)
+    sensor: str = setting()
+    target: str = setting()
+    status: AdviceStatus = setting()
     drive_known_only: bool = eqx.field(static=True)
-    notes: tuple[Fact, ...] = eqx.field(static=True, default=())
+    notes: tuple[Fact, ...] = setting(default=())
 
     @property
     def message(self) -> str:
@@ -94,10 +106,10 @@ class NextMeasurements(AbstractTable[NextMeasurement]):
     def summary(self) -> tuple[str, ...]:
         """See `AbstractResult`."""
         lines = [f"NextMeasurements: {len(self)} states that narrow the band of {self.target} most"]
-        for one in self.rows[:_SHOWN]:
-            load = f"force {one.force:.4g} N" if one.drive is None else f"drive {one.drive:.4g} V"
-            place = f"{load}, {one.frequency / _HERTZ:.6g} Hz (expected {one.expected})"
-            lines.append(f"{one.rank}: {place}: {one.reason}")
+        for row in self.rows[:_SHOWN]:
+            load = f"force {row.force:.4g} N" if row.drive is None else f"drive {row.drive:.4g} V"
+            place = f"{load}, {row.frequency / HERTZ:.6g} Hz (expected {row.expected})"
+            lines.append(f"{row.rank}: {place}: {row.reason}")
         if len(self) > _SHOWN:
             lines.append(f"and {len(self) - _SHOWN} more")
         if self.status != AdviceStatus.COMPLETE:
@@ -105,33 +117,15 @@ class NextMeasurements(AbstractTable[NextMeasurement]):
         return (*lines, *(f"note: {note}" for note in self.notes))
 
     def variables(self) -> dict[str, Variable]:
-        """See `AbstractResult`."""
-
-        rows = self.rows
-        load = {"force_n": self.column([one.force for one in rows], "N", "force")}
-        if self.drive_known_only:
-            load = {"drive_v": self.column([one.drive for one in rows], "V", "drive voltage")}
-        ratio = [one.expected_band_ratio for one in rows]
+        """Those of the rows, the force as a test states it."""
+        left_out = "force_n" if self.drive_known_only else "drive_v"
         return {
-            "rank": self.column([one.rank for one in rows], "1", "rank, the best first"),
-            **load,
-            "frequency_hz": self.column(
-                [one.frequency / _HERTZ for one in rows], "Hz", "frequency"
-            ),
-            "velocity_m_s": self.column([one.velocity for one in rows], "m/s", "expected velocity"),
-            "phase_deg": self.column(np.degrees([o.phase for o in rows]).tolist(), "deg", "phase"),
-            "expected_band_ratio": self.column(ratio, "1", "mean band after it, over today's"),
-            "reason": self.column([str(one.reason) for one in rows], "", "why this state"),
+            name: variable for name, variable in super().variables().items() if name != left_out
         }
 
     def attributes(self) -> dict[str, str | float | int]:
         """See `AbstractResult`."""
-        return {
-            "target": self.target,
-            "sensor": self.sensor,
-            "status": self.message,
-            "notes": "\n".join(map(str, self.notes)),
-        }
+        return {**super().attributes(), "status": self.status.message}
 
 
 def next_measurements(
@@ -168,7 +162,7 @@ def next_measurements(
     states = _candidates(fit, [float(f) for f in wanted], (from_frequency, to_frequency))
     slopes, scale = _target(fit, target)
     advice = [] if states is None else _ranked(fit, states, slopes / scale[:, None], target, count)
-    loads = {one.force for one in advice}
+    loads = {row.force for row in advice}
     status = AdviceStatus.COMPLETE if len(advice) == count else AdviceStatus.FEWER_STATES
     return NextMeasurements(
         rows=tuple(advice),
@@ -232,11 +226,11 @@ class _States(NamedTuple):
 
 
 def _candidates(fit: JointFit, forces: list[float], ends: tuple[float, float]) -> _States | None:
-    rows, every = [], []
+    rows, drawn = [], []
     for number, force in enumerate(forces):
         curves = fitted_response(fit, force, from_frequency=ends[0], to_frequency=ends[1])
         for curve in curves[:1]:
-            every.append(curve)
+            drawn.append(curve)
             keep = _measurable(curve)
             at = np.flatnonzero(keep)
             if at.size > _PER_FORCE:
@@ -250,7 +244,7 @@ def _candidates(fit: JointFit, forces: list[float], ends: tuple[float, float]) -
     if not rows or not sum(len(row[0]) for row in rows):
         return None
     level, load, frequency, velocity = (np.concatenate(c) for c in zip(*rows, strict=True))
-    return _States(level, load, frequency, velocity, tuple(every))
+    return _States(level, load, frequency, velocity, tuple(drawn))
 
 
 def _measurable(curve: FittedResponse) -> np.ndarray:
@@ -294,8 +288,8 @@ def _information(fit: JointFit, states: _States) -> Float[np.ndarray, "state par
     padded_states = jax.tree.map(lambda rows: filled(rows, n_padded, None), data)
     levels = dataclasses.replace(padded_states, n_levels=padded_levels(n_levels))
     problem = BalanceProblem(levels, fit.modes, fit.prior)
-    found = _slopes(program.vector, program.unravel, problem)
-    by_vector, by_level = (np.asarray(part)[:n] for part in found)
+    by_unknowns = _slopes(program.vector, program.unravel, problem)
+    by_vector, by_level = (np.asarray(part)[:n] for part in by_unknowns)
     rows = np.zeros((n, 2, fit.covariance.shape[0] + n_levels * len(LEVEL_ERRORS)))
     rows[:, :, : fit.covariance.shape[0]] = by_vector[:, :, program.own]
     for k in range(len(LEVEL_ERRORS)):
@@ -333,9 +327,9 @@ def _best(
 ) -> tuple[int, np.ndarray]:
     """The candidate that leaves the smallest mean band, and the variances that it leaves."""
     index = np.flatnonzero(wanted)
-    own = rows[index]
-    through = own @ covariance  # (state, part, unknown)
-    inner = np.eye(2) + through @ own.transpose(0, 2, 1)
+    candidates = rows[index]
+    through = candidates @ covariance  # (state, part, unknown)
+    inner = np.eye(2) + through @ candidates.transpose(0, 2, 1)
     arms = through @ slopes.T  # (state, part, output)
     gain = np.einsum("sio,sio->so", arms, np.linalg.solve(inner, arms))
     variance = np.einsum("op,pq,oq->o", slopes, covariance, slopes)

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 
-from snrmjax.report.sentences import Wording
+from snrmjax.report.sentences import Wording, number_of
 
 _TURNS = {1: "turned by +90°", -1: "turned by -90°", 2: "turned by 180°"}
 _CONJUGATED = (
@@ -68,6 +68,13 @@ _LEVELS_BY = {
 }
 
 
+def _steps_used(used: int, left_out: Iterable[tuple[str, int]]) -> str:
+    counts = dict(left_out)
+    reasons = ", ".join(f"{count} {reason}" for reason, count in counts.items())
+    steps = f"{used} of {used + sum(counts.values())} steps used"
+    return f"{steps}; left out: {reasons}" if reasons else steps
+
+
 def _sweep_bias(sweeps: int, shift_hz: float, lowest: float, removed: bool) -> str:
     return (
         f"each of {sweeps} sweeps by itself shifts the peak by up to {shift_hz:.2g} Hz and lowers "
@@ -86,6 +93,8 @@ SENTENCES: dict[str, Wording] = {
         "modal mass misses the phasors by {as_given:%.0f}, with its own by {with_own_mass:%.2g}.)"
     ),
     "levels_numbered": lambda by: f"levels {_LEVELS_BY[by]}",
+    "levels_counted": lambda n, by: f"{number_of(n, 'level')} {_LEVELS_BY[by]}",
+    "steps_used": _steps_used,
     "sweep_bias": _sweep_bias,
     "sweep_bias_unknown": (
         "too few states near resonance: the bias of the sweep is not taken out, but is within the "

@@ -135,7 +135,7 @@ def test_derivatives_of_the_inverse_force_are_those_of_central_differences(exact
 def test_the_inverse_force_says_itself(exact):
     found = inverse_force(curved(), exact, harmonic_order=ORDER)
     n = exact.n_states
-    assert repr(found).startswith(f"InverseForce: {n} of {n} motions found")
+    assert repr(found).startswith(f"InverseForce: {n} states")
     assert found.to_xarray().force_re_n.attrs["units"] == "N"
     assert isinstance(found.plot(), Figure)
 

@@ -46,12 +46,12 @@ def test_resonances_and_folds_that_are_not_located_are_counted_and_said(monkeypa
     before = sj.identify.fitted_response(fit, 2.2)[0]
     assert before.not_located == ()
     assert before.notes == ()
-    whole = located_points._solved
+    whole = located_points.solved_point
 
     def lost(one, force, place, *new):
         return None if place.kind == "fold" else whole(one, force, place)
 
-    monkeypatch.setattr(located_points, "_solved", lost)
+    monkeypatch.setattr(located_points, "solved_point", lost)
     found = sj.identify.fitted_response(fit, 2.2)[0]
     assert found.folds == ()
     assert [one.kind for one in found.not_located] == ["fold"] * len(before.folds)

@@ -8,6 +8,7 @@ from truths.exact_states import exact, modes, stated
 from truths.levels_with_errors import Level
 
 import snrmjax as sj
+from snrmjax.identify.pointwise.backbone import BackboneValues
 from snrmjax.identify.prediction.new_level import ON_THE_CURVES, NewLevel
 from snrmjax.identify.prediction.notes import (
     notes_on_negative_damping,
@@ -202,7 +203,7 @@ def values_of(ratio, std):
     """A backbone at three amplitudes with some damping."""
     one, ratio = np.ones(3), np.array(ratio)
     columns = (np.array([0.0, 1.0, 2.0]), 100 * one, one, ratio, np.array(std), ratio, one)
-    return sj.identify.BackboneValues(*map(jnp.asarray, columns))
+    return BackboneValues(*map(jnp.asarray, columns))
 
 
 def test_negative_damping_is_said_once_with_its_probability():
@@ -220,4 +221,4 @@ def test_a_distribution_is_a_table():
     table = one.to_pandas()
     assert list(table["quantile"]) == list(QUANTILES)
     assert table["frequency_hz"][2] == pytest.approx(OMEGA / (2 * np.pi))
-    assert repr(one).startswith("ResonanceDistribution under 2 N")
+    assert repr(one).startswith("ResonanceDistribution: 5 quantiles")

@@ -14,7 +14,7 @@ import snrmjax as sj
 from snrmjax.cli import app
 from snrmjax.doctor.findings import Checkup, Finding, Repair
 from snrmjax.io.exchange.import_map import ImportMap, ResponseMap
-from snrmjax.pipelines import corrections as mends
+from snrmjax.pipelines import check as mends
 
 RAW = "Freq [Hz],Load [N],Amp [{}],Phase [deg]\n"
 TOLD = ("--force", "Load", "--frequency", "Freq", "--phase", "Phase", "--sensor", "tip")
