@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 import snrmjax as sj
-from snrmjax.study.uncertainty.moments import STATISTICS
+from snrmjax.study.uncertainty.propagation import STATISTICS
 
 HERTZ = 2 * np.pi
 SCALES = {"small": 0.5, "large": 5.0}
@@ -127,7 +127,7 @@ def propagated(name: str, case: Case, members: int) -> None:
             other_number_of_folds=f"{int(np.sum(rows['n_folds'] != folds))} of {members}",
             derivative_seconds=middle - begin,
             members_seconds=end - middle,
-            notes=list(found.notes),
+            notes=[str(note) for note in found.notes],
         )
 
 

@@ -42,7 +42,7 @@ import numpy as np
 import snrmjax as sj
 from snrmjax import plot
 from snrmjax.plot import style as drawing
-from snrmjax.report.study.main_effects import main_effect
+from snrmjax.study.uncertainty.sensitivity import main_effect
 
 HERTZ = 2 * np.pi
 FIGURES = Path(sys.argv[1]) if len(sys.argv) > 1 and sys.argv[0].endswith(".py") else None

@@ -188,7 +188,7 @@ def test_simulate_and_nnm_write_what_the_contract_says(files, tmp_path):
 
 
 BAD_DATA = {
-    "missing column": (HEADER.replace("force_n,", ""), "force_n"),
+    "missing column": (HEADER.replace("force_n,", "") + "1,60.0,0.1,0.0\n", "force_n"),
     "text in a number": (HEADER + "1,64,abc,0.01,0\n", "abc"),
     "negative frequency": (HEADER + "1,-64,1e-5,0.01,0\n", "-64"),
     "empty file": ("", "empty"),

@@ -88,13 +88,15 @@ SUB_ROOMS = {
         *("io.files", "io.units", "io.columns", "io.rows", "io.tables", "io.toml_table"),
         "io.laboratory",
     },
-    "report.figures": {"report.style", "report.html", "report.sampling"},
+    "report.figures": {
+        *("report.style", "report.html", "report.sampling", "report.sentences"),
+    },
     "report.pages": {
         *("report.figures", "report.style", "report.html", "report.sampling"),
         "report.sentences",
     },
     "report.sentences": set(),
-    "report.study": {"report.style", "report.html"},
+    "report.study": {"report.style", "report.html", "report.sentences"},
     "io.reduction": {
         *("io.columns", "io.files", "io.rows", "io.tables", "io.toml_table", "io.units"),
     },
@@ -103,6 +105,7 @@ SUB_ROOMS = {
     # A study is made of computations, which know nothing of where and how often they run.
     "study.computations": set(),
     "study.uncertainty": {"study.variations"},
+    "study.analysis": {"study.computations", "study.uncertainty"},
 }
 NUMERICAL = set(ROOMS) - {"io", "study", "pipelines", "report"}
 MOST_MODULES = 13

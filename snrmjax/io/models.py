@@ -43,26 +43,27 @@ _TOP_KEYS = (
 )
 
 
+_Rules = dict[str, tuple[Rule, ...]]
 # The keys of numbers of each table with their rules; standard deviations may be missing.
-_MODE = {
+_MODE: _Rules = {
     "frequency_hz": (POSITIVE, IN_RANGE_HZ),
     "damping_ratio": (BELOW_ONE,),
+    "shape": (),
     "participation": (NOT_ZERO,),
 }
-_MODE_STD = {
+_MODE_STD: _Rules = {
     "frequency_std_hz": (NOT_NEGATIVE, IN_RANGE_HZ),
     "damping_ratio_std": (NOT_NEGATIVE,),
     "modal_mass_std": (NOT_NEGATIVE,),
 }
-_RIGID_BODY_MODE = {"participation": (NOT_ZERO,)}
-_MEASUREMENT = dict.fromkeys(
+_RIGID_BODY_MODE: _Rules = {"shape": (), "participation": (NOT_ZERO,)}
+_MEASUREMENT: _Rules = dict.fromkeys(
     (
         *("level_gain_std", "level_phase_std_deg"),
         *("level_frequency_std_hz", "level_damping_ratio_std"),
     ),
     (NOT_NEGATIVE,),
 )
-_Rules = dict[str, tuple[Rule, ...]]
 
 
 def read_model(path: FilePath) -> Structure:
@@ -96,19 +97,17 @@ def _read(text: str, file: str, stem: str) -> Structure:
     )
 
 
-def _numbers(
-    table: TomlTable, required: _Rules, optional: _Rules, *further: str
-) -> dict[str, float]:
-    """The numbers of a table that are there; `further` are its other keys."""
-    table.check_keys((*required, *further), optional)
-    rules = required | optional
+def _numbers(table: TomlTable, required: _Rules, optional: _Rules) -> dict[str, float]:
+    """The numbers of a table that are there, checked."""
+    table.check_keys(required, optional)
+    rules = {key: rule for key, rule in (required | optional).items() if key != "shape"}
     return {key: table.number(key, *rules[key]) for key in rules if key in table.entries}
 
 
 def _modes(top: TomlTable, file: str) -> LinearModes:
     tables, rigid_tables = top.tables("mode", file), top.tables("rigid_body_mode", file)
-    flexible = [_numbers(table, _MODE, _MODE_STD, "shape") for table in tables]
-    rigid = [_numbers(table, _RIGID_BODY_MODE, {}, "shape") for table in rigid_tables]
+    flexible = [_numbers(table, _MODE, _MODE_STD) for table in tables]
+    rigid = [_numbers(table, _RIGID_BODY_MODE, {}) for table in rigid_tables]
     if not flexible:
         raise ValueError(f"{file} must have at least one mode with a shape, under [[mode]].")
     of_interest = top.whole("mode_of_interest", 1, 1)

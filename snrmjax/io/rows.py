@@ -36,6 +36,19 @@ class Cells(NamedTuple):
     rows: list[Row]
     file: str
 
+    def require_rows(self) -> None:
+        """Raises `ValueError` where there are none, or one is not of the header's width."""
+        width, file = len(self.names), self.file
+        for row in self.rows:
+            if len(row.fields) != width:
+                marks = " (numbers need a point as decimal sign and no thousands separators)"
+                raise ValueError(
+                    f"each row must have {width} fields as the header has, but row {row.number} "
+                    f"of {file} has {len(row.fields)}{marks if len(row.fields) > width else ''}."
+                )
+        if not self.rows:
+            raise ValueError(f"{file} has a header, but no rows below it.")
+
     def has(self, column: str) -> bool:
         """Whether there is such a column."""
         return column in self.names
@@ -47,11 +60,11 @@ class Cells(NamedTuple):
 
     def refusal(self, column: str, expected: str, row: int) -> ValueError:
         """The error for one field."""
-        found = self.texts(column)[row]
-        if found == "":
+        field = self.texts(column)[row]
+        if field == "":
             value = "an empty field"
         else:
-            value = found if _NUMBER.fullmatch(found) and len(found) <= 40 else shown(found)
+            value = field if _NUMBER.fullmatch(field) and len(field) <= 40 else shown(field)
         return ValueError(
             f"`{column}` must be {expected}, but row {self.rows[row].number} of {self.file} "
             f"has {value}."
@@ -99,8 +112,8 @@ def header_of(path: FilePath) -> list[str]:
 def cells_of(text: str, file: str) -> Cells:
     """The header and the rows of a CSV's text; `file` as messages name it.
 
-    Raises `ValueError` where it is not a CSV with a header and rows of its width, has a blank line
-    in the middle, or a column twice.
+    Raises `ValueError` where it is not a CSV with a header, has a blank line in the middle, or a
+    column twice. Rows are to be looked at by `Cells.require_rows`, once the header is understood.
 
     >>> cells_of('level, "sensor" \\r\\n 1,"tip"\\r\\n\\r\\n', "beam.csv").rows
     [Row(number=2, fields=['1', 'tip'])]
@@ -123,15 +136,6 @@ def cells_of(text: str, file: str) -> Cells:
                 f"each column must stand once, but {file} has the column `{shortened(name)}` twice "
                 f"(columns {names.index(name) + 1} and {k + 1})."
             )
-    for row in rows:
-        if len(row.fields) != len(names):
-            marks = " (numbers need a point as decimal sign and no thousands separators)"
-            raise ValueError(
-                f"each row must have {len(names)} fields as the header has, but row {row.number} "
-                f"of {file} has {len(row.fields)}{marks if len(row.fields) > len(names) else ''}."
-            )
-    if not rows:
-        raise ValueError(f"{file} has a header, but no rows below it.")
     return Cells(names, rows, file)
 
 

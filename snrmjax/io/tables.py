@@ -59,6 +59,7 @@ def read_steady_states(
 def _read(text: str, file: str, sensors: tuple[str, ...] | None) -> SteadyStates:
     cells = cells_of(text, file)
     header = read_header(cells)
+    cells.require_rows()
     notes = list(header.notes)
     rules = REQUIRED | FORCES | OPTIONAL | dict.fromkeys(header.harmonics, ())
     columns: dict[str, np.ndarray] = {}

@@ -92,7 +92,7 @@ def setting(**settings: Any) -> Any:
     return eqx.field(static=True, metadata={"setting": True}, **settings)
 
 
-@dataclass_transform(field_specifiers=(quantity, setting, eqx.field))
+@dataclass_transform(field_specifiers=(eqx.field, quantity, setting))
 class AbstractResult(eqx.Module):
     """Base of results: a repr of one screen, `to_xarray()`, `to_pandas()` and `plot()`.
 

@@ -16,7 +16,7 @@ from snrmjax.io.exchange.import_map import (
 )
 from snrmjax.io.exchange.importing import Imported, import_files
 from snrmjax.io.exchange.own_tables import is_own_file
-from snrmjax.io.exchange.record_import import told_record
+from snrmjax.io.exchange.record_import import mapped_record
 from snrmjax.io.files import read_text
 from snrmjax.io.laboratory.contents import LaboratoryFile
 from snrmjax.io.laboratory.reading import read_laboratory_file
@@ -162,7 +162,7 @@ def read_test_files(folder: Path, model: Path | None = None) -> TestFiles:
             else:
                 responses += [NamedResponses(path.name, one) for one in _linear(held, path)]
             for one in held.recordings:
-                record = one if told.is_empty else told_record(one, told, path.name, assumed)[0]
+                record = one if told.is_empty else mapped_record(one, told, path.name, assumed)[0]
                 several = f"{path.name}: {one.name}"
                 records.append(
                     NamedRecord(several if len(held.recordings) > 1 else path.name, record)

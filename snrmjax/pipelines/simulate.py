@@ -122,7 +122,7 @@ def _notes_on_curve(curve: ResponseCurve) -> Iterator[Fact]:
     if curve.branch == "main" and curve.status != CurveStatus.UPPER_END:
         yield Fact("curve_ended", force=curve.force, status=curve.status)
     if curve.not_located:
-        yield Fact("events_not_located", force=curve.force, kinds=curve.not_located)
+        yield Fact("curve_events_not_located", force=curve.force, kinds=curve.not_located)
     unknown = int(np.sum(curve.stability == int(Stability.NOT_COMPUTED)))
     if unknown:
         yield Fact("stability_not_computed", force=curve.force, n=unknown)

@@ -69,9 +69,10 @@ class Workers:
         """Start a task. Raises `ClusterGone`."""
         if self._executor is None:
             self._executor = self._start()
+        lost: tuple[type[Exception], ...] = (OSError, *self._gone)
         try:
             return self._executor.submit(function, *arguments)
-        except (*self._gone, OSError) as error:
+        except lost as error:
             raise ClusterGone("the Dask scheduler is gone") from error
 
     def result(self, future: Future) -> Any:

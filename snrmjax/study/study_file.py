@@ -108,17 +108,17 @@ def _variation(table: TomlTable) -> AbstractVariation:
 
 
 def _single(table: TomlTable) -> AbstractVariation:
-    name = table.text("parameter")
+    name = (table.text("parameter"),)
     ways = [key for key in ("values", "range", "distribution") if key in table.entries]
     if len(ways) != 1:
         found = " and ".join(f"`{key}`" for key in ways) or "none of them"
         raise ValueError(
-            f"{table.place} ({name}) needs one of `values`, `range`, `distribution`, but has "
+            f"{table.place} ({name[0]}) needs one of `values`, `range`, `distribution`, but has "
             f"{found}."
         )
     if ways == ["values"]:
         table.check_keys(("parameter", "values"))
-        return Discrete(name, table.numbers("values", each="value"))
+        return Discrete(name, np.array(table.numbers("values", each="value")))
     if ways == ["range"]:
         table.check_keys(("parameter", "range"), ("points",))
         ends = table.numbers("range", each="end")
@@ -149,7 +149,9 @@ def _joint(table: TomlTable) -> AbstractVariation:
     ]
     if len(each) != len(names) or any(len(row) != len(names) for row in each):
         raise table.refusal("covariance", f"{len(names)} rows of {len(names)} numbers", rows)
-    return MultivariateNormal(names, table.numbers("mean", each="entry"), each)
+    return MultivariateNormal(
+        tuple(names), np.array(table.numbers("mean", each="entry")), np.array(each)
+    )
 
 
 def _computation(

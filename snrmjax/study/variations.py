@@ -216,7 +216,7 @@ def stated_variations(model: Structure) -> tuple[Normal, ...]:
     values, stds = parameter_values(model), stated_stds(model)
     if not stds:
         raise ValueError("the model states no standard deviation of its parameters.")
-    return tuple(Normal(name, values[name], std) for name, std in stds.items())
+    return tuple(Normal((name,), values[name], std) for name, std in stds.items())
 
 
 def posterior_variation(calibrated: CalibratedModel | BackboneCalibration) -> MultivariateNormal:

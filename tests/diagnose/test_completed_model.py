@@ -27,9 +27,9 @@ def test_a_negative_damping_ratio_is_no_reason_to_lose_the_answer(tmp_path):
     assert "quadratic_damping" in found.effects
     assert found.completed is None
     assert found.answer.completed_status is CompletedStatus.NOT_PHYSICAL
-    (note,) = (note for note in found.notes if "completed model" in note)
-    assert "damping_ratio" in note
-    ratio = float(note.split("but is ")[1].split(". ")[0])
+    (note,) = (note for note in found.notes if note.kind == "not_physical")
+    assert "damping_ratio" in note["reason"]
+    ratio = float(note["reason"].split("but is ")[1].rstrip("."))
     assert ratio == pytest.approx(-0.2 * ZETA, rel=0.1)
     told = json.loads((tmp_path / "diagnosis.json").read_text())
     assert told["effects"] == list(found.effects)

@@ -208,7 +208,7 @@ def test_limits_and_losing_candidates_are_folded_away(drag, pictures):
     ],
 )
 def test_each_verdict_is_one_plain_sentence(drag, verdict, words):
-    sentence = told.readable_verdict(dataclasses.replace(drag[2], verdict=verdict))
+    sentence = dataclasses.replace(drag[2], verdict=verdict).verdict_sentence
     assert words in sentence
     assert sentence.endswith(".")
     assert "_" not in sentence
@@ -219,7 +219,7 @@ def test_rivals_are_told_where_there_are_some(drag):
     unclear = dataclasses.replace(
         drag[2], verdict="ambiguous", answer=drag[2].answer._replace(candidates=rivals)
     )
-    assert told.readable_verdict(unclear).startswith(
+    assert unclear.verdict_sentence.startswith(
         "The model lacks quadratic damping, cubic damping or Jenkins slider, and these data cannot "
         "tell which"
     )

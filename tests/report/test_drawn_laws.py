@@ -3,20 +3,20 @@
 import numpy as np
 import pytest
 
-from snrmjax.diagnose.laws.law_search import DrawnLaw
+from snrmjax.diagnose.laws.law_search import DrawnLaw, LawOnset
 from snrmjax.model.effect_metadata import Argument
 from snrmjax.report.figures.drawn_laws import drawn_laws_figure, law_tables
 
 AT = np.array([0.0, 1e-3, 2e-3, 4e-3])
 SPRING = DrawnLaw(
-    "odd stiffness, hardening from 1 mm",
+    *("spring", ("odd",), (LawOnset(1e-3, 0, True),)),
     Argument.DISPLACEMENT,
     AT,
     np.array([0.0, 0.1, 0.4, 1.6]),
     np.array([0.0, 0.05, 0.05, 0.2]),
     2e-3,
 )
-FILM = SPRING._replace(name="damping that depends on the displacement", passing=0.25)
+BY_DISPLACEMENT = SPRING._replace(law="displacement_damping", symmetries=(), passing=0.25)
 
 
 def test_the_figure_has_the_curve_its_band_and_marks_what_is_extrapolated():
@@ -36,10 +36,10 @@ def test_the_figure_has_the_curve_its_band_and_marks_what_is_extrapolated():
 
 
 def test_two_laws_have_a_panel_each_and_a_table_each():
-    figure = drawn_laws_figure([SPRING, FILM])
+    figure = drawn_laws_figure([SPRING, BY_DISPLACEMENT])
     assert len(figure.axes) == 2
     assert "0.25 m/s" in figure.axes[1].get_title(loc="left") + figure.axes[1].get_title()
-    first, second = law_tables([SPRING, FILM])
+    first, second = law_tables([SPRING, BY_DISPLACEMENT])
     assert len(first.rows) == len(second.rows) == 4
     assert "hardening" in first.folded
     number, shown = first.rows[2]

@@ -30,14 +30,14 @@ def where_in_words(distribution: ResonanceDistribution) -> Fact:
     )
 
 
-def notes_on_resonance(distribution: ResonanceDistribution, load: str) -> list[Fact]:
+def notes_on_resonance(distribution: ResonanceDistribution, load: Fact) -> list[Fact]:
     """Which curves were left out."""
     if not distribution.negative_damping > _WORTH:
         return []
     return [Fact("negative_damping_left_out", load=load, share=distribution.negative_damping)]
 
 
-def notes_on_trends(trends: Sequence[LevelTrend], load: str) -> list[Fact]:
+def notes_on_trends(trends: Sequence[LevelTrend], load: Fact) -> list[Fact]:
     """Which errors of levels change steadily with their force, and what that comes to."""
     return [
         Fact(

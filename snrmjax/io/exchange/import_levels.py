@@ -1,5 +1,6 @@
 """What number of level each imported state gets."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -16,13 +17,13 @@ class MeasuredPart(NamedTuple):
     frequency: Float[np.ndarray, " state"]  # rad/s
     force: Float[np.ndarray, " state"]  # N or V
     velocity: Complex[np.ndarray, "state sensor"]  # m/s
-    key: Float[np.ndarray, " state"] | None = None  # what a column or the order says of levels
-    velocity_std: Float[np.ndarray, "state sensor"] | None = None  # m/s
-    phase_std: Float[np.ndarray, "state sensor"] | None = None  # rad
+    key: Float[np.ndarray, " state"] | None  # what a column or the order says of levels
+    velocity_std: Float[np.ndarray, "state sensor"]  # m/s; NaN where nobody states it
+    phase_std: Float[np.ndarray, "state sensor"]  # rad
 
 
 def numbered_levels(
-    parts: list[MeasuredPart], level: str, assumed: Assumptions
+    parts: Sequence[MeasuredPart], level: str, assumed: Assumptions
 ) -> tuple[np.ndarray, str]:
     """The level of every state of all parts, and the rule that was used, for the map.
 

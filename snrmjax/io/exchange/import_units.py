@@ -37,9 +37,9 @@ def require_name(option: str, name: str, known: Iterable[str], what: str, file: 
         )
 
 
-def force_meaning(told: ImportMap, file_unit: str, what: str) -> Force:
+def force_meaning(mapping: ImportMap, file_unit: str, what: str) -> Force:
     """The unit of the force. Raises `ValueError` with a question where nobody states it."""
-    unit = told.force_unit or file_unit
+    unit = mapping.force_unit or file_unit
     if not unit:
         raise ValueError(
             f"in which unit is {what}? State it: --force-unit N (or lbf, V for a drive voltage)."
@@ -94,16 +94,17 @@ def motion_meaning(
     return meaning.dimension, meaning.factor, stated
 
 
-def amplitude_factor(told: ImportMap, units: Mapping[str, str], assumed: Assumptions) -> float:
+def amplitude_factor(mapping: ImportMap, units: Mapping[str, str], assumed: Assumptions) -> float:
     """What turns amplitudes into peak amplitudes: stated, said by a unit, else peak is assumed."""
     said = {unit_meaning(unit).size for unit in units.values() if unit}
     sizes = said - {""}
-    if told.amplitude:
-        if sizes - {told.amplitude}:
+    if mapping.amplitude:
+        if sizes - {mapping.amplitude}:
             raise ValueError(
-                f"--amplitude says {told.amplitude}, but a unit says {min(sizes)}: which is right?"
+                f"--amplitude says {mapping.amplitude}, but a unit says {min(sizes)}: which is "
+                "right?"
             )
-        return float(AMPLITUDE_FACTORS[told.amplitude])
+        return float(AMPLITUDE_FACTORS[mapping.amplitude])
     if len(sizes) > 1 or (sizes and "" in said and sizes != {"peak"}):
         raise ValueError(
             f"units say {' and '.join(sorted(sizes))} of some columns and not of others: which "
@@ -115,33 +116,31 @@ def amplitude_factor(told: ImportMap, units: Mapping[str, str], assumed: Assumpt
 
 
 def frequency_in_rad(
-    values: Float[np.ndarray, " row"], told: ImportMap, file_unit: str, assumed: Assumptions
+    values: Float[np.ndarray, " row"], mapping: ImportMap, file_unit: str, assumed: Assumptions
 ) -> Float[np.ndarray, " row"]:
     """Frequencies in rad/s; hertz where nothing is said."""
-    unit = told.frequency_unit or file_unit
+    unit = mapping.frequency_unit or file_unit
     if not unit:
-        if told.frequency.lower().rsplit(".", 1)[-1] in ("w", "omega", "om"):
+        if mapping.frequency.lower().rsplit(".", 1)[-1] in ("w", "omega", "om"):
             raise ValueError(
-                f"is {told.frequency} in Hz or in rad/s? State it: --frequency-unit Hz or rad/s."
+                f"is {mapping.frequency} in Hz or in rad/s? State it: --frequency-unit Hz or rad/s."
             )
         assumed.add("frequency_unit", Fact("nothing_is_said"), "Hz")
         return values * _HERTZ
-    assumed.unit("frequency_unit", told.frequency_unit, file_unit)
+    assumed.unit("frequency_unit", mapping.frequency_unit, file_unit)
     meaning = _understood(unit, "--frequency-unit")
     if meaning.dimension != "frequency":
         raise ValueError(
-            f"{told.frequency} must be a frequency, but its unit {unit} is of {meaning.dimension}: "
-            "--frequency names another column."
+            f"{mapping.frequency} must be a frequency, but its unit {unit} is of "
+            f"{meaning.dimension}: --frequency names another column."
         )
-    if abs(meaning.factor / _HERTZ - 1) < 1e-14:
-        return values * _HERTZ
     return values * meaning.factor
 
 
 def phase_in_rad(
     values: Float[np.ndarray, "*row"],
     column: str,
-    told: ImportMap,
+    mapping: ImportMap,
     file_unit: str,
     assumed: Assumptions,
 ) -> Float[np.ndarray, "*row"]:
@@ -150,7 +149,7 @@ def phase_in_rad(
     Raises `ValueError` with a question where degrees and radians are both possible.
     """
     stated = unit_meaning(file_unit) if file_unit else None
-    if stated and stated.dimension != "angle" and not told.phase_unit:
+    if stated and stated.dimension != "angle" and not mapping.phase_unit:
         raise ValueError(
             f"{column} must be an angle, but its unit is {file_unit}: --phase names another "
             "column, --phase-unit its unit."
@@ -158,12 +157,13 @@ def phase_in_rad(
     of_file = (
         "" if not stated or stated.dimension != "angle" else "rad" if stated.factor == 1 else "deg"
     )
-    if told.phase_unit and of_file not in ("", told.phase_unit):
+    if mapping.phase_unit and of_file not in ("", mapping.phase_unit):
         raise ValueError(
-            f"--phase-unit says {told.phase_unit}, but {column} is in {file_unit}: which is right?"
+            f"--phase-unit says {mapping.phase_unit}, but {column} is in {file_unit}: which is "
+            "right?"
         )
-    unit = told.phase_unit or of_file
-    if not told.phase_unit and of_file:
+    unit = mapping.phase_unit or of_file
+    if not mapping.phase_unit and of_file:
         assumed.add("phase_unit", Fact("unit_of_file"), unit)
     if not unit:
         ends = [word for word in ("deg", "rad") if column.lower().rstrip("_)]s").endswith(word)]
@@ -175,9 +175,9 @@ def phase_in_rad(
         )
         unit, why = (ends[0], said) if ends else ("deg", beyond)
         assumed.add("phase_unit", why, unit)
-    if not told.phase_sign:
+    if not mapping.phase_sign:
         assumed.add("phase_sign", Fact("phase_ahead_of_the_force"), "lead")
-    sign = -1.0 if told.phase_sign == "lag" else 1.0
+    sign = -1.0 if mapping.phase_sign == "lag" else 1.0
     return sign * (np.radians(values) if unit == "deg" else values)
 
 

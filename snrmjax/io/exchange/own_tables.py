@@ -34,25 +34,25 @@ def states_of_own_table(table: NumberTable, file: str) -> SteadyStates:
     return steady_states_of_fields(fields, file)
 
 
-def restated(states: SteadyStates, told: ImportMap) -> SteadyStates:
+def restated(states: SteadyStates, mapping: ImportMap) -> SteadyStates:
     """Steady states of our table whose numbers are not what our columns say, in SI.
 
-    Arguments: `told.unit` of the velocity columns (of an acceleration, say), `told.force_unit` of
-    the force's (a voltage makes it a drive), `told.amplitude`, `told.phase_sign`.
+    Arguments: of `mapping` the `unit` of the velocity columns (of an acceleration, say), the
+    `force_unit` (a voltage makes it a drive), `amplitude` and `phase_sign`.
     Raises `ValueError` for units that are none of a motion or of a force.
     """
     orders = (1, *states.harmonic_order)
     factors = np.ones((states.n_states, len(orders)), dtype=complex)
-    if told.unit:
-        quantity, factor, _ = motion_meaning("", told.unit, "", "the velocity")
+    if mapping.unit:
+        quantity, factor, _ = motion_meaning("", mapping.unit, "", "the velocity")
         channel = Channel("", quantity)  # type: ignore[arg-type]
         factors = factor * velocity_factors([channel], orders, np.asarray(states.frequency))[:, 0]
-    factors = factors * AMPLITUDE_FACTORS[told.amplitude]
+    factors = factors * AMPLITUDE_FACTORS[mapping.amplitude]
     phasors = np.concatenate(
         [np.asarray(states.velocity)[:, :, None], np.asarray(states.harmonics)], axis=2
     )
     phasors = phasors * factors[:, None]
-    if told.phase_sign == "lag":
+    if mapping.phase_sign == "lag":
         phasors = phasors.conj()
     size = np.abs(factors[:, :1])
     # What is stated is the rms over the harmonics, whose noise is alike in the unit of the columns.
@@ -65,17 +65,17 @@ def restated(states: SteadyStates, told: ImportMap) -> SteadyStates:
         velocity_std=states.velocity_std * size,
         harmonic_std=states.harmonic_std * floor,
     )
-    return _with_force(changed, told)
+    return _with_force(changed, mapping)
 
 
-def _with_force(states: SteadyStates, told: ImportMap) -> SteadyStates:
-    """With the force, or the drive in its place, in the unit that is told."""
-    force = force_meaning(told, "N", "the force")
-    factor = force.factor * AMPLITUDE_FACTORS[told.amplitude]
+def _with_force(states: SteadyStates, mapping: ImportMap) -> SteadyStates:
+    """With the force, or the drive in its place, in the unit that is stated."""
+    force = force_meaning(mapping, "N", "the force")
+    factor = force.factor * AMPLITUDE_FACTORS[mapping.amplitude]
     missing = jnp.full(states.n_states, jnp.nan)
     known = jnp.isfinite(states.force)
-    if not told.force_unit:
-        drive, newtons = states.drive * AMPLITUDE_FACTORS[told.amplitude], states.force * factor
+    if not mapping.force_unit:
+        drive, newtons = states.drive * AMPLITUDE_FACTORS[mapping.amplitude], states.force * factor
     else:
         every = factor * jnp.where(known, states.force, states.drive)
         drive, newtons = (every, missing) if force.is_voltage else (missing, every)
@@ -83,14 +83,14 @@ def _with_force(states: SteadyStates, told: ImportMap) -> SteadyStates:
     return dataclasses.replace(states, force=newtons, drive=drive, force_std=std)
 
 
-def restated_how(told: ImportMap) -> Fact:
-    """What of our table is told to be otherwise."""
+def restated_how(mapping: ImportMap) -> Fact:
+    """What of our table is said to be otherwise."""
     return Fact(
         "our_own_table",
-        unit=told.unit,
-        force_unit=told.force_unit,
-        amplitude="" if told.amplitude == "peak" else told.amplitude,
-        conjugated=told.phase_sign == "lag",
+        unit=mapping.unit,
+        force_unit=mapping.force_unit,
+        amplitude="" if mapping.amplitude == "peak" else mapping.amplitude,
+        conjugated=mapping.phase_sign == "lag",
     )
 
 

@@ -20,7 +20,7 @@ _RULES = ("force", "runs", "file")
 def import_responses(
     sets: Sequence[FrequencyResponses],
     z: Sequence[float],
-    told: ImportMap,
+    mapping: ImportMap,
     file: str,
     assumed: Assumptions,
 ) -> tuple[MeasuredPart, ImportMap, Force, list[Fact]]:
@@ -30,40 +30,49 @@ def import_responses(
     reference, whose amplitude the map states: one for all, one a set, or the z axis.
     Raises `ValueError` with a question that names the option for what cannot be told.
     """
-    if not told.responses:
-        named = ", ".join(dict.fromkeys(c.name for one in sets for c in one.responses))
+    if not mapping.responses:
+        named = ", ".join(dict.fromkeys(c.name for level_set in sets for c in level_set.responses))
         raise ValueError(
             f"which channel of {file} is the response? --response CHANNEL names it, of {named}."
         )
-    if told.level not in ("", "z", "order", *_RULES):
-        raise ValueError(f"--level must be order, z, force or file of {file}, not {told.level!r}.")
-    if told.level == "z" and not np.isfinite(z).all():
+    if mapping.level not in ("", "z", "order", *_RULES):
+        raise ValueError(
+            f"--level must be order, z, force or file of {file}, not {mapping.level!r}."
+        )
+    if mapping.level == "z" and not np.isfinite(z).all():
         raise ValueError(f"--level z: {file} states no value on the z axis: --level order.")
-    spectra = bool(told.force) and all(told.force in _names(one.responses) for one in sets)
-    keys = z if told.level == "z" else np.arange(1.0, len(sets) + 1)
-    columns = {_FREQUENCY: np.concatenate([_or_nothing(one.frequency) for one in sets])}
-    columns[_SET] = np.repeat(keys, [one.frequency.size for one in sets])
+    spectra = bool(mapping.force) and all(
+        mapping.force in _names(level_set.responses) for level_set in sets
+    )
+    keys = z if mapping.level == "z" else np.arange(1.0, len(sets) + 1)
+    columns = {_FREQUENCY: np.concatenate([_or_nothing(level_set.frequency) for level_set in sets])}
+    columns[_SET] = np.repeat(keys, [level_set.frequency.size for level_set in sets])
     units = {_FREQUENCY: "rad/s"}
-    rule = told.level if told.level in _RULES else _SET
-    as_table = told._replace(frequency=_FREQUENCY, frequency_unit="", level=rule)
+    rule = mapping.level if mapping.level in _RULES else _SET
+    as_table = mapping._replace(frequency=_FREQUENCY, frequency_unit="", level=rule)
     if not spectra:
-        amplitude = _amplitudes(sets, z, told, file)
+        amplitude = _amplitudes(sets, z, mapping, file)
         pairs = zip(amplitude, sets, strict=True)
-        columns[_FORCE] = np.concatenate([np.full(one.frequency.size, size) for size, one in pairs])
-        units[_FORCE] = "V" if _reference_force(sets, told, file).is_voltage else "N"
+        columns[_FORCE] = np.concatenate(
+            [np.full(level_set.frequency.size, size) for size, level_set in pairs]
+        )
+        units[_FORCE] = "V" if _reference_force(sets, mapping, file).is_voltage else "N"
         as_table = as_table._replace(
             force=_FORCE, force_unit="", force_amplitude=(), over_force=True
         )
-    asked = [(one.channel, one.unit, "--response") for one in told.responses]
-    for name, unit, option in [*asked, *([(told.force, told.force_unit, "--force")] * spectra)]:
+    asked = [(response.channel, response.unit, "--response") for response in mapping.responses]
+    for name, unit, option in [
+        *asked,
+        *([(mapping.force, mapping.force_unit, "--force")] * spectra),
+    ]:
         parts = []
-        for one in sets:
-            names = _names(one.responses)
+        for level_set in sets:
+            names = _names(level_set.responses)
             require_name(option, name, names, "responses", file)
             row = names.index(name)
-            channel = one.responses[row]
+            channel = level_set.responses[row]
             # A known channel's values are in SI already: its own unit, or the one that is stated.
-            values = one.values[row, _reference(one, told, file, spectra=spectra)]
+            values = level_set.values[row, _reference(level_set, mapping, file, spectra=spectra)]
             parts.append(values / channel.calibration if unit else values)
         columns[name] = (
             np.concatenate(parts) if option == "--response" else _or_nothing(np.concatenate(parts))
@@ -77,13 +86,13 @@ def import_responses(
         assumed.add("force_amplitude", Fact("spectra_of_one_reference"))
     else:
         del assumed["force_unit"]
-        reference = sets[0].references[_reference(sets[0], told, file, spectra=False)]
-        if not _si(reference) and not told.force_unit:
+        reference = sets[0].references[_reference(sets[0], mapping, file, spectra=False)]
+        if not _si(reference) and not mapping.force_unit:
             assumed.add("force_unit", Fact("reference_without_unit"), "N")
-    if not told.level:
+    if not mapping.level:
         assumed.add("level", Fact("level_a_set"))
-    told = told._replace(responses=found.responses, level=told.level or "order")
-    return part, told, force, notes
+    mapping = mapping._replace(responses=found.responses, level=mapping.level or "order")
+    return part, mapping, force, notes
 
 
 def _or_nothing(values: np.ndarray) -> np.ndarray:
@@ -91,23 +100,23 @@ def _or_nothing(values: np.ndarray) -> np.ndarray:
     return np.where(values == 0, np.nan, values)
 
 
-def _reference_force(sets: Sequence[FrequencyResponses], told: ImportMap, file: str) -> Force:
+def _reference_force(sets: Sequence[FrequencyResponses], mapping: ImportMap, file: str) -> Force:
     """What the responses are over."""
-    for one in sets:
-        channel = one.references[_reference(one, told, file, spectra=False)]
-        if told.force_unit and _si(channel) not in ("", told.force_unit):
+    for level_set in sets:
+        channel = level_set.references[_reference(level_set, mapping, file, spectra=False)]
+        if mapping.force_unit and _si(channel) not in ("", mapping.force_unit):
             raise ValueError(
-                f"--force-unit says {told.force_unit}, but the responses of {file} are over "
+                f"--force-unit says {mapping.force_unit}, but the responses of {file} are over "
                 f"{channel.name} in {_si(channel)}, in which --force-amplitude is stated too: "
                 "leave --force-unit out."
             )
-    return force_meaning(told, _si(channel) or "N", f"{channel.name} of {file}")
+    return force_meaning(mapping, _si(channel) or "N", f"{channel.name} of {file}")
 
 
 def _amplitudes(
-    sets: Sequence[FrequencyResponses], z: Sequence[float], told: ImportMap, file: str
+    sets: Sequence[FrequencyResponses], z: Sequence[float], mapping: ImportMap, file: str
 ) -> np.ndarray:
-    stated = told.force_amplitude
+    stated = mapping.force_amplitude
     if not stated:
         levels = ", ".join(f"{value:g}" for value in z)
         has_z = bool(np.isfinite(z).all())
@@ -125,7 +134,7 @@ def _amplitudes(
             )
         values = np.asarray(z, dtype=float)
     else:
-        values = np.asarray([float(one) for one in stated])
+        values = np.asarray([float(newtons) for newtons in stated])
     if values.size not in (1, len(sets)):
         raise ValueError(
             f"--force-amplitude must be one for all or one for each of the {len(sets)} sets of "
@@ -142,12 +151,14 @@ def _names(channels: Sequence[Channel]) -> list[str]:
     return [channel.name for channel in channels]
 
 
-def _reference(one: FrequencyResponses, told: ImportMap, file: str, *, spectra: bool) -> int:
-    names = _names(one.references)
-    if told.force and not spectra:
-        what = f"responses {', '.join(_names(one.responses))}, and over the references"
-        require_name("--force", told.force, names, what, file)
-        return names.index(told.force)
+def _reference(
+    level_set: FrequencyResponses, mapping: ImportMap, file: str, *, spectra: bool
+) -> int:
+    names = _names(level_set.references)
+    if mapping.force and not spectra:
+        what = f"responses {', '.join(_names(level_set.responses))}, and over the references"
+        require_name("--force", mapping.force, names, what, file)
+        return names.index(mapping.force)
     if len(names) > 1:
         raise ValueError(
             f"which reference of {file} is the force? --force names it, of {', '.join(names)}."

@@ -29,10 +29,10 @@ _DEVIATION = re.compile(r"stdev|stddev|std|sigma|deviation|dev")
 
 
 class _Source(NamedTuple):
-    """A table, what is told of it, and what is assumed."""
+    """A table, what the map says of it, and what is assumed."""
 
     table: NumberTable
-    told: ImportMap
+    mapping: ImportMap
     file: str
     assumed: Assumptions
 
@@ -54,15 +54,15 @@ class _Source(NamedTuple):
 
     def phasors(self, values: np.ndarray) -> np.ndarray:
         """Phasors as e^(+iwt), conjugated where the sign of their phases is said to be another."""
-        if np.iscomplexobj(values) and not self.told.phase_sign:
+        if np.iscomplexobj(values) and not self.mapping.phase_sign:
             self.assumed.add("phase_sign", Fact("phasors_turn_forward"), "lead")
         phasors = values.astype(complex)
-        return phasors.conj() if self.told.phase_sign == "lag" else phasors
+        return phasors.conj() if self.mapping.phase_sign == "lag" else phasors
 
     def phase(self, name: str, option: str) -> Float[np.ndarray, " row"]:
         """A column of phases in rad, positive where the response leads."""
         values = self.real(name, option)
-        return phase_in_rad(values, name, self.told, self.unit(name), self.assumed)
+        return phase_in_rad(values, name, self.mapping, self.unit(name), self.assumed)
 
     def with_role(self, *roles: str) -> list[str]:
         """Columns whose names say that they have one of these roles."""
@@ -75,42 +75,48 @@ class _Source(NamedTuple):
 
 
 def import_table(
-    table: NumberTable, told: ImportMap, file: str, assumed: Assumptions
+    table: NumberTable, mapping: ImportMap, file: str, assumed: Assumptions
 ) -> tuple[MeasuredPart, ImportMap, Force, list[Fact]]:
     """States of a table, the map with what was found, the force's unit, and notes.
 
     Raises `ValueError` with a question that names the option for what cannot be told.
     """
-    source = _Source(table, told, file, assumed)
-    told = told._replace(frequency=told.frequency or _frequency_column(source))
-    source = source._replace(told=told)
+    source = _Source(table, mapping, file, assumed)
+    mapping = mapping._replace(frequency=mapping.frequency or _frequency_column(source))
+    source = source._replace(mapping=mapping)
     omega = frequency_in_rad(
-        source.real(told.frequency, "--frequency"), told, source.unit(told.frequency), assumed
+        source.real(mapping.frequency, "--frequency"),
+        mapping,
+        source.unit(mapping.frequency),
+        assumed,
     )
-    if not told.responses:
+    if not mapping.responses:
         raise ValueError(
             f"which column of {file} is the response? --response COLUMN:velocity (or acceleration, "
             f"displacement) names it, of {source.listed}."
         )
     size, force = _force(source)
-    units = {one.channel: one.unit or source.unit(one.channel) for one in told.responses}
-    units = {} if told.over_force else units
-    units |= {told.force: force.unit} if told.force else {}
-    peak = amplitude_factor(told, units, assumed) if units else 1.0
-    size = size * peak if told.force else size
+    units = {
+        response.channel: response.unit or source.unit(response.channel)
+        for response in mapping.responses
+    }
+    units = {} if mapping.over_force else units
+    units |= {mapping.force: force.unit} if mapping.force else {}
+    peak = amplitude_factor(mapping, units, assumed) if units else 1.0
+    size = size * peak if mapping.force else size
     # Over the force only its amplitude counts; else phases are of one clock with the force's own.
-    turn = np.abs(size) if told.over_force else peak * np.exp(-1j * np.angle(size))
+    turn = np.abs(size) if mapping.over_force else peak * np.exp(-1j * np.angle(size))
     velocity, responses, errors = [], [], []
-    for k, one in enumerate(told.responses):
-        one = _with_errors_by_name(source, one, k + 1)
-        row, filled, scale = _response(source, one, omega, k + 1)
+    for k, response in enumerate(mapping.responses):
+        response = _with_errors_by_name(source, response, k + 1)
+        row, filled, scale = _response(source, response, omega, k + 1)
         velocity.append(row * turn)
         responses.append(filled)
         errors.append(_errors(source, filled, np.abs(scale * turn)))
     phasors = np.stack(velocity, axis=1)
     amplitude_std, phase_std = np.moveaxis(np.array(errors), (0, 1, 2), (2, 0, 1))
     level, key = _level(source)
-    told = told._replace(responses=tuple(responses), level=level)
+    mapping = mapping._replace(responses=tuple(responses), level=level)
     good = np.isfinite(omega) & np.isfinite(size) & np.isfinite(phasors).any(axis=1)
     _check(omega[good], np.abs(size[good]), file)
     part = MeasuredPart(
@@ -119,59 +125,59 @@ def import_table(
     )
     left_out = int(np.sum(~good))
     notes = [Fact("rows_incomplete", n=left_out, of=len(good), file=file)] if left_out else []
-    return part, told, force, notes
+    return part, mapping, force, notes
 
 
 def _frequency_column(source: _Source) -> str:
     """The only column that is a frequency by its name."""
-    found = source.with_role("frequency")
-    if len(found) != 1:
+    columns = source.with_role("frequency")
+    if len(columns) != 1:
         raise ValueError(
             f"which column of {source.file} is the frequency? --frequency names it, of "
-            f"{', '.join(found) or source.listed}."
+            f"{', '.join(columns) or source.listed}."
         )
     source.assumed.add("frequency", Fact("column_by_name"))
-    return found[0]
+    return columns[0]
 
 
 def _force(source: _Source) -> tuple[Complex[np.ndarray, " row"], Force]:
     """The force of every row, of a column or as stated."""
-    told, file, name = source.told, source.file, source.told.force
+    mapping, file, name = source.mapping, source.file, source.mapping.force
     if not name:
-        if len(told.force_amplitude) != 1 or told.force_amplitude[0] == "z":
+        if len(mapping.force_amplitude) != 1 or mapping.force_amplitude[0] == "z":
             raise ValueError(
                 f"which column of {file} is the force? --force COLUMN names it, of "
                 f"{source.listed}; --force-amplitude N states one that no column has."
             )
-        stated = float(told.force_amplitude[0])
+        stated = float(mapping.force_amplitude[0])
         return np.full(source.table.n_rows, stated, dtype=complex), Force(1.0, False, "N")
-    source.assumed.unit("force_unit", told.force_unit, source.unit(name))
-    force = force_meaning(told, source.unit(name), f"{name} of {file}")
+    source.assumed.unit("force_unit", mapping.force_unit, source.unit(name))
+    force = force_meaning(mapping, source.unit(name), f"{name} of {file}")
     raw = source.column(name, "--force")
     if not np.iscomplexobj(raw) and np.nanmin(raw, initial=1.0) < 0:
         raise ValueError(f"{name} of {file} has negative amplitudes: --force names another column.")
     size = source.phasors(raw) * force.factor
-    if told.force_phase:
-        size = size * np.exp(1j * source.phase(told.force_phase, "--force-phase"))
+    if mapping.force_phase:
+        size = size * np.exp(1j * source.phase(mapping.force_phase, "--force-phase"))
     return size, force
 
 
 def _response(
-    source: _Source, one: ResponseMap, omega: Float[np.ndarray, " row"], number: int
+    source: _Source, response: ResponseMap, omega: Float[np.ndarray, " row"], number: int
 ) -> tuple[Complex[np.ndarray, " row"], ResponseMap, Complex[np.ndarray, " row"]]:
     """The velocity phasors of one response (over the force where the table has it so).
 
     And the map with what was found, and what a number of the response is multiplied with.
     """
-    told, file, assumed, name = source.told, source.file, source.assumed, one.channel
+    mapping, file, assumed, name = source.mapping, source.file, source.assumed, response.channel
     values = source.column(name, "--response")
     quantity, factor, unit = motion_meaning(
-        one.quantity, one.unit, source.unit(name), name, is_ratio=told.over_force
+        response.quantity, response.unit, source.unit(name), name, is_ratio=mapping.over_force
     )
-    assumed.unit(f"response {number}.unit", one.unit, source.unit(name))
-    if not one.quantity:
+    assumed.unit(f"response {number}.unit", response.unit, source.unit(name))
+    if not response.quantity:
         assumed.add(f"response {number}.quantity", Fact("quantity_by_unit", unit=unit))
-    imaginary, phase = one.imaginary, one.phase
+    imaginary, phase = response.imaginary, response.phase
     if not (np.iscomplexobj(values) or imaginary or phase):
         imaginary, phase = _partner(source, name)
         if not (imaginary or phase):
@@ -186,8 +192,8 @@ def _response(
     elif imaginary:
         phasor = np.empty(len(values), dtype=complex)
         phasor.real, phasor.imag = values, source.real(imaginary, "--imaginary")
-        phasor = phasor.conj() if told.phase_sign == "lag" else phasor
-        if not told.phase_sign:
+        phasor = phasor.conj() if mapping.phase_sign == "lag" else phasor
+        if not mapping.phase_sign:
             assumed.add("phase_sign", Fact("imaginary_ahead_of_the_force"), "lead")
     else:
         if np.nanmin(values, initial=0.0) < 0:
@@ -196,17 +202,19 @@ def _response(
                 "--imaginary COLUMN names the other one."
             )
         phasor = values * np.exp(1j * source.phase(phase, "--phase"))
-    sensor = sensor_of(one, told, number, assumed)
+    sensor = sensor_of(response, mapping, number, assumed)
     turn = velocity_factors([Channel(name, quantity)], [1], omega)[:, 0, 0]  # type: ignore[arg-type]
-    filled = one._replace(quantity=quantity, sensor=sensor, phase=phase, imaginary=imaginary)
+    filled = response._replace(quantity=quantity, sensor=sensor, phase=phase, imaginary=imaginary)
     return phasor * factor * turn, filled, factor * turn
 
 
-def sensor_of(one: ResponseMap, told: ImportMap, number: int, assumed: Assumptions) -> str:
+def sensor_of(response: ResponseMap, mapping: ImportMap, number: int, assumed: Assumptions) -> str:
     """The sensor of a response: stated, the only one, or named like its channel."""
-    if not one.sensor:
+    if not response.sensor:
         assumed.add(f"response {number}.sensor", Fact("sensor_not_stated"))
-    return one.sensor or (UNNAMED_SENSOR[0] if len(told.responses) == 1 else one.channel)
+    return response.sensor or (
+        UNNAMED_SENSOR[0] if len(mapping.responses) == 1 else response.channel
+    )
 
 
 def _partner(source: _Source, channel: str) -> tuple[str, str]:
@@ -217,23 +225,23 @@ def _partner(source: _Source, channel: str) -> tuple[str, str]:
             return swapped, ""
         others = source.with_role("imaginary")
         return (others[0] if len(others) == 1 else ""), ""
-    phases = [name for name in source.with_role("phase") if name != source.told.force_phase]
-    return "", (phases[0] if len(phases) == 1 and len(source.told.responses) == 1 else "")
+    phases = [name for name in source.with_role("phase") if name != source.mapping.force_phase]
+    return "", (phases[0] if len(phases) == 1 and len(source.mapping.responses) == 1 else "")
 
 
 def _swap(name: str) -> str:
     """The name of an imaginary part beside that of a real part."""
     for old, new in (("real", "imag"), ("Real", "Imag"), ("re", "im"), ("Re", "Im")):
-        found = re.sub(rf"(?<![A-Za-z]){old}(?![A-Za-z])|(?<=_){old}(?=_|$)", new, name)
-        if found != name:
-            return found
+        swapped = re.sub(rf"(?<![A-Za-z]){old}(?![A-Za-z])|(?<=_){old}(?=_|$)", new, name)
+        if swapped != name:
+            return swapped
     last = {"X": "Y", "x": "y"}.get(name[-1:], "")
     return last and name[:-1] + last
 
 
 def _level(source: _Source) -> tuple[str, np.ndarray | None]:
     """The rule for levels, and the numbers of a column where one has them."""
-    rule, columns = source.told.level, source.table.columns
+    rule, columns = source.mapping.level, source.table.columns
     if rule in ("force", "runs", "file"):
         return rule, None
     if rule in columns:
@@ -266,31 +274,31 @@ def _check(omega: Float[np.ndarray, " row"], force: Float[np.ndarray, " row"], f
 # Standard deviations, as lock-in amplifiers list them.
 
 
-def _with_errors_by_name(source: _Source, one: ResponseMap, number: int) -> ResponseMap:
+def _with_errors_by_name(source: _Source, response: ResponseMap, number: int) -> ResponseMap:
     """A response with the columns of its errors: those that are named after it and its phase."""
     phases = source.with_role("phase")
-    phase = one.phase or (phases[0] if len(phases) == 1 else "")
-    found: dict[str, Any] = {}
-    for key, of in {"amplitude_std": one.channel, "phase_std": phase}.items():
+    phase = response.phase or (phases[0] if len(phases) == 1 else "")
+    named_columns: dict[str, Any] = {}
+    for key, of in {"amplitude_std": response.channel, "phase_std": phase}.items():
         named = [name for name in source.with_role("deviation") if _bare(name) == _bare(of)]
-        if of and not getattr(one, key) and len(named) == 1:
-            found[key] = named[0]
+        if of and not getattr(response, key) and len(named) == 1:
+            named_columns[key] = named[0]
             source.assumed.add(f"response {number}.{key}", Fact("deviation_of_one_row"))
-    return one._replace(**found)
+    return response._replace(**named_columns)
 
 
 def _errors(
-    source: _Source, one: ResponseMap, scale: Float[np.ndarray, " row"]
+    source: _Source, response: ResponseMap, scale: Float[np.ndarray, " row"]
 ) -> Float[np.ndarray, "2 row"]:
     """1σ of the velocity (m/s) and of the phase (rad) of every row; NaN where none is stated.
 
     Arguments: `scale` is what an amplitude of the table is multiplied with; phases' errors have
     the unit of the phases.
     """
-    turn = 1.0 if _in_radians(source, one) else np.pi / 180
+    turn = 1.0 if _in_radians(source, response) else np.pi / 180
     stated = (
-        (one.amplitude_std, "--amplitude-std", scale),
-        (one.phase_std, "--phase-std", np.asarray(turn)),
+        (response.amplitude_std, "--amplitude-std", scale),
+        (response.phase_std, "--phase-std", np.asarray(turn)),
     )
     missing = np.full(source.table.n_rows, np.nan)
     return np.stack(
@@ -298,15 +306,15 @@ def _errors(
     )
 
 
-def _in_radians(source: _Source, one: ResponseMap) -> bool:
+def _in_radians(source: _Source, response: ResponseMap) -> bool:
     """Whether an error of the phase is in radians: as its name, its unit or the phase's says."""
-    for name in (one.phase_std, one.phase):
+    for name in (response.phase_std, response.phase):
         unit = source.unit(name).lower()
         if unit.startswith("rad") or re.search(r"rad(?![a-z])", name.lower()):
             return True
         if unit.startswith(("deg", "°")) or "deg" in name.lower():
             return False
-    return source.told.phase_unit == "rad"
+    return source.mapping.phase_unit == "rad"
 
 
 def _bare(name: str) -> str:

@@ -43,6 +43,7 @@ def read_record_table(path: FilePath) -> TimeRecording:
     cells = read_cells(path)
     file = cells.file
     channels, notes = _channels(cells.names, file)
+    cells.require_rows()
     time = cells.numbers("time_s")
     values = np.stack([cells.numbers(one.name) for one in channels])
     if len(time) < _FEWEST:

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from snrmjax.measure.recordings.channels import Channel, checked_channels
+from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, Variable
 
 _HERTZ = 2 * np.pi
@@ -29,7 +30,7 @@ class FrequencyResponses(AbstractResult):
     references: tuple[Channel, ...] = eqx.field(static=True)
     averages: int | None = eqx.field(static=True, default=None)
     name: str = eqx.field(static=True, default="")
-    notes: tuple[str, ...] = eqx.field(static=True, default=())
+    notes: tuple[Fact | str, ...] = eqx.field(static=True, default=())
 
     def receptance(self) -> Complex[np.ndarray, "response reference frequency"]:
         """Displacement over reference: velocities over iΩ, accelerations over −Ω².
@@ -85,7 +86,7 @@ def frequency_responses(
     coherence: Float[np.ndarray, "response reference frequency"] | None = None,
     averages: int | None = None,
     name: str = "",
-    notes: Sequence[str] = (),
+    notes: Sequence[Fact | str] = (),
 ) -> FrequencyResponses:
     """Frequency responses, checked.
 

@@ -4,6 +4,8 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
+from snrmjax.numerics.facts import Fact
+
 
 class StepCounts(NamedTuple):
     """Steps that were used, and those left out by their reason."""
@@ -12,26 +14,14 @@ class StepCounts(NamedTuple):
     left_out: Mapping[str, int]
 
     @property
-    def steps(self) -> int:
-        """All steps."""
-        return self.used + sum(self.left_out.values())
-
-    @property
     def words(self) -> str:
-        """The counts as part of a sentence.
-
-        >>> StepCounts(44, {"unsettled": 58, "too short": 2}).words
-        '44 of 104 steps used; left out: 58 unsettled, 2 too short'
-        """
-        reasons = self.reasons
-        return f"{self.used} of {self.steps} steps used" + (
-            f"; left out: {reasons}" if reasons else ""
-        )
+        """The counts as part of a sentence: 44 of 104 steps used; left out: 58 unsettled."""
+        return str(Fact("steps_used", used=self.used, left_out=self.reasons))
 
     @property
-    def reasons(self) -> str:
-        """How many were left out for each reason; empty where none was."""
-        return ", ".join(f"{count} {reason}" for reason, count in self.left_out.items() if count)
+    def reasons(self) -> dict[str, int]:
+        """How many were left out for each reason for which any was."""
+        return {reason: count for reason, count in self.left_out.items() if count}
 
 
 def joined_counts(counts: Iterable[StepCounts]) -> StepCounts:

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from typing import ClassVar, NamedTuple
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -28,10 +27,11 @@ from snrmjax.measure.recordings.velocity_states import (
 )
 from snrmjax.measure.signals import require_fundamental
 from snrmjax.measure.states import SteadyStates
-from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
 from snrmjax.numerics.status import Status
+from snrmjax.numerics.units import HERTZ
 
-_HERTZ = 2 * np.pi
 _FEWEST_CYCLES = 10
 _HIGHEST = 3  # harmonics that are always fitted, so that they do not pass for noise
 _NEAR_TABLE = 0.5  # cycles over a step by which a table's frequency may be off
@@ -60,17 +60,25 @@ class SteppedSineStates(AbstractResult):
     coordinates: ClassVar[tuple[str, ...]] = ("step",)
 
     states: SteadyStates
-    start: Float[np.ndarray, " step"]  # s
-    stop: Float[np.ndarray, " step"]  # s
-    settled_from: Float[np.ndarray, " step"]  # s, NaN where it did not settle
-    frequency: Float[np.ndarray, " step"]  # rad/s
-    force: Float[np.ndarray, " step"]  # N or V
-    decay_time: Float[np.ndarray, " step"]  # s, of the transient, NaN where none was seen
-    moved: Float[np.ndarray, " step"]  # share by which a phasor moves over the part used
-    colour: Float[np.ndarray, " step"]  # largest scatter of blocks over that of white noise
-    state: Int[np.ndarray, " step"]  # row of `states`, −1 where there is none
-    status: Int[np.ndarray, " step"]  # a `StepStatus`
-    notes: tuple[str, ...] = eqx.field(static=True, default=())
+    start: Float[np.ndarray, " step"] = quantity("step", "s", "its start", name="start_s")
+    stop: Float[np.ndarray, " step"] = quantity("step", "s", "its end", name="stop_s")
+    # NaN where it did not settle.
+    settled_from: Float[np.ndarray, " step"] = quantity(
+        "step", "s", "from where on it was used", name="settled_from_s"
+    )
+    frequency: Float[np.ndarray, " step"] = quantity("step", "Hz", "frequency of the force")
+    force: Float[np.ndarray, " step"] = quantity("step", "N or V", "amplitude of the force")
+    # NaN where none was seen.
+    decay_time: Float[np.ndarray, " step"] = quantity(
+        "step", "s", "decay time of the transient", name="decay_time_s"
+    )
+    moved: Float[np.ndarray, " step"] = quantity("step", "1", "share that a phasor still moves")
+    noise_to_white_ratio: Float[np.ndarray, " step"] = quantity(
+        "step", "1", "scatter of blocks over white noise's"
+    )
+    state: Int[np.ndarray, " step"] = quantity("step", "1", "row of the steady states, -1: none")
+    status: Int[np.ndarray, " step"] = quantity("step", "", "whether it settled", of=StepStatus)
+    notes: tuple[Fact | str, ...] = setting(default=())
 
     @property
     def counts(self) -> StepCounts:
@@ -82,40 +90,13 @@ class SteppedSineStates(AbstractResult):
         }
         return StepCounts(self.states.n_states, left)
 
-    def summary(self) -> tuple[str, ...]:
-        """See `AbstractResult`."""
-        hertz = self.frequency / _HERTZ
-        failed = [
-            f"{np.sum(self.status == int(kind))} left out: {kind.message}"
-            for kind in StepStatus
-            if kind is not StepStatus.SETTLED and np.any(self.status == int(kind))
-        ]
-        return (
-            f"SteppedSineStates: {len(self.status)} steps, {self.states.n_states} settled",
-            f"frequency {hertz.min():.6g} to {hertz.max():.6g} Hz",
-            f"dwell {np.min(self.stop - self.start):.3g} to {np.max(self.stop - self.start):.3g} s",
-            *failed,
-            *(f"note: {note}" for note in self.notes),
-        )
-
     def variables(self) -> dict[str, Variable]:
-        """See `AbstractResult`; the table of steps."""
-        at = ("step",)
-        names = np.array([StepStatus(int(k)).name.lower() for k in self.status], dtype=str)
+        """The table of steps, with the reasons in words."""
         reasons = np.array([StepStatus(int(k)).message for k in self.status], dtype=str)
         return {
-            "step": Variable(at, np.arange(len(self.status)), "1", "step"),
-            "start_s": Variable(at, self.start, "s", "its start"),
-            "stop_s": Variable(at, self.stop, "s", "its end"),
-            "settled_from_s": Variable(at, self.settled_from, "s", "from where on it was used"),
-            "frequency_hz": Variable(at, self.frequency / _HERTZ, "Hz", "frequency of the force"),
-            "force": Variable(at, self.force, "N or V", "amplitude of the force"),
-            "decay_time_s": Variable(at, self.decay_time, "s", "decay time of the transient"),
-            "moved": Variable(at, self.moved, "1", "share that a phasor still moves"),
-            "colour": Variable(at, self.colour, "1", "scatter of blocks over white noise's"),
-            "state": Variable(at, self.state, "1", "row of the steady states, -1: none"),
-            "status": Variable(at, names, "", "whether it settled"),
-            "reason": Variable(at, reasons, "", "in words"),
+            "step": Variable(("step",), np.arange(len(self.status)), "1", "step"),
+            **super().variables(),
+            "reason": Variable(("step",), reasons, "", "in words"),
         }
 
 
@@ -222,7 +203,7 @@ def _recognised(
         )
     if len(long) == 1:
         raise ValueError(
-            f"the record has one step only, of {long[0].frequency / _HERTZ:.6g} Hz from "
+            f"the record has one step only, of {long[0].frequency / HERTZ:.6g} Hz from "
             f"{long[0].start / recording.sampling_rate:.4g} s on: state `frequencies` where a "
             "single tone is meant."
         )
@@ -270,13 +251,13 @@ def _check_highest(
     highest = max(one.frequency for one in steps) * max(orders)
     if highest >= np.pi * recording.sampling_rate:
         raise ValueError(
-            f"harmonic {max(orders)} of {highest / max(orders) / _HERTZ:.6g} Hz lies above half "
+            f"harmonic {max(orders)} of {highest / max(orders) / HERTZ:.6g} Hz lies above half "
             f"the sampling rate, {recording.sampling_rate / 2:.6g} Hz: ask for fewer harmonics."
         )
 
 
 def _cycles(recording: TimeRecording, step: Step) -> float:
-    return (step.stop - step.start) * step.frequency / _HERTZ / recording.sampling_rate
+    return (step.stop - step.start) * step.frequency / HERTZ / recording.sampling_rate
 
 
 def _measure(
@@ -305,7 +286,7 @@ def _measure(
         blocks = _within_step(blocks, guide)
     shift = steady_frequency(blocks, guide)
     dwell = (step.stop - step.start) / recording.sampling_rate
-    if of_table and abs(shift) * dwell > _HERTZ * _NEAR_TABLE:
+    if of_table and abs(shift) * dwell > HERTZ * _NEAR_TABLE:
         return _Measured(step, StepStatus.NOT_FOUND)
     blocks = blocks.turned(shift)
     step = step._replace(frequency=blocks.frequency)
@@ -318,7 +299,7 @@ def _measure(
         if moved == 0:
             break
     each = (blocks.time[-1] - blocks.time[0]) / max(len(blocks.time) - 1, 1)
-    if len(kept.time) * each * step.frequency < _HERTZ * _FEWEST_CYCLES / 2 or len(kept.time) < 3:
+    if len(kept.time) * each * step.frequency < HERTZ * _FEWEST_CYCLES / 2 or len(kept.time) < 3:
         return _Measured(step, StepStatus.TOO_SHORT)
     means = mean_phasors(kept)
     left = part.left[:, first]

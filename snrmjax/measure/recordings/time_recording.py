@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Num
 
 from snrmjax.measure.recordings.channels import Channel, channel_number, checked_channels
+from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, Variable
 
 _MOST_AT_ONCE = 2**25  # numbers of all channels together: 256 MiB of float64
@@ -70,7 +71,7 @@ class TimeRecording(AbstractResult):
     sampling_rate: float = eqx.field(static=True)  # Hz
     start_time: float = eqx.field(static=True, default=0.0)  # s, of the first sample
     name: str = eqx.field(static=True, default="")
-    notes: tuple[str, ...] = eqx.field(static=True, default=())
+    notes: tuple[Fact | str, ...] = eqx.field(static=True, default=())
 
     @property
     def n_samples(self) -> int:
@@ -153,7 +154,7 @@ def time_recording(
     *,
     start_time: float = 0.0,
     name: str = "",
-    notes: Sequence[str] = (),
+    notes: Sequence[Fact | str] = (),
 ) -> TimeRecording:
     """Channels sampled together, checked.
 

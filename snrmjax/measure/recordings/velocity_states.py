@@ -10,6 +10,7 @@ from jaxtyping import Complex, Float, Int
 from snrmjax.measure.recordings.channels import Channel, channel_number
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.states import SteadyStates, steady_states
+from snrmjax.numerics.facts import Fact
 
 Levels = Literal["auto", "force", "drive", "runs"]
 
@@ -106,7 +107,7 @@ def states_of_phasors(
     table: PhasorTable,
     orders: tuple[int, ...],
     level: Levels | int,
-    notes: Sequence[str] = (),
+    notes: Sequence[Fact] = (),
 ) -> SteadyStates:
     """Steady states of phasors of any motion, in the order of the table."""
     higher = tuple(k for k in orders if k != 1)
@@ -120,7 +121,7 @@ def states_of_phasors(
         floor = np.sqrt(np.mean((spread * np.abs(factors))[:, :, noisy] ** 2, axis=2))
     volts = chosen.force.quantity == "voltage"
     number, rule = number_levels(level, table.force, table.drive, table.frequency)
-    told = (*notes, *([f"levels {_LEVELS_BY[rule]}"] if rule else []))
+    numbered = (Fact("levels_numbered", by=rule),) if rule else ()
     unknown = np.full(len(table.force), np.nan)
     states = steady_states(
         number,
@@ -137,7 +138,7 @@ def states_of_phasors(
         harmonic_std=floor,
         harmonic_order=higher,
     )
-    return dataclasses.replace(states, notes=told)
+    return dataclasses.replace(states, notes=(*notes, *numbered))
 
 
 def number_levels(
@@ -169,21 +170,13 @@ def number_levels(
     return _runs(frequency), "runs"
 
 
-_LEVELS_BY = {
-    "drive": "by amplitude of the drive",
-    "force": "by amplitude of the force",
-    "runs": "by runs of frequency: the force of a run is not constant",
-}
-
-
 def counted_levels(number: Int[np.ndarray, " state"], rule: str) -> str:
     """How many levels were found by a rule of `number_levels`.
 
     >>> counted_levels(np.array([1, 1]), "force")
     '1 level by amplitude of the force'
     """
-    n = len(np.unique(np.asarray(number)))
-    return f"{n} level{'s' if n > 1 else ''} {_LEVELS_BY[rule]}"
+    return str(Fact("levels_counted", n=len(np.unique(np.asarray(number))), by=rule))
 
 
 def _number(recording: TimeRecording, name: str, what: str) -> int:

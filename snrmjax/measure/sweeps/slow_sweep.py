@@ -36,10 +36,11 @@ from snrmjax.measure.sweeps.swept_table import (
     swept_motion,
     table_of,
 )
-from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
 from snrmjax.numerics.status import Status
+from snrmjax.numerics.units import HERTZ
 
-_HERTZ = 2 * np.pi
 _START = 60  # states a sweep before the grid is made finer where the response changes
 _CHORD = 0.08  # of the largest response between neighbouring states
 _ROUNDS = 3
@@ -62,68 +63,26 @@ class SweptStates(AbstractResult):
     coordinates: ClassVar[tuple[str, ...]] = ("state",)
 
     states: SteadyStates
-    sweep: Int[np.ndarray, " state"]  # which sweep each state is from, −1: both directions
-    time: Float[np.ndarray, " state"]  # s
-    moving: Complex[np.ndarray, " state"]  # share of the force that moved the phasor, taken out
+    # −1: both directions.
+    sweep: Int[np.ndarray, " state"] = quantity("state", "1", "sweep, -1: both directions")
+    time: Float[np.ndarray, " state"] = quantity("state", "s", "when it was passed", name="time_s")
+    # That moved the phasor instead of holding it, and was taken out.
+    sweep_inertia_fraction: Complex[np.ndarray, " state"] = quantity(
+        "state", "1", "share of the force taken out"
+    )
     sweeps: tuple[Sweep, ...] = eqx.field(static=True)
     bias: tuple[SweepBias | None, ...] = eqx.field(static=True)  # at resonance, uncorrected
     balance: ModalBalance
-    left_out: tuple[int, ...] = eqx.field(static=True)  # moments, by `SweepStatus`
-    corrected: bool = eqx.field(static=True)
-
-    def summary(self) -> tuple[str, ...]:
-        """See `AbstractResult`."""
-        lines = [f"SweptStates: {self.states.n_states} states of {len(self.sweeps)} sweeps"]
-        for sweep, bias in zip(self.sweeps, self.bias, strict=True):
-            says = (
-                ""
-                if bias is None
-                else (
-                    f": by itself it shifts the peak by {bias.frequency_shift / _HERTZ:.2g} Hz and "
-                    f"lowers it to {100 * bias.peak_ratio:.4g} % (normalised rate "
-                    f"{bias.normalised_rate:.2g})"
-                )
-            )
-            lines.append(
-                f"{sweep.first / _HERTZ:.5g} to {sweep.last / _HERTZ:.5g} Hz in "
-                f"{sweep.stop - sweep.start:.4g} s{says}"
-            )
-        share = np.abs(self.moving)
-        if self.corrected:
-            lines.append(f"taken out: up to {100 * share.max():.2g} % of the force")
-        notes = (f"note: {note}" for note in self.states.notes)
-        return (*lines, *self._left_out_in_words(), *notes)
-
-    def _left_out_in_words(self) -> tuple[str, ...]:
-        return tuple(
-            f"{count} left out: {kind.message}"
-            for kind, count in zip(SweepStatus, self.left_out, strict=True)
-            if count and kind is not SweepStatus.FOUND
-        )
-
-    @property
-    def remarks(self) -> tuple[str, ...]:
-        """What a reader of the states should know: the bias of all sweeps, and what is missing."""
-        bias = [one for one in self.bias if one is not None]
-        shift = max((abs(one.frequency_shift) for one in bias), default=0.0) / _HERTZ
-        lowest = min((one.peak_ratio for one in bias), default=1.0)
-        told = (
-            f"each of {len(self.sweeps)} sweeps by itself shifts the peak by up to {shift:.2g} Hz "
-            f"and lowers it to {100 * lowest:.4g} %: {'' if self.corrected else 'not '}taken out"
-        )
-        return (*((told,) if bias else ()), *self._left_out_in_words(), *self.states.notes)
+    corrected: bool = setting()
+    notes: tuple[Fact | str, ...] = setting()  # the bias of all sweeps, and what is missing
 
     def variables(self) -> dict[str, Variable]:
-        """See `AbstractResult`."""
-        at = ("state",)
-        hertz = np.asarray(self.states.frequency) / _HERTZ
+        """By state, with its frequency."""
+        hertz = np.asarray(self.states.frequency) / HERTZ
         return {
-            "state": Variable(at, np.arange(len(self.time)), "1", "steady state"),
-            "frequency_hz": Variable(at, hertz, "Hz", "frequency"),
-            "time_s": Variable(at, self.time, "s", "when it was passed"),
-            "sweep": Variable(at, self.sweep, "1", "sweep, -1: both directions"),
-            "moving_re": Variable(at, self.moving.real, "1", "share of the force taken out"),
-            "moving_im": Variable(at, self.moving.imag, "1", "its imaginary part"),
+            **super().variables(),
+            "state": Variable(("state",), np.arange(len(self.time)), "1", "steady state"),
+            "frequency_hz": Variable(("state",), hertz, "Hz", "frequency"),
         }
 
 
@@ -237,7 +196,7 @@ class _Reader(NamedTuple):
             inside = (wanted >= speed.min()) & (wanted <= speed.max())
             return [(float(omega), self.at(rows, float(omega))) for omega in wanted[inside]]
         middle = self.track.middle[rows] / self.recording.sampling_rate
-        edge = _HERTZ * self.cycles / speed.min()
+        edge = HERTZ * self.cycles / speed.min()
         rate = np.ptp(speed) / np.ptp(middle)
         grid = np.linspace(speed[0], speed[-1], _START + 2)[1:-1]
         found = {float(omega): self.at(rows, float(omega)) for omega in grid}
@@ -268,8 +227,8 @@ def _wanted(
     outside = wanted[(wanted < low) | (wanted > high)]
     if outside.size:
         raise ValueError(
-            f"`frequencies` must lie within the sweeps, {low / _HERTZ:.6g} to "
-            f"{high / _HERTZ:.6g} Hz, but one is {outside[0] / _HERTZ:.6g} Hz."
+            f"`frequencies` must lie within the sweeps, {low / HERTZ:.6g} to "
+            f"{high / HERTZ:.6g} Hz, but one is {outside[0] / HERTZ:.6g} Hz."
         )
     return wanted
 
@@ -313,12 +272,7 @@ def _result(
         table = averaged_table(table, pairs)
         number = np.array([number[a] if a == b else -1 for a, b in pairs])
         share = np.array([(share[a] + share[b]) / 2 for a, b in pairs])
-    notes = []
-    if correct and not corrected:
-        notes.append(
-            "too few states near resonance: the bias of the sweep is not taken out, but is within "
-            "the stated errors"
-        )
+    notes = [Fact("sweep_bias_unknown")] if correct and not corrected else []
     states = states_of_phasors(reader.recording, reader.chosen, table, orders, level, notes)
     rate, begin = reader.recording.sampling_rate, reader.recording.start_time
     speed = track_speed(reader.track, reader.phase) * rate
@@ -330,10 +284,31 @@ def _result(
         for rows in runs
     )
     bias = tuple(_bias(balance, every, k) for k in range(len(runs)))
-    left_out[0] = states.n_states
-    return SweptStates(
-        states, number, table.time, share, sweeps, bias, balance, tuple(left_out), corrected
-    )
+    facts = (*_facts_of_sweeps(bias, corrected, left_out), *states.notes)
+    return SweptStates(states, number, table.time, share, sweeps, bias, balance, corrected, facts)
+
+
+def _facts_of_sweeps(
+    bias: Sequence[SweepBias | None], corrected: bool, left_out: Sequence[int]
+) -> list[Fact]:
+    known = [one for one in bias if one is not None]
+    facts = []
+    if known:
+        shift = max(abs(one.frequency_shift) for one in known) / HERTZ
+        facts.append(
+            Fact(
+                "sweep_bias",
+                sweeps=len(bias),
+                shift_hz=shift,
+                lowest=min(one.peak_ratio for one in known),
+                removed=corrected,
+            )
+        )
+    return facts + [
+        Fact("moments_left_out", count=count, status=kind)
+        for kind, count in zip(SweepStatus, left_out, strict=True)
+        if count and kind is not SweepStatus.FOUND
+    ]
 
 
 def _moments(

@@ -27,6 +27,7 @@ from snrmjax.model.effect_metadata import Argument
 from snrmjax.model.effect_shape import shape_of
 from snrmjax.model.structures import Structure
 from snrmjax.report.sampling import sensor_index
+from snrmjax.report.sentences.diagnose import effect_name
 from snrmjax.report.style import (
     COLUMN,
     CURVE,
@@ -53,25 +54,12 @@ _SHOWN = 10  # candidates
 _LARGEST = 5.0  # misfit, in units of noise, at the end of the colour scale
 _SAMPLES = 361  # of a cycle
 _AS_IT_IS = ("Hz", "periods", "%", "%, °", "1", "√kg m/s²")  # units without prefixes
-_PEOPLE = ("Coulomb", "Jenkins", "Iwan", "Van der Pol")
 _SINGLE_VALUED = 0.02  # of a force's range, between going there and coming back
 HELD_CAPTION = (
     "These levels hold the response, not the force: the force that holds each level's median "
     "velocity against frequency, without and with the effects that were found, over the measured "
     "forces. Lines should pass through the dots; the force is smallest at resonance."
 )
-
-
-def effect_name(kind: str) -> str:
-    """An effect's kind in words.
-
-    >>> effect_name("internal_resonance_1_3")
-    'internal resonance 1:3'
-    """
-    words = kind.replace("_", " ")
-    for name in _PEOPLE:
-        words = words.replace(name.lower(), name)
-    return f"{words[:-2]}:{words[-1]}" if words[-3:-2].isdigit() and words[-1].isdigit() else words
 
 
 def misfit_figure(diagnosis: Diagnosis) -> Figure:

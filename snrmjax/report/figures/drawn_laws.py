@@ -6,7 +6,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from snrmjax.diagnose.laws.law_search import SURE, DrawnLaw
+from snrmjax.diagnose import priors
+from snrmjax.diagnose.laws.law_search import DrawnLaw
 from snrmjax.model.effect_metadata import Argument
 from snrmjax.report.html import ReportTable, number, with_error
 from snrmjax.report.style import (
@@ -50,14 +51,14 @@ def _draw(axes: Axes, law: DrawnLaw) -> None:
     is_velocity = law.argument is Argument.VELOCITY
     x, y = unit_for(law.at, "m/s" if is_velocity else "m"), unit_for(law.force, "N")
     at, force = law.at / x.size, law.force / y.size
-    error = SURE * law.force_std / y.size
+    error = priors.BAND * law.force_std / y.size
     inside = np.abs(law.at) <= 1.0001 * law.largest
     banded(axes, at, force, error, IDENTIFIED, linestyle="--", zorder=2)
     own: Style = {"color": IDENTIFIED, "linewidth": LINE, "label": "drawn law"}
     axes.plot(at[inside], force[inside], marker="x", markersize=3.0, **own)
     axes.axhline(0.0, color="0.6", linewidth=0.6, zorder=1)
     quantity = "Velocity" if is_velocity else "Displacement"
-    title = law.name.split(",")[0]
+    title = law.title
     if law.passing is not None:
         title += f" (force at {law.passing:.2g} m/s)"
     name_axes(axes, plain(title), f"{quantity} ({x.name})", f"Force ({y.name})")

@@ -1,6 +1,5 @@
 """The report of a diagnosis: verdict, effects and their laws, evidence, resonances."""
 
-import re
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -10,7 +9,6 @@ from matplotlib.figure import Figure
 
 from snrmjax.diagnose.decide import Verdict
 from snrmjax.diagnose.diagnosis_result import Diagnosis
-from snrmjax.diagnose.diagnosis_result import probability_in_words as in_words
 from snrmjax.diagnose.evidence import NOISE_REJECTED, NONE, UNKNOWN
 from snrmjax.diagnose.misfit.candidates import scales_of_motions
 from snrmjax.diagnose.priors import AS_NOISE
@@ -25,14 +23,13 @@ from snrmjax.io.files import write_summary
 from snrmjax.io.models import write_model
 from snrmjax.measure.states import relative_errors
 from snrmjax.model.effect_shape import shape_of
-from snrmjax.model.effects import EFFECTS, LAWS, effect_class
+from snrmjax.model.effects import EFFECTS, effect_class
 from snrmjax.pipelines.diagnose import DiagnosedTest, SimulatedLevels
 from snrmjax.report.figures.diagnosis import (
     HELD_CAPTION,
     candidates_figure,
     comparison_figure,
     effect_laws_figure,
-    effect_name,
     found_effects,
     held_velocity_figure,
     misfit_figure,
@@ -54,6 +51,8 @@ from snrmjax.report.pages.resonance_table import (
     resonance_rows,
     velocity_unit,
 )
+from snrmjax.report.sentences.diagnose import effect_name
+from snrmjax.report.sentences.diagnose import probability_in_words as in_words
 from snrmjax.report.style import PrintedFigure, unit_for, with_unit
 
 _SHOWN = 10  # candidates
@@ -126,7 +125,7 @@ def headline(found: DiagnosedTest) -> list[str]:
     """Verdict, probability, and what would decide an open answer."""
     diagnosis = found.diagnosis
     lines = [
-        readable_verdict(diagnosis),
+        diagnosis.verdict_sentence,
         f"probability: {diagnosis.most_probable()}",
     ]
     if diagnosis.decide_by:
@@ -177,9 +176,9 @@ def diagnosis_report(
     return Report(
         title=title,
         done=[*(done or {}).items(), ("program", f"snrmjax {version('snrmjax')}")],
-        result=readable_verdict(diagnosis),
+        result=diagnosis.verdict_sentence,
         summary=_key_numbers(diagnosis, predicted),
-        notes=[_readable(str(note)) for note in diagnosis.notes],
+        notes=[*map(str, diagnosis.notes)],
         sections=[
             *([_effects_section(diagnosis, shown)] if diagnosis.effects else []),
             _comparison_section(diagnosis, predicted, shown),
@@ -187,11 +186,6 @@ def diagnosis_report(
             _limits_section(diagnosis),
         ],
     )
-
-
-def readable_verdict(diagnosis: Diagnosis) -> str:
-    """What a diagnosis says in one plain sentence, with the effects' names in words."""
-    return _readable(diagnosis.verdict_sentence)
 
 
 def _times(misfit: float) -> str:
@@ -238,7 +232,7 @@ def _key_numbers(diagnosis: Diagnosis, predicted: Sequence[LevelResponse]) -> li
         text = "; ".join(f"{name}: {resonance_in_words(one, unit)}" for name, one in pairs)
         rows.append((f"resonance at {with_unit(top.force, 'N')}", text))
     if diagnosis.decide_by:
-        rows.append(("what to measure next", _readable(diagnosis.decide_by)))
+        rows.append(("what to measure next", diagnosis.decide_by))
     return rows
 
 
@@ -301,7 +295,7 @@ def _candidates_section(diagnosis: Diagnosis, shown: Mapping[str, ReportFigure])
         if step
     ]
     rows = [
-        (_OTHER_ANSWERS.get(name) or _readable(name.replace("+", " with ")), in_words(value))
+        (_OTHER_ANSWERS.get(name) or _answer(name), in_words(value))
         for name, value in list(diagnosis.probabilities.items())[:_SHOWN]
     ]
     tables.insert(0, ReportTable(("answer", "probability"), rows, _PROBABILITIES))
@@ -362,11 +356,8 @@ def _meaning(kind: str, name: str) -> str:
     return effect_class(kind).parameters()[name].meaning or _words(name)
 
 
-def _readable(text: str) -> str:
-    """A sentence of the diagnosis with the effects' names in words."""
-    for kind in sorted((*EFFECTS, *LAWS), key=len, reverse=True):
-        text = re.sub(rf"\b{kind}\b", effect_name(kind), text, flags=re.IGNORECASE)
-    return text
+def _answer(name: str) -> str:
+    return " with ".join(map(effect_name, name.split("+")))
 
 
 def _words(name: str) -> str:

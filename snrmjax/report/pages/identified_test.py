@@ -34,7 +34,7 @@ def settings_in_words(found: IdentifiedTest) -> dict[str, str]:
         return {"amplitude": f"{asked.amplitude}, {asked.measure}", "curves": "smooth"}
     unknowns = found.joint.fit.unknowns
     pair = (unknowns.squared_frequency, unknowns.modal_damping)
-    curves = " and ".join(joint_results.described(curve) for curve in pair)
+    curves = " and ".join(curve.label for curve in pair)
     return {"amplitude": "displacement, fundamental", "curves": curves}
 
 

@@ -183,7 +183,7 @@ def _damping_and_phase(change: float, phase_was_free: bool) -> str:
     )
 
 
-def _trend(error: str, change: float, there: float, p_value: float, load: str) -> str:
+def _trend(error: str, change: float, there: float, p_value: float, load: object) -> str:
     def sized(size: float) -> str:
         return f"{'-' if size < 0 else '+'}{_of_kind(error, abs(size))}"
 

@@ -23,6 +23,10 @@ def _equilibria(sensor: str, displacement: tuple[float, ...], stable: tuple[bool
     )
 
 
+def _load(force: float, drive: float | None) -> str:
+    return f"{force:g} N" if drive is None else f"{drive:.5g} V ({force:.4g} N)"
+
+
 def _load_scale(stated: float, coefficient: str, change: float, chosen: float) -> str:
     return (
         f"with `load_scale` = {stated:g} thicknesses the coefficient {coefficient} differs by "
@@ -32,6 +36,7 @@ def _load_scale(stated: float, coefficient: str, change: float, chosen: float) -
 
 
 SENTENCES: dict[str, Wording] = {
+    "load": _load,
     "level_missed_by_curves": (
         "level {level} has its resonance under {force:.4g} N, measured at {frequency_hz:.5g} Hz, "
         "{velocity:.3g} m/s: the curves miss this level."
@@ -73,7 +78,7 @@ SENTENCES: dict[str, Wording] = {
     ),
     "mode_not_followed": _not_followed,
     "curve_ended": _ended,
-    "events_not_located": "force {force:g} N: not located: {kinds}.",
+    "curve_events_not_located": "force {force:g} N: not located: {kinds}.",
     "stability_not_computed": (
         "force {force:g} N: the stability of {n} points could not be computed; response.csv has 0 "
         "there and says so in `event`."

@@ -165,7 +165,7 @@ def locked_motions(
     settle_cycles: int = 300,
     record_cycles: int = 50,
     seed: int = 0,
-) -> tuple[list[HeldMotion], LabState, float]:
+) -> tuple[list[HeldMotion], LabState | None, float]:
     """The loop stays closed while drive voltage and phase step on.
 
     At each step it has `settle_cycles` of the linear mode to lock, then `record_cycles` are
@@ -195,9 +195,14 @@ def locked_motions(
         frequency, angle, force, velocity = (np.asarray(column)[-keep:] for column in columns)
         noise = [noise_of_sample(signal, angle) for signal in (force, velocity)]
         locked = _Locked(
-            frequency,
-            *(through_hann_window(signal, angle) for signal in (force, velocity)),
-            *(laboratory.decay, phase, np.array(noise), 1 / laboratory.sampling_rate, rates),
+            frequency=frequency,
+            force=through_hann_window(force, angle),
+            velocity=through_hann_window(velocity, angle),
+            decay=laboratory.decay,
+            phase=phase,
+            noise=np.array(noise),
+            period=1 / laboratory.sampling_rate,
+            gains=rates,
         )
         motions.append(locked.motion())
     seconds = len(steps) * (settle + keep) / laboratory.sampling_rate

@@ -268,7 +268,8 @@ def decay_test(
         seed=seed,
     )
     free = Playback(jnp.zeros(1))
-    start = state._replace(controller=free.initial(), voltage=jnp.zeros(3))
+    held = state or laboratory.at_rest(free)
+    start = held._replace(controller=free.initial(), voltage=jnp.zeros(3))
     count = round(decay_seconds * laboratory.sampling_rate)
     away = dataclasses.replace(laboratory, attached=False)
     record, _ = run_test(away, free, count, start=start, seed=seed + 1)

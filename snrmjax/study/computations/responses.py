@@ -26,7 +26,7 @@ from snrmjax.study.computations.base import (
     of_forces,
 )
 
-_GRID = "frequency_hz"
+GRID = "frequency_hz"
 _ISOLATED = {
     "n_isolated": ("i4", "1", "isolated responses that were found"),
     "isolated_peak_velocity_m_s": ("f8", "m/s", "highest velocity of an isolated response"),
@@ -92,7 +92,7 @@ class Peaks(AbstractComputation):
         if self.grid_points:
             for name, which in (("upper", "highest"), ("lower", "lowest")):
                 text = f"{which} velocity of the response at this frequency"
-                named[f"{name}_velocity_m_s"] = Output((*at, _GRID), "f8", "m/s", text)
+                named[f"{name}_velocity_m_s"] = Output((*at, GRID), "f8", "m/s", text)
         if self.isolated:
             named |= {name: Output(at, *rest) for name, rest in _ISOLATED.items()}
         return named
@@ -101,7 +101,7 @@ class Peaks(AbstractComputation):
         """See `AbstractComputation.axes`."""
         axes = self.forces.axes()
         if self.grid_points:
-            axes[_GRID] = Axis(self._grid / HERTZ, "Hz", "frequency of the force")
+            axes[GRID] = Axis(self._grid / HERTZ, "Hz", "frequency of the force")
         return axes
 
     def rows(self, members: Members) -> dict[str, np.ndarray]:

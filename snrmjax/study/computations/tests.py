@@ -25,9 +25,9 @@ from snrmjax.study.computations.base import (
 )
 from snrmjax.study.computations.responses import ResponseRange
 
-_SHARE = "relative_amplitude"
+SHARE = "relative_amplitude"
 _POINTS = 11  # of a curve over the measured range
-_CURVE = (MEMBER, _SHARE)
+_CURVE = (MEMBER, SHARE)
 _FOUND = {
     "status": Output((MEMBER,), TEXT, "", "solved, or why not"),
     "n_states": Output((MEMBER,), "i4", "1", "steady states of the test"),
@@ -50,7 +50,7 @@ class AbstractIdentified(AbstractComputation):
     def axes(self) -> dict[str, Axis]:
         """See `AbstractComputation.axes`."""
         text = "place between the smallest (0) and the largest (1) measured amplitude"
-        return {_SHARE: Axis(np.linspace(0.0, 1.0, _POINTS), "1", text)}
+        return {SHARE: Axis(np.linspace(0.0, 1.0, _POINTS), "1", text)}
 
     def identified(self, data: SteadyStates, model: Structure) -> dict[str, np.ndarray]:
         """One member's row."""
@@ -74,7 +74,7 @@ class AbstractIdentified(AbstractComputation):
     def failed(self) -> dict[str, np.ndarray]:
         """The row of a member for which nothing is found."""
         counts = {name: np.zeros(1, dtype="i4") for name in ("n_states", "n_solved")}
-        curves = {k: np.full((1, _POINTS), np.nan) for k in _FOUND if _SHARE in _FOUND[k][0]}
+        curves = {k: np.full((1, _POINTS), np.nan) for k in _FOUND if SHARE in _FOUND[k][0]}
         return {**counts, **curves}
 
 

@@ -10,7 +10,7 @@ from snrmjax.io.reduction.load_tables import read_load_tables
 
 def coefficients(folder):
     source = read_load_tables(folder.path)
-    found = sj.condense.condense(source.basis, source.cases, expand=False)
+    found = sj.condense.reduced_model(source.basis, source.cases, expand=False)
     return found.potential
 
 
@@ -140,7 +140,7 @@ BAD_TABLES = [
     (lambda folder: (folder.path / "mass.csv").unlink(), "mass.csv does not exist"),
     (edit("modes.toml", "frequency_hz", "frequencies_hz"), "unknown key 'frequencies_hz' (did"),
     (edit("modes.toml", "frequency_hz = [", "frequency_hz = [-"), "must be positive"),
-    (edit("modes.toml", "[1, 3]", "[1, 1]"), "2 different whole numbers"),
+    (edit("modes.toml", "[1, 3]", "[1, 1]"), "`numbers` must be different mode numbers"),
     (edit("modes.toml", "0.02", "1.5"), "from 0 to below 1"),
     (edit("modes.toml", "[0.5, -0.25]", "[0.5]"), "2 numbers, one a mode"),
     (edit("modes.toml", 'shapes = "shapes.csv"\n', ""), "has a `mass`, but no `shapes`"),

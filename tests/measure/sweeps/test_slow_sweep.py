@@ -96,7 +96,7 @@ def test_swept_states_are_those_of_a_stepped_sine(name, first, last):
     assert found.corrected
     size = np.abs(np.asarray(found.states.velocity)[:, 0])
     # Close to a jump no force holds the state for long: it is not what a stepped sine could do.
-    slow = np.abs(found.moving) < (0.08 if name == "hardening" else 1.0)
+    slow = np.abs(found.sweep_inertia_fraction) < (0.08 if name == "hardening" else 1.0)
     loud = np.flatnonzero((size > 0.3 * size.max()) & slow)
     error, before = [], []
     for k in loud[:: max(1, len(loud) // 4)]:

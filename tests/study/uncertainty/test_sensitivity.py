@@ -77,7 +77,9 @@ def test_rows_without_a_value_are_left_out_whole():
     found = sobol_indices(data)
     # x is drawn twice in a row, P(x < 0) = 0.1587: (1 − 0.1587)² of the rows stay.
     assert found.rows[0] / 256 == pytest.approx(0.708, abs=0.02)
-    assert any("29 % of the rows are left out" in note for note in found.notes)
+    (note,) = found.notes
+    assert (note.kind, note["output"]) == ("rows_without_value", "y0")
+    assert note["share"] == pytest.approx(1 - found.rows[0] / 256)
 
 
 def test_other_members_are_refused():

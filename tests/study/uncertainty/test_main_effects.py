@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from snrmjax.report.study.main_effects import FEWEST, correlated_pairs, main_effect
+from snrmjax.study.uncertainty.sensitivity import FEWEST, correlated_pairs, main_effect
 
 A, B = 7.0, 0.1
 

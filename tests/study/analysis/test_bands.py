@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from snrmjax.report.study import bands
-from snrmjax.report.study.bands import band_panels
+from snrmjax.study.analysis import bands
+from snrmjax.study.analysis.bands import curve_bands
 from snrmjax.study.computations.responses import bounds_over
 
 SIZES = np.linspace(0.5, 1.5, 41)  # one for each member: the median is 1, 95 % are within 0.475
@@ -70,21 +70,21 @@ def check(panel, force):
 
 
 def test_bands_of_a_grid():
-    (panel,) = band_panels(gridded())
+    (panel,) = curve_bands(gridded())
     check(panel, 1.0)
 
 
 def test_every_force_has_a_panel(monkeypatch):
     monkeypatch.setattr(bands, "_BLOCK", 7)  # several blocks of members
-    panels = band_panels(gridded([0.001, 0.002]))
-    assert [one.title for one in panels] == ["1 mN", "2 mN"]
+    panels = curve_bands(gridded([0.001, 0.002]))
+    assert [one.force for one in panels] == [0.001, 0.002]
     for panel, force in zip(panels, (0.001, 0.002), strict=True):
         check(panel, force)
 
 
 def test_points_give_the_same_bands_as_a_grid(monkeypatch):
     monkeypatch.setattr(bands, "_BLOCK", 7)
-    panels = band_panels(ragged([0.5, 1.0]))
+    panels = curve_bands(ragged([0.5, 1.0]))
     for panel, force in zip(panels, (0.5, 1.0), strict=True):
         check(panel, force)
         between = (panel.upper.at > 20.0) & (panel.upper.at < 30.0)
@@ -116,7 +116,7 @@ def test_backbones_that_end_early_end_the_band():
             "point_damping_ratio": (("point",), 0.01 * (1 + x)),
         }
     )
-    frequency, damping = band_panels(data)
+    frequency, damping = curve_bands(data)
     assert frequency.upper.at[[0, -1]] == pytest.approx([0.0, 1.0])
     np.testing.assert_allclose(frequency.upper.median, 80 + frequency.upper.at, rtol=1e-12)
     np.testing.assert_allclose(damping.upper.most, 0.01 * (1 + damping.upper.at), rtol=1e-12)
@@ -128,7 +128,7 @@ def test_many_members_are_sampled_for_quantiles_but_not_for_extremes():
     rows[7, 1] = 40.0
     named = dict.fromkeys(("upper_velocity_m_s",), (("member", "frequency_hz"), rows))
     named["lower_velocity_m_s"] = named["upper_velocity_m_s"]
-    (panel,) = band_panels(xr.Dataset(named, {"frequency_hz": [1.0, 2.0, 3.0]}))
+    (panel,) = curve_bands(xr.Dataset(named, {"frequency_hz": [1.0, 2.0, 3.0]}))
     assert panel.upper.most[1] == 40.0
     # Quantiles of a normal distribution; five standard errors with 4096 members.
     np.testing.assert_allclose(panel.upper.high, 1.96, atol=5 * np.sqrt(0.025 / 4096) / 0.0584)

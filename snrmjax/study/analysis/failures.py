@@ -6,14 +6,13 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from snrmjax.report.html import ReportTable
-from snrmjax.study.computations.base import COMPLETE, FORCE, HIGHEST_AT_END, NO_PEAK
+from snrmjax.numerics.facts import Fact
+from snrmjax.study.computations.base import COMPLETE, HIGHEST_AT_END, NO_PEAK
 
 if TYPE_CHECKING:
     import xarray
 
 _BINS = 10
-_LONGEST = 120  # letters of a status that a table shows
 
 
 class Failures(NamedTuple):
@@ -29,11 +28,6 @@ class Failures(NamedTuple):
         return int(self.failed.sum())
 
     @property
-    def kinds(self) -> list[str]:
-        """The statuses of failed members, the most frequent first."""
-        return list(self.failed_counts)
-
-    @property
     def failed_counts(self) -> dict[str, int]:
         """How many members failed with each status, the most frequent first."""
         return dict(Counter(self.status[self.failed].tolist()).most_common())
@@ -42,6 +36,17 @@ class Failures(NamedTuple):
     def n_outside(self) -> int:
         """How many members were computed but have their resonance outside the range."""
         return sum(self.failed_counts.get(name, 0) for name in (NO_PEAK, HIGHEST_AT_END))
+
+    @property
+    def facts(self) -> tuple[Fact, ...]:
+        """What to do about members whose resonance is not in the range of a study of peaks."""
+        counts = self.failed_counts
+        facts = []
+        if NO_PEAK in counts:
+            facts.append(Fact("no_peak_in_range", n_members=counts[NO_PEAK]))
+        if HIGHEST_AT_END in counts:
+            facts.append(Fact("highest_at_range_end", n_members=counts[HIGHEST_AT_END]))
+        return tuple(facts)
 
 
 class FailureShare(NamedTuple):
@@ -63,23 +68,6 @@ def failures_of(data: "xarray.Dataset") -> Failures:
     return Failures(dict(counts.most_common()), np.any(bad, axis=1), worst)
 
 
-def range_notes(failures: Failures) -> list[str]:
-    """What to do about members whose resonance is not in the range of a study of peaks."""
-    counts, notes = failures.failed_counts, []
-    if NO_PEAK in counts:
-        notes.append(
-            f"{counts[NO_PEAK]} members have no peak between `from_hz` and `to_hz` (status "
-            f"{NO_PEAK}): their response is highest at an end of the range; widen it"
-        )
-    if HIGHEST_AT_END in counts:
-        notes.append(
-            f"the response of {counts[HIGHEST_AT_END]} members is higher at an end of the range "
-            f"than at its highest peak (status {HIGHEST_AT_END}): widen the range to have that "
-            "resonance, or narrow it to leave the other resonance out"
-        )
-    return notes
-
-
 def failure_share(
     quantity: Float[np.ndarray, " member"], failed: Bool[np.ndarray, " member"]
 ) -> FailureShare:
@@ -87,9 +75,8 @@ def failure_share(
     from scipy.stats import binomtest
 
     edges = np.unique(np.quantile(quantity, np.linspace(0, 1, _BINS + 1)))
-    part = np.clip(np.searchsorted(edges, quantity, side="right") - 1, 0, max(len(edges) - 2, 0))
-    n = np.bincount(part, minlength=len(edges) - 1)
-    k = np.bincount(part, weights=failed, minlength=len(edges) - 1).astype(int)
+    n = np.histogram(quantity, edges)[0]
+    k = np.histogram(quantity[failed], edges)[0]
     ends = [
         binomtest(int(a), int(b)).proportion_ci(method="wilson") if b else (np.nan, np.nan)
         for a, b in zip(k, n, strict=True)
@@ -114,20 +101,3 @@ def most_telling(
         for name, values in quantities.items()
     }
     return sorted(distance, key=lambda name: -distance[name])
-
-
-def status_table(failures: Failures, data: "xarray.Dataset") -> ReportTable:
-    """How many members ended in which way."""
-    total = sum(failures.counts.values())
-    rows = [
-        (
-            name if len(name) <= _LONGEST else f"{name[:_LONGEST]} …",
-            str(count),
-            f"{100 * count / total:.3g} %",
-            "yes" if name in COMPLETE else "no",
-        )
-        for name, count in failures.counts.items()
-    ]
-    each = "members and forces" if FORCE in data["status"].dims else "members"
-    header = ("status", each, "share", "complete")
-    return ReportTable(header, rows, "How the computations ended.")

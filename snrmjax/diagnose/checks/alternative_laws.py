@@ -1,5 +1,6 @@
 """Reasons to doubt an answer that fits: what a law outside the library could do as well."""
 
+from collections.abc import Iterator
 from itertools import combinations
 from typing import NamedTuple
 
@@ -17,18 +18,22 @@ from snrmjax.model.effect_metadata import Imitation, Shape
 from snrmjax.model.effect_shape import acts_like, shape_of
 from snrmjax.model.effects import EFFECTS
 from snrmjax.model.library.internal_resonances import AbstractInternalResonance
+from snrmjax.numerics.facts import Fact
 
 
 class Doubt(NamedTuple):
-    """Why another law may explain the data as well, and what would separate them."""
+    """Why another law may explain the data as well, and what would separate them.
 
-    reason: str
-    decide_by: str
+    Texts are those that an effect's class states.
+    """
+
+    reason: Fact | str
+    decide_by: Fact | str
     refutes: bool = False
     identical: bool = False  # the other law changes all that was measured alike
 
 
-WIDER = "widen the range of levels at both ends and record the second and third harmonics"
+WIDER = Fact("widen_levels")
 """The measurement that tells most laws apart."""
 
 
@@ -50,30 +55,16 @@ def doubts(
     energy; `wide` are internal resonances wider than the measured range (`wider_than_measured`).
     """
     found = []
-    mine = [kind for kind in effects if is_drag(kind) and kind not in both_ways]
-    if mine:
-        closer = " with less noise" if 2 in orders else ""
-        found.append(
-            Doubt(
-                f"a damping that acts in one direction only has the same fundamental as {mine[0]}.",
-                f"record harmonic 2 at the largest level{closer}",
-                identical=True,
-            )
-        )
+    drags = [kind for kind in effects if is_drag(kind) and kind not in both_ways]
+    if drags:
+        record = Fact("record_second_harmonic", closer=2 in orders)
+        found.append(Doubt(Fact("one_direction_alike", effect=drags[0]), record, identical=True))
     imitations = [one for kind in effects for one in EFFECTS[kind].imitations]
-    found += [
-        _doubt(one)
-        for one in imitations
-        if one.unless_harmonic is not None and one.unless_harmonic not in orders
-    ]
+    found += [_doubt(one) for one in imitations if one.unless_harmonic not in (None, *orders)]
     # Nothing passive adds energy: there is a source, whose law may be another one.
+    silent = Fact("measure_without_feedback")
     found += [
-        Doubt(
-            f"{kind} with a negative coefficient adds energy: a feedback, or a force that lags "
-            "behind the displacement, does the same.",
-            "measure with every feedback off, or record the feedback's force",
-            identical=True,
-        )
+        Doubt(Fact("adds_energy", effect=kind), silent, identical=True)
         for kind in effects
         if kind in feeding
     ]
@@ -83,44 +74,26 @@ def doubts(
         _doubt(one) for one in imitations if one.unless_harmonic is None and one.near_power is None
     ]
     found += [
-        Doubt(
-            f"{kind} is wider than the range of frequencies measured: it was not observed as a "
-            "resonance, and many laws of amplitude look like one side of it.",
-            "step through a wider range of frequencies at the largest level",
-        )
+        Doubt(Fact("wider_than_measured", effect=kind), Fact("step_wider"))
         for kind in effects
         if kind in wide
     ]
-    return found + _of_several(effects)
+    return found + list(_of_several(effects))
 
 
-def _of_several(effects: tuple[str, ...]) -> list[Doubt]:
+def _of_several(effects: tuple[str, ...]) -> Iterator[Doubt]:
     """What effects may stand for together."""
-    found = []
     if len(effects) > 2:
-        found.append(Doubt("three effects together can fit most laws.", WIDER))
+        yield Doubt(Fact("three_effects", effects=effects), WIDER)
     alike = [
-        (one, other)
-        for one, other in combinations(effects, 2)
-        if acts_like(EFFECTS[one]) == acts_like(EFFECTS[other]) is not None
+        pair
+        for pair in combinations(effects, 2)
+        if acts_like(EFFECTS[pair[0]]) == acts_like(EFFECTS[pair[1]]) is not None
     ]
     if alike:
-        found.append(
-            Doubt(
-                f"{' and '.join(alike[0])} change the same part of the force balance: together "
-                "they may stand for one law that the library does not have.",
-                WIDER,
-            )
-        )
+        yield Doubt(Fact("same_part_twice", effects=alike[0]), WIDER)
     elif len(effects) > 1 and any(_resonance(kind) for kind in effects):
-        found.append(
-            Doubt(
-                "a further mode beside another effect can fit a law that the library does not "
-                "have.",
-                f"step finely through the frequency of the further mode, or {WIDER}",
-            )
-        )
-    return found
+        yield Doubt(Fact("further_mode_beside"), Fact("step_through_mode"))
 
 
 def wider_than_measured(
@@ -179,15 +152,13 @@ def _of_exponent(effect: str, located: tuple[Located, ...], own_power: float | N
     if law is None or law.power is None:
         return []
     part, expected = law.part, law.power if own_power is None else own_power
-    mine = [p for p in located if p.part == part and p.exponent is not None]
-    if not mine or mine[0].exponent is None or mine[0].exponent_std is None:
+    measured = [p for p in located if p.part == part and p.exponent is not None]
+    if not measured or measured[0].exponent is None or measured[0].exponent_std is None:
         return []
-    exponent, std = mine[0].exponent, float(np.hypot(mine[0].exponent_std, 0.05))
+    exponent, std = measured[0].exponent, float(np.hypot(measured[0].exponent_std, 0.05))
     if abs(exponent - expected) > priors.CONTRADICTED * std:
-        reason = (
-            f"the {part} changes with the power {exponent:.2f} ± {std:.2f} of the amplitude, "
-            f"not with the power {expected:.3g} of {effect}."
-        )
+        power = {"exponent": exponent, "exponent_std": std, "expected": expected}
+        reason = Fact("other_power", effect=effect, part=part, **power)
         return [Doubt(reason, WIDER, refutes=True)]
     return [
         _doubt(one)
