@@ -133,8 +133,8 @@ def cells_of(text: str, file: str) -> Cells:
     for k, name in enumerate(names):
         if name and name in names[:k]:
             raise ValueError(
-                f"each column must stand once, but {file} has the column `{shortened_name(name)}` twice "
-                f"(columns {names.index(name) + 1} and {k + 1})."
+                f"each column must stand once, but {file} has the column `{shortened_name(name)}` "
+                f"twice (columns {names.index(name) + 1} and {k + 1})."
             )
     return Cells(names, rows, file)
 
