@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from snrmjax.condense.condensation import Condensation, condense
+from snrmjax.condense.condensation import Condensation, reduced_model
 from snrmjax.condense.load_cases import StaticCases
 from snrmjax.condense.load_set import modal_loads
 from snrmjax.condense.scale_study import (
@@ -73,7 +73,7 @@ def reduce_model(
     displacement, cases = None, source.cases
     if cases is None:
         displacement, cases = run_load_cases(source)
-    found = condense(source.basis, cases, degree=source.degree)
+    found = reduced_model(source.basis, cases, degree=source.degree)
     _refuse_contradictions(source, found)
     compared = _stated_scale_compared(source, found)
     scales = sweep = None
@@ -91,7 +91,7 @@ def reduce_model(
         )
     structure = source.structure(found)
     notes: list[Fact | str] = [*source.notes, *compared]
-    notes += [warning.message for warning in found.warnings]
+    notes += found.warnings
     if scales is not None and not scales.holds_default:
         notes.append(Fact("load_scale_outside_plateau"))
     states = [one for one in equilibria(structure) if one.stable]
@@ -105,7 +105,7 @@ def _refuse_contradictions(source: ReductionSource, found: Condensation) -> None
         return
     for one in found.warnings:
         if one.kind == "inconsistent_case":
-            raise ValueError(f"{one.message}; mend or remove it.")
+            raise ValueError(f"{one}; mend or remove it.")
     ratio = found.quality.linear_stiffness_ratio
     worst = int(np.argmax(np.abs(np.nan_to_num(ratio, nan=1.0) - 1)))
     if abs(ratio[worst] - 1) > _REFUSED_LINEAR:
@@ -137,7 +137,7 @@ def _stated_scale_compared(source: ReductionSource, found: Condensation) -> list
     except ValueError as error:
         why = str(error)
         return [Fact("load_scale_not_compared", stated=source.load_scale, why=why)]
-    chosen = condense(source.basis, cases, degree=source.degree)
+    chosen = reduced_model(source.basis, cases, degree=source.degree)
     scale = float(np.max(displacement)) / source.thickness
     monomials, own = chosen.potential.monomials, np.asarray(chosen.potential.coefficient)
     leading = np.flatnonzero(leading_terms(own, typical_displacement(cases), monomials))

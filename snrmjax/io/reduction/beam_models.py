@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from snrmjax.condense.condensation import condense
+from snrmjax.condense.condensation import reduced_model
 from snrmjax.io.files import FilePath, file_name
 from snrmjax.io.reduction.beam_file import THICKNESS, BeamDescription, read_beam_description
 from snrmjax.io.reduction.beam_parameters import (
@@ -76,7 +76,7 @@ def _model(models: BeamModels, values: Mapping[str, Any]) -> Structure:
     source = beam_source(beam, models.file)
     thickness = dict(beam.numbers)[THICKNESS]
     _, cases = run_load_cases(source, thickness * np.asarray(models.displacement))
-    return source.structure(condense(source.basis, cases, degree=source.degree))
+    return source.structure(reduced_model(source.basis, cases, degree=source.degree))
 
 
 # One program: step by step, derivatives would compile each step.

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from snrmjax.condense.elements.beam import Beam, PointMass, Support
-from snrmjax.condense.elements.beam_cases import static_cases
 from snrmjax.condense.elements.beam_modes import beam_modes, participation, shape_at
+from snrmjax.condense.elements.statics import static_cases
 from snrmjax.condense.load_cases import ReductionBasis, StaticCases
 from snrmjax.condense.load_set import StaticSolver
 from snrmjax.io.files import FilePath, file_name

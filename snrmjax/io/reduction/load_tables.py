@@ -31,7 +31,7 @@ degrees of freedom, such as
 Modal coordinates are q = ΦᵀM u where a mass matrix is given, else the least-squares fit q = Φ⁺u at
 the freedoms that were written. That is exact where what the load cases add to the modes is
 orthogonal to the shapes there, as the stretching of a flat structure is; else state a mass matrix,
-or write `q_1 …`. From arrays in Python, `snrmjax.condense.condense` starts at once.
+or write `q_1 …`. From arrays in Python, `snrmjax.condense.reduced_model` starts at once.
 """
 
 import os

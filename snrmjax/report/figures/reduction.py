@@ -120,7 +120,7 @@ def quality_figure(found: Condensation) -> Figure:
     named = np.zeros(len(ratio), dtype=bool)
     for one in found.warnings:
         if one.kind == "inconsistent_case":
-            named[list(one.cases)] = True
+            named[list(one["cases"])] = True
     shown = np.isfinite(error) & (error > 0)
     marks(axes, ratio[shown & ~named], error[shown & ~named], DOT, "load case")
     cross = {**CROSS, "markeredgecolor": IDENTIFIED}
