@@ -140,11 +140,11 @@ BAD = {
         *(("resonant_decay",), "resonant_decay: 8 samples a cycle are needed"),
     ),
     "NaN": (DECAY.replace("\n", "\n0.0,nan\n", 1), (), "`velocity_m_s` must be a finite number"),
-    "infinite": (DECAY.replace("\n", "\n-1,inf\n", 1), (), "row 2 of bad.csv has inf"),
+    "infinite": (DECAY.replace("\n", "\n-1,inf\n", 1), (), "row 2 of bad.csv has 'inf'"),
     "text": (DECAY + "4.0,fast\n", (), "`velocity_m_s` must be a number, but row 4002 of bad.csv"),
     "ragged": (DECAY + "4.0\n", (), "each row must have 2 fields as the header has, but row 4002"),
     "doubled column": (
-        DECAY.replace("time_s,velocity_m_s", "time_s,time_s"), (), "`time_s` stands more than once",
+        DECAY.replace("time_s,velocity_m_s", "time_s,time_s"), (), "each column must stand once",
     ),
     "no motion": (
         table(time_s=TIME, force_n=VELOCITY), (), "needs velocity_m_s, acceleration_m_s2 or",
