@@ -83,7 +83,7 @@ def write(folder: Path, found: Comparison, *, title: str = "", model: str = "") 
 
 def headline(found: Comparison) -> list[str]:
     """What each record was taken for, and the result."""
-    return [*found.records, comparison_sentence(found)]
+    return [*map(str, found.records), comparison_sentence(found)]
 
 
 def notes_of(found: Comparison) -> list[str]:
@@ -203,7 +203,7 @@ def _notes(found: Comparison) -> list[str]:
         for result in results
         for note in result.notes
     ]
-    return [*found.records, *notes_of(found), *notes_on_bands(results), *own]
+    return [*map(str, found.records), *notes_of(found), *notes_on_bands(results), *own]
 
 
 def notes_on_bands(results: Sequence[MethodResult]) -> list[str]:
@@ -237,7 +237,7 @@ def _summary(found: Comparison) -> dict:
     own = reference is not None and reference.method == "snrm"
     near = {name: (hertz, ratio) for name, hertz, ratio, _ in _distances(found) if own}
     return {
-        "records": list(found.records),
+        "records": [str(one) for one in found.records],
         "bands": notes_on_bands(results),
         "methods": {
             result.method: {

@@ -69,9 +69,8 @@ _LEVELS_BY = {
 
 
 def _steps_used(used: int, left_out: Iterable[tuple[str, int]]) -> str:
-    counts = dict(left_out)
-    reasons = ", ".join(f"{count} {reason}" for reason, count in counts.items())
-    steps = f"{used} of {used + sum(counts.values())} steps used"
+    reasons = ", ".join(f"{count} {reason}" for reason, count in left_out)
+    steps = f"{used} of {used + sum(count for _, count in left_out)} steps used"
     return f"{steps}; left out: {reasons}" if reasons else steps
 
 
