@@ -46,11 +46,11 @@ class Secants(NamedTuple):
 
 def start_of(point: Float[Array, " unknown"]) -> Secants:
     """A point of whose neighbourhood nothing is known."""
-    none = nothing_of(point)
-    return Secants(point, none + jnp.zeros((_SECANTS, point.shape[0])), none.astype(int))
+    zero = batched_zero(point)
+    return Secants(point, zero + jnp.zeros((_SECANTS, point.shape[0])), zero.astype(int))
 
 
-def nothing_of(point: Float[Array, " unknown"]) -> Float[Array, ""]:
+def batched_zero(point: Float[Array, " unknown"]) -> Float[Array, ""]:
     """Zero, a number of every point.
 
     A loop of many points whose first state is theirs throughout is traced once; else again and
@@ -169,8 +169,8 @@ class PrescribedMotion(eqx.Module):
             now, far, enough = state
             return (now.taken < 1) | ((now.taken < _SECANTS) & (far > enough))  # false for NaN
 
-        none = nothing_of(near.point)
-        first = (start_of(near.point), none, none)
+        zero = batched_zero(near.point)
+        first = (start_of(near.point), zero, zero)
         found, far, _ = jax.lax.while_loop(going, step, first)
         return found._replace(point=jnp.where(far <= _CLOSE, found.point, jnp.nan))
 

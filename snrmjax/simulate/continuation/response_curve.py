@@ -20,9 +20,7 @@ from snrmjax.simulate.continuation.continuation import CurveStatus, StepControl,
 from snrmjax.simulate.continuation.events import with_events
 from snrmjax.simulate.continuation.stability import (
     Stability,
-    StabilityLoss,
     floquet_multipliers,
-    stability_loss,
     stability_of,
 )
 
@@ -92,13 +90,6 @@ class ResponseCurve(MotionCurve):
     def is_unstable(self) -> Bool[np.ndarray, " point"]:
         """Which points are known to be unstable."""
         return self.stability == int(Stability.UNSTABLE)
-
-    @property
-    def stability_loss(self) -> tuple[StabilityLoss, ...]:
-        """By which kind of multiplier each point is unstable."""
-        if self.multipliers is None:
-            return (StabilityLoss.NOT_COMPUTED,) * len(self.frequency)
-        return stability_loss(self.multipliers)
 
     def at_events(self, kind: str) -> np.ndarray:
         """Indices of the points at which an event of this kind was located."""

@@ -36,18 +36,12 @@ Means = Literal["harmonic_balance", "time_integration"]
 
 
 class SweepSimulation(NamedTuple):
-    """How the motions of a phase-resonance test are computed.
+    """How the motions of a phase-resonance test are computed."""
 
-    `by` is "harmonic_balance", where the frequency is stepped infinitely slowly, or
-    "time_integration", where each sweep has `steps_per_sweep` equal steps of frequency, each held
-    for at most `cycles_per_step` cycles of the force. `harmonic_order` is the highest harmonic of
-    the motion, a multiple of the frequency of the force.
-    """
-
-    by: Means = "harmonic_balance"
-    harmonic_order: int = 9
-    steps_per_sweep: int = 100  # of a time integration
-    cycles_per_step: int = 200  # of a time integration
+    by: Means = "harmonic_balance"  # as if the frequency were stepped infinitely slowly
+    harmonic_order: int = 9  # highest of the motion
+    steps_per_sweep: int = 100  # of a time integration: equal steps of frequency
+    cycles_per_step: int = 200  # of a time integration, at most
 
 
 BY_HARMONIC_BALANCE = SweepSimulation()
