@@ -145,10 +145,10 @@ def read_joint_fit(path: FilePath) -> JointFit:
         raise ValueError(f"{path} is no joint fit: {error}.") from error
     if not isinstance(content, dict) or content.get("format") != _FORMAT:
         raise ValueError(f"{path} is no joint fit of format {_FORMAT}.")
-    found = _decoded(content.get("fit"))
-    if not isinstance(found, JointFit):
+    fit = _decoded(content.get("fit"))
+    if not isinstance(fit, JointFit):
         raise ValueError(f"{path} is no joint fit: it holds another thing.")
-    return found
+    return fit
 
 
 def _encoded(value: Any) -> Any:
@@ -202,8 +202,8 @@ def _class(name: str) -> Any:
     module, _, qualified = name.partition(":")
     if not module.startswith("snrmjax.") or not qualified.isidentifier():
         raise ValueError(f"a joint fit is not made of {name}.")
-    found = getattr(importlib.import_module(module), qualified, None)
-    holds = isinstance(found, type) and issubclass(found, tuple | Status | eqx.Module)
+    named = getattr(importlib.import_module(module), qualified, None)
+    holds = isinstance(named, type) and issubclass(named, tuple | Status | eqx.Module)
     if not holds:
         raise ValueError(f"a joint fit is not made of {name}.")
-    return found
+    return named

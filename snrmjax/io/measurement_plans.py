@@ -96,18 +96,18 @@ def read_former_answer(path: FilePath) -> FormerAnswer:
     """
     file = file_name(path)
     try:
-        told = json.loads(read_text(path))
-        every = {row["effect"]: row for step in told["tried"] for row in step}
+        answer = json.loads(read_text(path))
+        rows = {row["effect"]: row for step in answer["tried"] for row in step}
         starts = {
             kind: tuple(
                 float(value)
                 for name, value in row["parameters"].items()
                 if name.startswith(f"{kind}.")
             )
-            for kind, row in every.items()
+            for kind, row in rows.items()
         }
-        probabilities = {str(name): float(p) for name, p in told["probabilities"].items()}
-        return FormerAnswer(str(told["verdict"]), tuple(told["effects"]), probabilities, starts)
+        probabilities = {str(name): float(p) for name, p in answer["probabilities"].items()}
+        return FormerAnswer(str(answer["verdict"]), tuple(answer["effects"]), probabilities, starts)
     except (json.JSONDecodeError, KeyError, TypeError, AttributeError, ValueError) as error:
         if isinstance(error, ValueError) and not isinstance(error, json.JSONDecodeError):
             raise

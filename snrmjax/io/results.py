@@ -213,17 +213,17 @@ def summarise_resonance(resonance: Resonance) -> dict:
     }
 
 
-def summarise_distribution(found: ResonanceDistribution) -> dict:
+def summarise_distribution(distribution: ResonanceDistribution) -> dict:
     """Whether a further level has its resonance in a range, and where, in units of the files."""
     return {
-        "force_n": found.force,
-        "largest_amplitude_ratio": found.largest_amplitude_ratio,
-        "probability": found.probability,
+        "force_n": distribution.force,
+        "largest_amplitude_ratio": distribution.largest_amplitude_ratio,
+        "probability": distribution.probability,
         "quantiles": list(QUANTILES),
-        "frequency_hz": (found.frequency / HERTZ).tolist(),
-        "velocity_m_s": found.velocity.tolist(),
-        "negative_damping": found.negative_damping,
-        "holds": found.holds,
+        "frequency_hz": (distribution.frequency / HERTZ).tolist(),
+        "velocity_m_s": distribution.velocity.tolist(),
+        "negative_damping": distribution.negative_damping,
+        "holds": distribution.holds,
     }
 
 

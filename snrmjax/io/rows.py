@@ -60,11 +60,11 @@ class Cells(NamedTuple):
 
     def refusal(self, column: str, expected: str, row: int) -> ValueError:
         """The error for one field."""
-        found = self.texts(column)[row]
-        if found == "":
+        field = self.texts(column)[row]
+        if field == "":
             value = "an empty field"
         else:
-            value = found if _NUMBER.fullmatch(found) and len(found) <= 40 else shown(found)
+            value = field if _NUMBER.fullmatch(field) and len(field) <= 40 else shown(field)
         return ValueError(
             f"`{column}` must be {expected}, but row {self.rows[row].number} of {self.file} "
             f"has {value}."

@@ -94,8 +94,8 @@ class _Aim(NamedTuple):
 
     def parameters(self, unknowns: Float[Array, " unknown"]) -> Float[Array, " parameter"]:
         """The parameters themselves."""
-        own = unknowns[: self.values.shape[0]]
-        return jnp.where(self.values != 0, self.values * (1 + own), own)
+        changes = unknowns[: self.values.shape[0]]
+        return jnp.where(self.values != 0, self.values * (1 + changes), changes)
 
     def misses(self, unknowns: Float[Array, " unknown"]) -> Float[Array, " unknown"]:
         """Residuals of the unknowns themselves."""
@@ -225,8 +225,8 @@ def _slopes(
 ) -> _Slopes:
     def one(state: CalibrationStates, start: Array) -> _Slopes:
         def both(unknowns: Array, error: Array) -> tuple:
-            found = _columns(model, state, settings, aim, unknowns, error, start)
-            return found, found
+            columns_and_point = _columns(model, state, settings, aim, unknowns, error, start)
+            return columns_and_point, columns_and_point
 
         slopes = jax.jacfwd(both, argnums=(0, 1), has_aux=True)
         (columns, points), (value, point) = slopes(unknowns, jnp.zeros_like(state.error))
@@ -320,8 +320,8 @@ def _fitted(model: Structure, states: CalibrationStates, settings: _Settings, ai
 
 
 def _jacobian(whiten: Array, slopes: _Slopes, aim: _Aim) -> np.ndarray:
-    own, by_unknown = np.asarray(whiten), np.asarray(slopes.by_unknown)
-    of_states = whitened_columns(own, by_unknown).reshape(-1, by_unknown.shape[-1])
+    whitener, by_unknown = np.asarray(whiten), np.asarray(slopes.by_unknown)
+    of_states = whitened_columns(whitener, by_unknown).reshape(-1, by_unknown.shape[-1])
     values, weight = np.asarray(aim.values), np.asarray(aim.weight)
     of_parameters = np.where(values != 0, values, 1.0) * weight
     shared = np.ones(by_unknown.shape[-1] - len(values))
@@ -331,26 +331,26 @@ def _jacobian(whiten: Array, slopes: _Slopes, aim: _Aim) -> np.ndarray:
 def _result(
     model: Structure, n_states: int, chosen: ComparedColumns, settings: _Settings, aim: _Aim
 ) -> CalibratedModel:
-    found = _fitted(model, chosen.states, settings, aim)
-    names, p, usable = settings.names, len(settings.names), found.usable
+    fit = _fitted(model, chosen.states, settings, aim)
+    names, p, usable = settings.names, len(settings.names), fit.usable
     known = np.asarray(chosen.states.known) & usable[:, None]
     freedom = int(known.sum()) + int(np.sum(np.asarray(aim.weight) > 0)) - p
-    square = np.sum(found.residuals**2) + np.sum(
-        np.asarray(aim.misses(jnp.asarray(found.unknowns))) ** 2
+    square = np.sum(fit.residuals**2) + np.sum(
+        np.asarray(aim.misses(jnp.asarray(fit.unknowns))) ** 2
     )
     reduced = float(square) / freedom if freedom > 0 else np.nan
-    values = np.asarray(aim.parameters(jnp.asarray(found.unknowns)))
+    values = np.asarray(aim.parameters(jnp.asarray(fit.unknowns)))
     unit = np.where(np.asarray(aim.values) != 0, np.asarray(aim.values), 1.0)
-    covariance = _inverse_of_square(found.jacobian)[:p, :p] * unit * unit[:, None]
+    covariance = _inverse_of_square(fit.jacobian)[:p, :p] * unit * unit[:, None]
     scatter = float(np.sqrt(2 / max(freedom, 1)))  # 1σ of the reduced χ²
     if not chosen.noise_stated or not reduced <= 1 + 3 * scatter:
         covariance = covariance * reduced
     std = np.sqrt(np.diag(covariance))
-    level = found.unknowns[p:].reshape(settings.n_levels, -1) * np.asarray(aim.level_std)
+    level = fit.unknowns[p:].reshape(settings.n_levels, -1) * np.asarray(aim.level_std)
     shared = dict(zip(settings.shared, level.T, strict=True))
     nothing = np.zeros(settings.n_levels)
     residuals = np.full((n_states, known.shape[1]), np.nan)
-    residuals[chosen.rows] = np.where(known, found.residuals, np.nan)
+    residuals[chosen.rows] = np.where(known, fit.residuals, np.nan)
     converged = np.zeros(n_states, dtype=bool)
     converged[chosen.rows] = usable
     fitted = with_parameters(model, names, jnp.asarray(values))
@@ -365,26 +365,24 @@ def _result(
         reduced_chi_square=reduced,
         names=names,
         noise_stated=chosen.noise_stated,
-        status=found.status,
-        notes=(*chosen.notes, *_notes(chosen, names, found, reduced, 3 * scatter)),
+        status=fit.status,
+        notes=(*chosen.notes, *_notes(chosen, names, fit, reduced, 3 * scatter)),
     )
 
 
 def _notes(
-    chosen: ComparedColumns, names: tuple[str, ...], found: _Fitted, reduced: float, margin: float
+    chosen: ComparedColumns, names: tuple[str, ...], fit: _Fitted, reduced: float, margin: float
 ) -> list[Fact]:
     notes = []
-    if found.status == MinimisationStatus.NOT_FINITE:
+    if fit.status == MinimisationStatus.NOT_FINITE:
         notes.append(Fact("no_motion_for_calibration"))
-    elif not found.status.found_minimum:
+    elif not fit.status.found_minimum:
         notes.append(Fact("calibration_not_converged"))
-    if not found.usable.all():
-        notes.append(
-            Fact("states_without_motion", states=tuple(chosen.rows[~found.usable].tolist()))
-        )
+    if not fit.usable.all():
+        notes.append(Fact("states_without_motion", states=tuple(chosen.rows[~fit.usable].tolist())))
     if chosen.noise_stated and not abs(reduced - 1) <= margin:
         notes.append(Fact("calibration_noise", scale=float(np.sqrt(reduced))))
-    slopes = zip(names, found.jacobian.T, strict=False)
+    slopes = zip(names, fit.jacobian.T, strict=False)
     blind = tuple(name for name, slope in slopes if not slope.any())
     if blind:
         notes.append(Fact("parameters_without_data", names=blind))

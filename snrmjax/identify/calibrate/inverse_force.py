@@ -65,13 +65,13 @@ def inverse_force(model: Structure, data: SteadyStates, *, harmonic_order: int =
     """
     check_phases(data, "an inverse force")
     chosen = calibration_states(model, data, harmonic_order)
-    found = _needed(model, chosen.states, chosen.sensors[0], harmonic_order)
+    solved = _needed(model, chosen.states, chosen.sensors[0], harmonic_order)
     n, rows = data.n_states, chosen.rows
-    nothing = jnp.full((n, *found.velocity.shape[1:]), jnp.nan, dtype=jnp.complex128)
+    nothing = jnp.full((n, *solved.velocity.shape[1:]), jnp.nan, dtype=jnp.complex128)
     return InverseForce(
-        force=nothing[:, 0, 0].at[rows].set(found.force),
-        velocity=nothing.at[rows].set(found.velocity),
-        converged=jnp.zeros(n, dtype=bool).at[rows].set(found.converged),
+        force=nothing[:, 0, 0].at[rows].set(solved.force),
+        velocity=nothing.at[rows].set(solved.velocity),
+        converged=jnp.zeros(n, dtype=bool).at[rows].set(solved.converged),
     )
 
 
@@ -102,8 +102,8 @@ class StateWithErrors(NamedTuple):
     def velocity(self) -> Complex[Array, " sensor"]:
         """Fundamentals freed of the errors, in m/s."""
         n = self.state.velocity.shape[0]
-        own = jnp.exp(self.error[1 : n + 1] + 1j * self.error[n + 1 :])
-        return self.state.velocity * self.factor * own
+        factors = jnp.exp(self.error[1 : n + 1] + 1j * self.error[n + 1 :])
+        return self.state.velocity * self.factor * factors
 
     def harmonics(self, orders: tuple[int, ...]) -> Complex[Array, "sensor harmonic"]:
         """Harmonics freed of the errors, in m/s: a phase is an error of time, h times as large."""
@@ -138,8 +138,8 @@ def residual_columns(
     seen = seen[:, np.array(sensors)]
     higher = seen[np.array(orders, dtype=int)].T - harmonics
     missed = jnp.append((seen[1] - velocity)[1:], higher.reshape(-1)) / jnp.abs(state.velocity[0])
-    own = (force - state.force * jnp.exp(erring.error[0])) / state.force
-    each = jnp.append(own, missed)
+    force_misfit = (force - state.force * jnp.exp(erring.error[0])) / state.force
+    each = jnp.append(force_misfit, missed)
     parts = jnp.stack([each.real, each.imag], axis=1).reshape(-1)
     return jnp.where(state.known, parts, 0.0)
 

@@ -74,15 +74,15 @@ def notes_on_instruments(fit: Any, level_errors: Sequence[str]) -> list[Fact]:
     names, notes = fit.names(), []
     std = np.sqrt(np.abs(np.diag(fit.covariance)))
     for name in fit.free:
-        own = float(std[names.index(name)])
-        how = _determined(name, own)
+        size = float(std[names.index(name)])
+        how = _determined(name, size)
         if name == "force_gain":
             phase = np.angle(np.asarray(fit.motion().velocity))
-            note = force_gain_undetermined(own, float(np.max(np.abs(phase))))
+            note = force_gain_undetermined(size, float(np.max(np.abs(phase))))
         elif how is Determination.WELL:
             note = None
         else:
-            note = Fact("instrument_undetermined", name=name, std=own, how=how)
+            note = Fact("instrument_undetermined", name=name, std=size, how=how)
         if how is Determination.NOT_AT_ALL:
             raise ValueError(str(note))
         notes += [] if note is None else [note]

@@ -144,13 +144,13 @@ class PowerLaw(AbstractFamily):
     ) -> list[AbstractFamily]:
         """See `AbstractFamily`."""
         scale = float(np.max(amplitude))
-        found: list[AbstractFamily] = []
+        members: list[AbstractFamily] = []
         for power in cls.tried:
             columns = np.stack([np.ones(len(values)), (amplitude / scale) ** power], axis=1)
             share = power / cls.largest_exponent
             start = [*linear_start(columns, values, weight), np.log(share / (1 - share))]
-            found.append(cls(jnp.asarray(start), jnp.asarray(scale, dtype=jnp.float64), argument))
-        return found
+            members.append(cls(jnp.asarray(start), jnp.asarray(scale, dtype=jnp.float64), argument))
+        return members
 
 
 class ViscousMicroslip(PowerLaw):
@@ -172,7 +172,9 @@ class FamilyTable(dict[str, type[AbstractFamily]]):
     def __repr__(self) -> str:
         """One line for each family."""
         width = max((len(kind) for kind in self), default=0)
-        texts = {kind: (one.__doc__ or "").strip().split("\n")[0] for kind, one in self.items()}
+        texts = {
+            kind: (family.__doc__ or "").strip().split("\n")[0] for kind, family in self.items()
+        }
         return "\n".join(f"{kind:{width}}  {text}" for kind, text in texts.items())
 
 

@@ -123,9 +123,9 @@ def amplitudes_apart(
     Arguments: `amplitude` relative to the largest; of more than `most` even picks.
     """
     apart = [1.0]
-    for one in np.sort(amplitude)[::-1]:
-        if 0 < one * ratio <= apart[-1]:
-            apart.append(float(one))
+    for size in np.sort(amplitude)[::-1]:
+        if 0 < size * ratio <= apart[-1]:
+            apart.append(float(size))
     pick = np.linspace(0, len(apart) - 1, min(most, len(apart)))
     return np.array(apart)[np.round(pick).astype(int)][::-1]
 

@@ -54,9 +54,9 @@ class Contributions(AbstractTable[Contribution]):
     def summary(self) -> tuple[str, ...]:
         """See `AbstractResult`."""
         listed = [
-            f"{one.source}: {100 * one.frequency_share:.1f} % of the variance of the natural "
-            f"frequency, {100 * one.damping_share:.1f} % of the damping's"
-            for one in self.rows[:_LISTED]
+            f"{row.source}: {100 * row.frequency_share:.1f} % of the variance of the natural "
+            f"frequency, {100 * row.damping_share:.1f} % of the damping's"
+            for row in self.rows[:_LISTED]
         ]
         more = len(self.rows) - len(listed)
         return (
@@ -107,9 +107,9 @@ def contributions(fit: JointFit, *, n_amplitudes: int = 25) -> Contributions:
     largest first; they sum to one but for rounding.
     """
     program, problem = fit.packed(), padded_problem(fit.problem)
-    found = _first_order(program.vector, program.unravel, problem)
+    derivatives = _first_order(program.vector, program.unravel, problem)
     p, n, n_levels = len(program.own), len(fit.data.level), fit.data.n_levels
-    jacobian, by_error = np.asarray(found[0])[:, program.own], np.asarray(found[1])[:n]
+    jacobian, by_error = np.asarray(derivatives[0])[:, program.own], np.asarray(derivatives[1])[:n]
     inverse = inverse_of(jacobian)
     points = jacobian[: 2 * len(problem.data.level)].reshape(-1, 2, p)[:n]
     by_state = np.einsum("pq,siq,sie->pse", inverse, points, by_error) * np.asarray(fit.data.std)

@@ -55,9 +55,10 @@ class FittedResponse(PredictedResponse):
             f"FittedResponse to {self.force:.4g} N: {len(hertz)} points from {hertz.min():.6g} to "
             f"{hertz.max():.6g} Hz, up to {size.max():.4g} m/s",
             *(
-                f"{one.kind} at {one.frequency / HERTZ:.6g} ± {one.frequency_std / HERTZ:.2g} Hz"
-                f", {one.velocity:.4g} ± {one.velocity_std:.2g} m/s"
-                for one in (*self.resonances, *self.folds)
+                f"{point.kind} at {point.frequency / HERTZ:.6g} ± "
+                f"{point.frequency_std / HERTZ:.2g} Hz, {point.velocity:.4g} ± "
+                f"{point.velocity_std:.2g} m/s"
+                for point in (*self.resonances, *self.folds)
             ),
             f"{int(np.sum(~self.stable))} points unstable, {int(np.sum(self.continued))} beyond "
             f"the measured amplitudes, {len(self.not_located)} resonances or folds not located",
@@ -66,11 +67,11 @@ class FittedResponse(PredictedResponse):
 
     def attributes(self) -> dict[str, str | float | int]:
         """See `AbstractResult`."""
-        own: dict[str, str | float | int] = {
+        more: dict[str, str | float | int] = {
             "sensor": self.sensor,
             "n_not_located": len(self.not_located),
         }
-        return super().attributes() | own
+        return super().attributes() | more
 
 
 def fitted_response(
@@ -113,8 +114,8 @@ def fitted_response(
         amplitude, frequency, velocity, frequency_std, velocity_std = band
         places = [*(tips if number == 0 else ()), *turns(curve.frequency, curve.amplitude)]
         points = [located(fit, force, place, level) for place in places]
-        good = [one for one in points if one.located]
-        missing = tuple(one for one in points if not one.located)
+        good = [point for point in points if point.located]
+        missing = tuple(point for point in points if not point.located)
         answer.append(
             FittedResponse(
                 force=force,
@@ -128,8 +129,8 @@ def fitted_response(
                 notes=(*curve.notes, *_notes_on(missing, force)),
                 frequency_std=frequency_std,
                 velocity_std=velocity_std,
-                resonances=tuple(one for one in good if one.kind == "resonance"),
-                folds=tuple(one for one in good if one.kind == "fold"),
+                resonances=tuple(point for point in good if point.kind == "resonance"),
+                folds=tuple(point for point in good if point.kind == "fold"),
                 not_located=missing,
                 sensor=fit.modes.sensors[fit.data.sensor],
             )
@@ -138,7 +139,7 @@ def fitted_response(
 
 
 def _notes_on(missing: tuple[FittedPoint, ...], force: float) -> tuple[Fact, ...]:
-    points = tuple((one.kind, float(one.frequency) / HERTZ) for one in missing)
+    points = tuple((point.kind, float(point.frequency) / HERTZ) for point in missing)
     return (Fact("points_not_located", points=points, force=force),) if points else ()
 
 

@@ -55,8 +55,8 @@ class Identification(AbstractResult):
     def level_frequency_std(self) -> float:
         """1σ of the natural frequency (rad/s) that the states of a level share."""
         j = self.fit.modes.mode_of_interest
-        own = float(self.fit.modes.natural_frequency[j])
-        return 0.5 * float(self.fit.noise.level_std[2]) * own
+        natural = float(self.fit.modes.natural_frequency[j])
+        return 0.5 * float(self.fit.noise.level_std[2]) * natural
 
     @property
     def level_damping_std(self) -> float:
@@ -90,12 +90,12 @@ class Identification(AbstractResult):
 
     def variables(self) -> dict[str, Variable]:
         """See `AbstractResult`; those of the points, and of the curves under `backbone_…`."""
-        own = dict(self.points.variables())
+        variables = dict(self.points.variables())
         for name, variable in self.backbone.variables().items():
             at = "backbone_amplitude_m_s"
             key = at if name == "velocity_m_s" else f"backbone_{name}"
-            own[key] = variable._replace(dimensions=(at,))
-        return own
+            variables[key] = variable._replace(dimensions=(at,))
+        return variables
 
     def attributes(self) -> dict[str, str | float | int]:
         """See `AbstractResult`."""
@@ -149,8 +149,8 @@ def identify_backbone(
         )
     family = "auto" if n_knots is None else f"smoothing_spline:{n_knots}"
     fit = fit_jointly(states, modes, backbone=family, damping=family)
-    found = identification_of_fit(data, fit, amplitude=amplitude, measure=measure)
-    return dataclasses.replace(found, notes=(*data.notes, *found.notes))
+    identified = identification_of_fit(data, fit, amplitude=amplitude, measure=measure)
+    return dataclasses.replace(identified, notes=(*data.notes, *identified.notes))
 
 
 def identification_of_fit(
@@ -172,19 +172,19 @@ def identification_of_fit(
     """
     points = identify_points(data, fit.modes_found, amplitude=amplitude, measure=measure)
     curves = as_backbone(fit, argument=amplitude)
-    found = Identification(points, curves, fit, ())
+    identified = Identification(points, curves, fit, ())
     if not fit.noise.stated:
         gain, phase = map(float, fit.noise.level_std[:2])
         j = fit.modes.mode_of_interest
-        own = float(fit.modes.natural_frequency[j])
-        wandering = 0.5 * own * float(np.max(np.asarray(fit.data.std)[:, 3]))
+        natural = float(fit.modes.natural_frequency[j])
+        wandering = 0.5 * natural * float(np.max(np.asarray(fit.data.std)[:, 3]))
         points = errors_from_scatter(
             points,
             fit.noise.scale,
             level_gain=gain,
             level_phase=phase,
-            frequency_std=float(np.hypot(found.level_frequency_std, wandering)),
-            damping_std=found.level_damping_std,
+            frequency_std=float(np.hypot(identified.level_frequency_std, wandering)),
+            damping_std=identified.level_damping_std,
             modal_mass_std=fit.modes_found.own_modal_mass_std,
         )
     notes = (
@@ -217,10 +217,10 @@ def errors_from_scatter(
     scale = noise * off_resonance_error_factor(np.asarray(points.mode_velocity))
     shared = np.array([0.0, level_gain, level_phase])
     spread = np.hypot(scale[:, None, None] * np.array([0.0, 1.0, 1.0]), shared)
-    own = np.sum((sensitivity[:, :2] * spread) ** 2, axis=2)
+    variances = np.sum((sensitivity[:, :2] * spread) ** 2, axis=2)
     natural, damping = np.asarray(points.natural_frequency), np.asarray(points.damping_ratio)
-    natural_std = np.hypot(np.sqrt(own[:, 0]) / (2 * natural), frequency_std)
-    of_damping = np.hypot(np.sqrt(own[:, 1]) / (2 * natural), damping_std)
+    natural_std = np.hypot(np.sqrt(variances[:, 0]) / (2 * natural), frequency_std)
+    of_damping = np.hypot(np.sqrt(variances[:, 1]) / (2 * natural), damping_std)
     of_damping = np.hypot(of_damping, damping * natural_std / natural)
     if modal_mass_std is not None:
         of_mass = moved_by_modal_mass(natural, damping, np.asarray(points.frequency))

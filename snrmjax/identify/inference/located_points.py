@@ -15,6 +15,8 @@ from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.result import quantity, setting
 
 _ITERATIONS = 12
+_SETTLED = 1e-9  # relative step, below which a point is a root
+_FARTHEST = 0.2  # relative, from where the drawn curve has it
 
 Kind = Literal["resonance", "fold"]
 
@@ -62,14 +64,14 @@ def located(
 
     At a phase resonance the mode moves in phase with the force: 2ζ̃ω̃ = |A|F/v.
     """
-    found = solved_point(fit, force, place, new)
+    solved = solved_point(fit, force, place, new)
     (_, x, omega), nan = place, float("nan")
     values, std, ratio = np.array([omega, omega * x, x]), np.full(3, nan), nan
-    if found is not None:
-        values = found.values
-        std = np.sqrt(found.variance(fit) + found.by_level**2 @ new.std**2)
+    if solved is not None:
+        values = solved.values
+        std = np.sqrt(solved.variance(fit) + solved.by_level**2 @ new.std**2)
     omega, speed, x = map(float, values)
-    if found is not None and place.kind == "resonance":
+    if solved is not None and place.kind == "resonance":
         load = abs(float(fit.problem.constant_of(fit.unknowns))) * force
         ratio = load / (2 * omega**2 * x)
     return FittedPoint(
@@ -82,7 +84,7 @@ def located(
         frequency_std=float(std[0]),
         velocity_std=float(std[1]),
         kind=place.kind,
-        located=found is not None,
+        located=solved is not None,
     )
 
 
@@ -129,10 +131,11 @@ def _point_with_slopes(
         return point - jnp.linalg.solve(jacobian, equations(point, vector))
 
     point = jax.lax.fori_loop(0, _ITERATIONS, step, jnp.ones(2))
-    left = jnp.max(jnp.abs(equations(point, vector)))
-    good = (left < 1e-9) & jnp.all(jnp.abs(point - 1.0) < 0.2)
-    by_vector = jax.jacfwd(equations, argnums=1)(point, vector)
-    along = -jnp.linalg.solve(jax.jacfwd(equations)(point, vector), by_vector)
+    # What a further step would move: what the equations leave grows with lightly damped slopes.
+    jacobian, by_vector = jax.jacfwd(equations, argnums=(0, 1))(point, vector)
+    left = jnp.linalg.solve(jacobian, equations(point, vector))
+    good = jnp.all(jnp.abs(left) < _SETTLED) & jnp.all(jnp.abs(point - 1.0) < _FARTHEST)
+    along = -jnp.linalg.solve(jacobian, by_vector)
 
     def outputs(point: Array, vector: Array) -> Array:
         x, omega = point * unit

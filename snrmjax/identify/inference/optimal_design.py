@@ -106,10 +106,10 @@ class NextMeasurements(AbstractTable[NextMeasurement]):
     def summary(self) -> tuple[str, ...]:
         """See `AbstractResult`."""
         lines = [f"NextMeasurements: {len(self)} states that narrow the band of {self.target} most"]
-        for one in self.rows[:_SHOWN]:
-            load = f"force {one.force:.4g} N" if one.drive is None else f"drive {one.drive:.4g} V"
-            place = f"{load}, {one.frequency / HERTZ:.6g} Hz (expected {one.expected})"
-            lines.append(f"{one.rank}: {place}: {one.reason}")
+        for row in self.rows[:_SHOWN]:
+            load = f"force {row.force:.4g} N" if row.drive is None else f"drive {row.drive:.4g} V"
+            place = f"{load}, {row.frequency / HERTZ:.6g} Hz (expected {row.expected})"
+            lines.append(f"{row.rank}: {place}: {row.reason}")
         if len(self) > _SHOWN:
             lines.append(f"and {len(self) - _SHOWN} more")
         if self.status != AdviceStatus.COMPLETE:
@@ -119,7 +119,9 @@ class NextMeasurements(AbstractTable[NextMeasurement]):
     def variables(self) -> dict[str, Variable]:
         """Those of the rows, the force as a test states it."""
         left_out = "force_n" if self.drive_known_only else "drive_v"
-        return {name: one for name, one in super().variables().items() if name != left_out}
+        return {
+            name: variable for name, variable in super().variables().items() if name != left_out
+        }
 
     def attributes(self) -> dict[str, str | float | int]:
         """See `AbstractResult`."""
@@ -160,7 +162,7 @@ def next_measurements(
     states = _candidates(fit, [float(f) for f in wanted], (from_frequency, to_frequency))
     slopes, scale = _target(fit, target)
     advice = [] if states is None else _ranked(fit, states, slopes / scale[:, None], target, count)
-    loads = {one.force for one in advice}
+    loads = {row.force for row in advice}
     status = AdviceStatus.COMPLETE if len(advice) == count else AdviceStatus.FEWER_STATES
     return NextMeasurements(
         rows=tuple(advice),
@@ -224,11 +226,11 @@ class _States(NamedTuple):
 
 
 def _candidates(fit: JointFit, forces: list[float], ends: tuple[float, float]) -> _States | None:
-    rows, every = [], []
+    rows, drawn = [], []
     for number, force in enumerate(forces):
         curves = fitted_response(fit, force, from_frequency=ends[0], to_frequency=ends[1])
         for curve in curves[:1]:
-            every.append(curve)
+            drawn.append(curve)
             keep = _measurable(curve)
             at = np.flatnonzero(keep)
             if at.size > _PER_FORCE:
@@ -242,7 +244,7 @@ def _candidates(fit: JointFit, forces: list[float], ends: tuple[float, float]) -
     if not rows or not sum(len(row[0]) for row in rows):
         return None
     level, load, frequency, velocity = (np.concatenate(c) for c in zip(*rows, strict=True))
-    return _States(level, load, frequency, velocity, tuple(every))
+    return _States(level, load, frequency, velocity, tuple(drawn))
 
 
 def _measurable(curve: FittedResponse) -> np.ndarray:
@@ -286,8 +288,8 @@ def _information(fit: JointFit, states: _States) -> Float[np.ndarray, "state par
     padded_states = jax.tree.map(lambda rows: filled(rows, n_padded, None), data)
     levels = dataclasses.replace(padded_states, n_levels=padded_levels(n_levels))
     problem = BalanceProblem(levels, fit.modes, fit.prior)
-    found = _slopes(program.vector, program.unravel, problem)
-    by_vector, by_level = (np.asarray(part)[:n] for part in found)
+    by_unknowns = _slopes(program.vector, program.unravel, problem)
+    by_vector, by_level = (np.asarray(part)[:n] for part in by_unknowns)
     rows = np.zeros((n, 2, fit.covariance.shape[0] + n_levels * len(LEVEL_ERRORS)))
     rows[:, :, : fit.covariance.shape[0]] = by_vector[:, :, program.own]
     for k in range(len(LEVEL_ERRORS)):
@@ -325,9 +327,9 @@ def _best(
 ) -> tuple[int, np.ndarray]:
     """The candidate that leaves the smallest mean band, and the variances that it leaves."""
     index = np.flatnonzero(wanted)
-    own = rows[index]
-    through = own @ covariance  # (state, part, unknown)
-    inner = np.eye(2) + through @ own.transpose(0, 2, 1)
+    candidates = rows[index]
+    through = candidates @ covariance  # (state, part, unknown)
+    inner = np.eye(2) + through @ candidates.transpose(0, 2, 1)
     arms = through @ slopes.T  # (state, part, output)
     gain = np.einsum("sio,sio->so", arms, np.linalg.solve(inner, arms))
     variance = np.einsum("op,pq,oq->o", slopes, covariance, slopes)

@@ -1,13 +1,10 @@
 """The unknowns of a joint fit, fitted anew to resampled states."""
 
-from collections.abc import Callable
-
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from snrmjax.identify.joint.family_fit import SOLVER
 from snrmjax.identify.joint.force_balance import BalanceProblem, filled
@@ -37,46 +34,30 @@ def bootstrap(
             for number in range(fit.data.n_levels):
                 mine = np.flatnonzero(level == number)
                 np.add.at(row, rng.choice(mine, size=mine.size), 1.0)
-    weights = weights * np.asarray(fit.data.weight)
-    refit, own = _refit_of(fit)
-    room = len(refit.problem.data.level)
-    every = np.stack([filled(row, room, 0.0) for row in weights])
-    return np.asarray(_resampled(refit, jnp.asarray(every)))[:, own]
-
-
-class _Refit(eqx.Module):
-    """A fit's problem and where it ended, as compiled programs take them."""
-
-    vector: Float[Array, " entry"]
-    std: Float[Array, " entry"]
-    unravel: Unravel
-    problem: BalanceProblem
-
-    def solved(self, residuals: Callable[[Array], Array], start: Array) -> Float[Array, " entry"]:
-        """The unknowns that make residuals least, from a start on; NaN if none are found."""
-        unit = jnp.where(self.std > 0, self.std, 1.0)
-        found: optx.Solution = optx.least_squares(
-            lambda y, _: residuals(self.vector + y * unit),
-            *(SOLVER, (start - self.vector) / unit),
-            max_steps=_MOST_STEPS,
-            throw=False,
-        )
-        good = found.result == optx.RESULTS.successful
-        return jnp.where(good, self.vector + found.value * unit, jnp.nan)
-
-
-def _refit_of(fit: JointFit) -> tuple[_Refit, Int[np.ndarray, " unknown"]]:
-    """The problem of refits, and where in its vector the fit's own unknowns are."""
-    program = fit.packed()
+    program, problem = fit.packed(), padded_problem(fit.problem)
     std = np.sqrt(np.diag(program.padded_covariance(fit.covariance)))
-    problem = padded_problem(fit.problem)
-    return _Refit(program.vector, jnp.asarray(std), program.unravel, problem), program.own
+    room, weights = len(problem.data.level), weights * np.asarray(fit.data.weight)
+    rows = jnp.asarray(np.stack([filled(row, room, 0.0) for row in weights]))
+    unit = jnp.asarray(np.where(std > 0, std, 1.0))
+    found = _resampled(program.vector, program.unravel, problem, unit, rows)
+    return np.asarray(found)[:, program.own]
 
 
 @compiled
-def _resampled(refit: _Refit, weights: Array) -> Float[Array, "sample entry"]:
-    def one(weight: Array) -> Array:
-        given = (refit.unravel, refit.problem.with_data(weight=weight))
-        return refit.solved(lambda vector: corrected_residuals(vector, *given), refit.vector)
+def _resampled(
+    vector: Array, unravel: Unravel, problem: BalanceProblem, unit: Array, weights: Array
+) -> Float[Array, "sample entry"]:
+    """Unknowns that make the residuals of weighted states least; NaN where none are found."""
 
-    return jax.lax.map(one, weights)
+    def refit(weight: Array) -> Array:
+        weighted = problem.with_data(weight=weight)
+        solution: optx.Solution = optx.least_squares(
+            lambda y, _: corrected_residuals(vector + y * unit, unravel, weighted),
+            *(SOLVER, jnp.zeros_like(vector)),
+            max_steps=_MOST_STEPS,
+            throw=False,
+        )
+        good = solution.result == optx.RESULTS.successful
+        return jnp.where(good, vector + solution.value * unit, jnp.nan)
+
+    return jax.lax.map(refit, weights)

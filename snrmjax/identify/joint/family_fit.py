@@ -95,21 +95,21 @@ def fit_families(
         problem = problem.with_data(correction=answer.correction[:n])
         residuals = np.asarray(answer.residuals)[:n] / np.sqrt(share)
         level, frequency = (np.asarray(a) for a in (problem.data.level, problem.data.frequency))
-        told = share_told_by(residuals, level, frequency)
-        rows = told * residuals.size
+        independent = share_told_by(residuals, level, frequency)
+        rows = independent * residuals.size
         left = max(rows - degrees_spent(jacobian, answer.residuals.size), LEAST_LEFT * rows)
-        found = size * float(np.sqrt(told * np.sum(residuals**2) / left))
-        std = found / float(np.sqrt(2 * left))
-        noise = dataclasses.replace(noise, scale=found, scale_std=std)
-        wanted = 1.0 if believed and not noise.exceeded else max(found, 1e-12)
-        change = np.hypot(np.log(wanted / size), np.log(told / share))
-        size, share = (size, share) if change < _SETTLED else (wanted, told)
+        scale = size * float(np.sqrt(independent * np.sum(residuals**2) / left))
+        std = scale / float(np.sqrt(2 * left))
+        noise = dataclasses.replace(noise, scale=scale, scale_std=std)
+        wanted = 1.0 if believed and not noise.exceeded else max(scale, 1e-12)
+        change = np.hypot(np.log(wanted / size), np.log(independent / share))
+        size, share = (size, share) if change < _SETTLED else (wanted, independent)
         if change < _SETTLED:
             status = FitStatus.CONVERGED if bool(good) else FitStatus.STEP_LIMIT
             break
     root = root_of_inverse(jacobian)
-    own = Unravel(start, free)(np.asarray(program.vector)[program.own])
-    return FamilyFit(own, root @ root.T, problem, noise, residuals, status)
+    unknowns = Unravel(start, free)(np.asarray(program.vector)[program.own])
+    return FamilyFit(unknowns, root @ root.T, problem, noise, residuals, status)
 
 
 class _Answer(NamedTuple):
@@ -140,10 +140,10 @@ def _solved(
     Every unknown counts in its own `unit`, so that the solver's damping treats all alike; states
     are corrected for their most likely errors at every step.
     """
-    found: optx.Solution = optx.least_squares(
+    solution: optx.Solution = optx.least_squares(
         lambda y, _: corrected_residuals(y * unit, unravel, problem),
         *(_ROUND, vector / unit),
         max_steps=MOST_STEPS,
         throw=False,
     )
-    return found.value * unit, jnp.asarray(found.result == optx.RESULTS.successful)
+    return solution.value * unit, jnp.asarray(solution.result == optx.RESULTS.successful)

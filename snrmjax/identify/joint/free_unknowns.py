@@ -52,9 +52,9 @@ class Unravel(eqx.Module):
             return eqx.combine(ravel_pytree(moving)[1](vector), fixed)
         leaves, structure = jax.tree.flatten(moving)
         ends = np.cumsum([leaf.size for leaf in leaves])
-        own = np.split(np.asarray(vector), ends[:-1])
+        pieces = np.split(np.asarray(vector), ends[:-1])
         parts = [
-            jnp.asarray(part.reshape(leaf.shape)) for part, leaf in zip(own, leaves, strict=True)
+            jnp.asarray(part.reshape(leaf.shape)) for part, leaf in zip(pieces, leaves, strict=True)
         ]
         return eqx.combine(jax.tree.unflatten(structure, parts), fixed)
 
@@ -96,8 +96,8 @@ def packed_unknowns(
     linear = len(vector) - len(unknowns.linear)
     spare = (len(whole.level) - present) * len(LEVEL_ERRORS)
     rest = (*range(size + other, linear - spare), *range(linear, len(vector)))
-    own = [*range(n), *range(size, size + m), *rest]
-    return PackedUnknowns(vector, Unravel(whole, free), np.array(own))
+    places = [*range(n), *range(size, size + m), *rest]
+    return PackedUnknowns(vector, Unravel(whole, free), np.array(places))
 
 
 def padded_data(data: BalanceData) -> BalanceData:
@@ -198,5 +198,5 @@ def corrected_residuals(
     The residuals are then those errors in units of their 1σ, whose slopes need no derivative of
     the errors themselves.
     """
-    errors, own = nearest_errors(unravel(jax.lax.stop_gradient(vector)), problem)
-    return all_residuals(vector, unravel, problem.with_data(correction=errors), own)
+    errors, weighting = nearest_errors(unravel(jax.lax.stop_gradient(vector)), problem)
+    return all_residuals(vector, unravel, problem.with_data(correction=errors), weighting)

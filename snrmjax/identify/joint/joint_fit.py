@@ -124,13 +124,13 @@ class JointFit(AbstractResult):
         """
         share = self.problem.constant_of(self.unknowns) / self.problem.modal_constant
         j, modes = self.modes.mode_of_interest, self.modes
-        found = eqx.tree_at(
+        scaled = eqx.tree_at(
             lambda m: m.participation, modes, modes.participation.at[j].multiply(share)
         )
         if modes.modal_mass_std is None:
-            return found
+            return scaled
         left = self.prior.linear[-1] * jnp.sqrt(jnp.asarray(self.covariance)[-1, -1])
-        return eqx.tree_at(lambda m: m.modal_mass_std, found, modes.modal_mass_std.at[j].set(left))
+        return eqx.tree_at(lambda m: m.modal_mass_std, scaled, modes.modal_mass_std.at[j].set(left))
 
     def motion(self) -> Motion:
         """The nonlinear mode's motion in the states as the fit sees it."""
@@ -166,8 +166,8 @@ class JointFit(AbstractResult):
 
     def labels(self) -> tuple[str, ...]:
         """`names` with the levels' own numbers, for readers."""
-        own = named_unknowns(self.unknowns, self.data, self.free, self.level_numbers)
-        return tuple(name for name, _ in own)
+        named = named_unknowns(self.unknowns, self.data, self.free, self.level_numbers)
+        return tuple(name for name, _ in named)
 
     def units(self) -> tuple[str, ...]:
         """Units of the free unknowns; a curve's terms count at the largest amplitude."""
@@ -283,7 +283,9 @@ def fit_jointly(
         raise ValueError(f"a joint fit needs at least 3 steady states, but only {n} are usable.")
     driven = not np.any(np.isfinite(np.asarray(data.force)))
     released = tuple(name for name in FREE if name in free or (driven and name == "force_gain"))
-    knots = {one.size for one in choices if one.kind == SmoothingSpline.kind and one.size}
+    knots = {
+        choice.size for choice in choices if choice.kind == SmoothingSpline.kind and choice.size
+    }
     if len(knots) > 1:
         raise ValueError(
             f"smooth curves have their knots in common: give both one size, not {min(knots)} "
@@ -291,12 +293,12 @@ def fit_jointly(
         )
     problem = BalanceProblem(measured, modes, stated_prior(modes, level_std, released))
     view = view_of(problem, released, stated, robust=robust, knots=max(knots, default=None))
-    found, unknowns = view.posterior, viewed_unknowns(view, choices)
+    posterior, unknowns = view.posterior, viewed_unknowns(view, choices)
     best = FamilyFit(
-        *(unknowns, viewed_covariance(view), view.problem, view.noise, found.residuals),
-        FitStatus.CONVERGED if found.settled else FitStatus.NOT_SETTLED,
+        *(unknowns, viewed_covariance(view), view.problem, view.noise, posterior.residuals),
+        FitStatus.CONVERGED if posterior.settled else FitStatus.NOT_SETTLED,
     )
-    if not all(one.kind in SMOOTH and one.argument != "velocity" for one in choices):
+    if not all(choice.kind in SMOOTH and choice.argument != "velocity" for choice in choices):
         wander = np.full(n, view.wandering / (1.0 if view.believed else view.noise.scale))
         errors = np.column_stack([np.asarray(measured.std)[:, :3], wander])
         best = fit_families(
@@ -306,13 +308,15 @@ def fit_jointly(
     autocorrelation = residual_autocorrelation(best.residuals, along_resonance(level, frequency))
     # What levels differ by is said where the data ask for it or the fit made use of it, and stays
     # possible elsewhere.
-    differ = np.array(found.differing) | _moved(best)
-    told = np.where(level_std > 0, level_std, np.where(differ, best.noise.level_std, 0.0))
+    differ = np.array(posterior.differing) | _moved(best)
+    level_std_said = np.where(level_std > 0, level_std, np.where(differ, best.noise.level_std, 0.0))
     fit = JointFit(
         unknowns=best.unknowns,
         covariance=best.covariance,
         problem=best.problem,
-        noise=dataclasses.replace(best.noise, level_std=told, autocorrelation=autocorrelation),
+        noise=dataclasses.replace(
+            best.noise, level_std=level_std_said, autocorrelation=autocorrelation
+        ),
         residuals=best.residuals,
         drive_known_only=driven,
         free=released,

@@ -92,12 +92,12 @@ def notes_on_modal_mass(
     """Which modal mass the damping is relative to: the model's, or one that the data ask for."""
     prior = float(problem.prior.linear[-1])
     model = 1 / abs(float(problem.modal_constant))
-    found = float(problem.modal_mass_of(unknowns))
-    std = found * prior * float(np.sqrt(covariance[-1, -1]))
-    away = abs(found / model - 1)
+    mass = float(problem.modal_mass_of(unknowns))
+    std = mass * prior * float(np.sqrt(covariance[-1, -1]))
+    away = abs(mass / model - 1)
     if prior == 0 or away <= _BREACH * min(prior, std / model):
         return []
-    masses = {"found_kg": found, "std_kg": std, "model_kg": model, "model_std": prior}
+    masses = {"found_kg": mass, "std_kg": std, "model_kg": model, "model_std": prior}
     stated, beyond = problem.modes.modal_mass_std is not None, bool(away > _BREACH * prior)
     return [Fact("modal_mass_moved", **masses, std_stated=stated, beyond_std=beyond)]
 
@@ -114,7 +114,7 @@ def notes_on_autocorrelation(correlation: Float[np.ndarray, " part"]) -> list[Fa
 
 
 def notes_on_level_errors(
-    found: Float[np.ndarray, "level error"],
+    errors: Float[np.ndarray, "level error"],
     numbers: Sequence[int],
     force: Float[np.ndarray, " level"],
     *,
@@ -129,8 +129,10 @@ def notes_on_level_errors(
     drive voltage.
     """
     changes = {
-        "forces" if of_force else "velocities": np.expm1(found[:, 0] if of_force else -found[:, 0]),
-        "phases": -found[:, 1],
+        "forces" if of_force else "velocities": np.expm1(
+            errors[:, 0] if of_force else -errors[:, 0]
+        ),
+        "phases": -errors[:, 1],
     }
     levels, order = tuple(numbers), np.argsort(force)
     return [

@@ -191,8 +191,8 @@ def _start(
         if not mine.size:
             raise ValueError(f"model order {order} has no lightly damped pole in the band.")
         return mine[np.argsort(np.abs(mine))]
-    found = clusters(orders, band)
-    damped, growing = found[found.real < 0], found[found.real > 0]
+    stable = clusters(orders, band)
+    damped, growing = stable[stable.real < 0], stable[stable.real > 0]
     if damped.size:
         return damped
     where = f"between {band[0] / HERTZ:.6g} and {band[1] / HERTZ:.6g} Hz"
@@ -215,7 +215,7 @@ def _by_hand(
 ) -> Complex[np.ndarray, " mode"]:
     if not wanted.size or not np.isfinite(wanted).all():
         raise ValueError("`poles` must be natural frequencies, at least one.")
-    found = []
+    chosen = []
     for omega in np.sort(wanted):
         if not band[0] <= omega <= band[1]:
             raise ValueError(
@@ -229,8 +229,8 @@ def _by_hand(
         if near.size:
             best = near[np.argmin(away[away < _NEAR * omega])]
             ratio = float(-best.real / abs(best))
-        found.append(complex(-ratio * omega, omega * np.sqrt(1 - ratio**2)))
-    return np.array(found)
+        chosen.append(complex(-ratio * omega, omega * np.sqrt(1 - ratio**2)))
+    return np.array(chosen)
 
 
 class _Spread(NamedTuple):
@@ -380,9 +380,9 @@ def _result(
     n, sensors = len(natural), len(data.channels)
     covariance = np.zeros((n, 2 + sensors, 2 + sensors))
     for place, k in enumerate(rank):
-        own = [k, n + k]
-        covariance[place, :2, :2] = fit.covariance[np.ix_(own, own)]
-        cross = fit.cross_covariance(k)[own]
+        pair = [k, n + k]
+        covariance[place, :2, :2] = fit.covariance[np.ix_(pair, pair)]
+        cross = fit.cross_covariance(k)[pair]
         covariance[place, :2, 2:], covariance[place, 2:, :2] = cross, cross.T
         covariance[place, 2:, 2:] = fit.term_covariance(k)
     terms = [k for k, used in enumerate((settings.lower, settings.upper)) if used]
@@ -401,7 +401,7 @@ def _result(
     collinearity, mean_phase, mean_phase_std = complex_residues(
         data, settings, fit, spread.std, rank
     )
-    found = LinearModalFit(
+    modes = LinearModalFit(
         natural_frequency=natural[rank],
         damping_ratio=ratio[rank],
         mode_covariance=covariance,
@@ -425,5 +425,5 @@ def _result(
         reference=data.reference,
         source=data.source,
     )
-    notes = (*data.notes, *fit_notes(found, data, settings, fit, rank))
-    return dataclasses.replace(found, notes=notes)
+    notes = (*data.notes, *fit_notes(modes, data, settings, fit, rank))
+    return dataclasses.replace(modes, notes=notes)

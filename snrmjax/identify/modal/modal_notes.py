@@ -48,8 +48,8 @@ def complex_residues(
         weighted = both * weight[:, None]
         size = np.linalg.norm(weighted, axis=0)
         inverse = np.linalg.pinv(weighted / size, rcond=1e-10) / size[:, None]
-        found = inverse @ (row * weight)
-        residue[k] = found[:n] + 1j * found[-n:]
+        both_parts = inverse @ (row * weight)
+        residue[k] = both_parts[:n] + 1j * both_parts[-n:]
         spread[k] = np.linalg.norm(inverse[-n:], axis=1)
     collinearity, angle = phase_collinearity(residue)
     size = np.maximum(np.sum(np.abs(residue) ** 2, axis=0), 1e-300)
@@ -90,17 +90,17 @@ def leakage_bias(
     low, high = fit.unknowns.copy(), fit.unknowns.copy()
     low[:n], high[:n] = 0.9 * low[:n], 1.1 * high[:n]
     low[n:], high[n:] = low[n:] - 0.5, high[n:] + 0.5
-    found = fit_separable(
+    refit = fit_separable(
         lambda point: receptance_bases(data.omega, point, settings),
         ChannelRows(values, np.tile(weights, (1, 2)), np.zeros(len(values), dtype=int), 2),
         fit.unknowns,
         (low, high),
     )
-    return found.unknowns[n : 2 * n] / fit.unknowns[n : 2 * n] - 1
+    return refit.unknowns[n : 2 * n] / fit.unknowns[n : 2 * n] - 1
 
 
 def fit_notes(
-    found: LinearModalFit,
+    modes: LinearModalFit,
     data: ResponseData,
     settings: BasisSettings,
     fit: SeparableFit,
@@ -109,28 +109,28 @@ def fit_notes(
     """What the fit assumes and the data do not keep."""
     notes = []
     averaged = data.source == "coherence" or data.averages is not None
-    few = found.lines_in_band < _FEW_LINES
-    hertz = (found.natural_frequency / HERTZ).tolist()
+    few = modes.lines_in_band < _FEW_LINES
+    hertz = (modes.natural_frequency / HERTZ).tolist()
     if settings.window_time is None and averaged and few.any():
-        bias = np.where(few, leakage_bias(data, settings, fit, found.curves.std)[rank], 0.0)
+        bias = np.where(few, leakage_bias(data, settings, fit, modes.curves.std)[rank], 0.0)
         for k in np.flatnonzero(np.abs(bias) > _BIASED).tolist():
-            lines, share = float(found.lines_in_band[k]), float(bias[k])
+            lines, share = float(modes.lines_in_band[k]), float(bias[k])
             notes.append(
                 Fact("leakage", mode=k + 1, frequency_hz=hertz[k], lines=lines, bias=share)
             )
-    for k, (phase, std) in enumerate(zip(found.mean_phase, found.mean_phase_std, strict=True)):
+    for k, (phase, std) in enumerate(zip(modes.mean_phase, modes.mean_phase_std, strict=True)):
         at = {"mode": k + 1, "frequency_hz": hertz[k]}
         if abs(phase) > max(_TURNED, _CERTAIN * std):
             turn = {"phase_deg": float(np.degrees(phase)), "std_deg": float(np.degrees(std))}
             notes.append(Fact("residues_turned", **at, **turn))
-        if found.collinearity[k] < REAL:
-            notes.append(Fact("complex_mode", **at, collinearity=float(found.collinearity[k])))
+        if modes.collinearity[k] < REAL:
+            notes.append(Fact("complex_mode", **at, collinearity=float(modes.collinearity[k])))
     notes += [
         Fact("misfit_of_sensor", sensor=name, times=float(value))
-        for name, value in zip(found.sensor_names, found.misfit, strict=True)
+        for name, value in zip(modes.sensor_names, modes.misfit, strict=True)
         if value > _MISFIT
     ]
-    if not found.status.found_minimum:
+    if not modes.status.found_minimum:
         notes.append(Fact("modal_fit_not_settled"))
     if settings.window_time is not None:
         notes.append(Fact("leakage_modelled", window_s=settings.window_time))

@@ -53,7 +53,7 @@ class ResponseData(NamedTuple):
         if not windowed:
             return (0,), np.zeros(len(self.powers), dtype=int)
         powers = tuple(dict.fromkeys(self.powers))
-        return powers, np.array([powers.index(one) for one in self.powers])
+        return powers, np.array([powers.index(power) for power in self.powers])
 
 
 def response_data(
@@ -88,9 +88,9 @@ def response_data(
             f"{len(omega)} lie in the band and were measured."
         )
     raw = responses.values[:, column][:, keep]
-    for one, row in zip(responses.responses, raw, strict=True):
+    for channel, row in zip(responses.responses, raw, strict=True):
         if not np.any(np.nan_to_num(row)):
-            raise ValueError(f"the response {one.name} is zero or missing all over the band.")
+            raise ValueError(f"the response {channel.name} is zero or missing all over the band.")
     coherence = responses.coherence[:, column][:, keep]
     bad = np.argwhere((coherence < 0) | (coherence > 1 + 1e-9))
     if bad.size:
@@ -99,7 +99,7 @@ def response_data(
             f"a coherence must be from 0 to 1, but that of {responses.responses[k].name} at "
             f"{omega[keep][line] / HERTZ:.6g} Hz is {coherence[k, line]:.6g}."
         )
-    powers = tuple(_POWERS[one.quantity] for one in responses.responses)
+    powers = tuple(_POWERS[channel.quantity] for channel in responses.responses)
     size = omega[keep] ** np.array(powers)[:, None]
     turned = raw / (1j * omega[keep]) ** np.array(powers)[:, None]
     spread, source, notes = _errors(responses, raw, coherence, std, keep)
@@ -122,39 +122,39 @@ def joined_responses(parts: Sequence[FrequencyResponses]) -> FrequencyResponses:
     Raises `ValueError` where frequencies or references differ, or a channel comes twice.
     """
     first = parts[0]
-    for one in parts[1:]:
-        place = one.name or "one file"
-        if one.frequency.shape != first.frequency.shape or np.any(
-            np.abs(one.frequency - first.frequency) > _SAME_FREQUENCY * first.frequency[-1]
+    for part in parts[1:]:
+        place = part.name or "one file"
+        if part.frequency.shape != first.frequency.shape or np.any(
+            np.abs(part.frequency - first.frequency) > _SAME_FREQUENCY * first.frequency[-1]
         ):
             raise ValueError(
                 f"responses of one test must share their frequencies, but {place} has "
-                f"{len(one.frequency)} lines to {one.frequency[-1] / HERTZ:.6g} Hz and "
+                f"{len(part.frequency)} lines to {part.frequency[-1] / HERTZ:.6g} Hz and "
                 f"{first.name or 'the first'} {len(first.frequency)} to "
                 f"{first.frequency[-1] / HERTZ:.6g} Hz."
             )
-        if [r.name for r in one.references] != [r.name for r in first.references]:
+        if [r.name for r in part.references] != [r.name for r in first.references]:
             raise ValueError(
                 f"responses of one test must share their references, but {place} has "
-                f"{', '.join(r.name for r in one.references)} and {first.name or 'the first'} "
+                f"{', '.join(r.name for r in part.references)} and {first.name or 'the first'} "
                 f"{', '.join(r.name for r in first.references)}."
             )
-    channels = tuple(c for one in parts for c in one.responses)
+    channels = tuple(c for part in parts for c in part.responses)
     names = [c.name for c in channels]
     for name in names:
         if names.count(name) > 1:
             raise ValueError(f"the response {name} comes {names.count(name)} times in the files.")
     return dataclasses.replace(
         first,
-        values=np.concatenate([one.values for one in parts]),
-        coherence=np.concatenate([one.coherence for one in parts]),
+        values=np.concatenate([part.values for part in parts]),
+        coherence=np.concatenate([part.coherence for part in parts]),
         responses=channels,
-        notes=tuple(dict.fromkeys(note for one in parts for note in one.notes)),
+        notes=tuple(dict.fromkeys(note for part in parts for note in part.notes)),
     )
 
 
 def _reference(responses: FrequencyResponses, name: str | None) -> int:
-    names = [one.name for one in responses.references]
+    names = [channel.name for channel in responses.references]
     if name is None and len(names) == 1:
         return 0
     if name is None:
@@ -168,11 +168,12 @@ def _reference(responses: FrequencyResponses, name: str | None) -> int:
 
 
 def _check_quantities(responses: FrequencyResponses) -> None:
-    for one in responses.responses:
-        if one.quantity not in _POWERS:
+    for channel in responses.responses:
+        if channel.quantity not in _POWERS:
+            named = channel.quantity if channel.quantity != "unknown" else "of no stated quantity"
             raise ValueError(
-                f"a response must be a displacement, velocity or acceleration, but {one.name} is "
-                f"{one.quantity if one.quantity != 'unknown' else 'of no stated quantity'}."
+                "a response must be a displacement, velocity or acceleration, but "
+                f"{channel.name} is {named}."
             )
 
 
@@ -233,7 +234,7 @@ def std_from_residuals(
     Arguments: complex residuals and sizes of the fit, receptances; NaN where not measured.
     """
     size = data.measured_size
-    found = np.full(residuals.shape, np.nan)
+    std = np.full(residuals.shape, np.nan)
     for k in range(len(residuals)):
         good = np.isfinite(residuals[k])
         left = 0.5 * np.abs(residuals[k][good] * size[k][good]) ** 2
@@ -241,7 +242,7 @@ def std_from_residuals(
         floor = max(_SMALLEST**2 * float(model[good].max()), float(np.mean(left)) * _SMALLEST)
         scale = float(np.mean(left)) + floor
         if 2 * good.sum() < _FEWEST_NUMBERS:
-            found[k] = np.sqrt(scale) / size[k]
+            std[k] = np.sqrt(scale) / size[k]
             continue
         relative = model / np.mean(model[good])
 
@@ -257,5 +258,5 @@ def std_from_residuals(
             bounds=[(-20.0, 10.0)] * 2,
         )
         variance = np.exp(best.x[0]) + np.exp(best.x[1]) * relative + _SPREAD**2
-        found[k] = np.sqrt(variance * scale) / size[k]
-    return found
+        std[k] = np.sqrt(variance * scale) / size[k]
+    return std

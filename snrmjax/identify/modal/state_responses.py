@@ -29,7 +29,7 @@ def levels_by_velocity(data: SteadyStates) -> list[int]:
     """The levels of a test, that of the smallest largest velocity first."""
     size = np.where(np.asarray(data.measured), np.abs(np.asarray(data.velocity)), 0.0).max(axis=1)
     level = np.asarray(data.level)
-    return sorted(np.unique(level).tolist(), key=lambda one: size[level == one].max())
+    return sorted(np.unique(level).tolist(), key=lambda number: size[level == number].max())
 
 
 def responses_of_states(data: SteadyStates, level: int) -> StateResponses:
@@ -65,7 +65,7 @@ def responses_of_states(data: SteadyStates, level: int) -> StateResponses:
         variance[:, row] += np.where(seen[k], parts[k] ** 2, 0.0)
     values = np.where(count > 0, total / np.maximum(count, 1), np.nan)
     std = np.sqrt(variance) / np.maximum(count, 1)
-    found = frequency_responses(
+    responses = frequency_responses(
         omega,
         values[:, None],
         [Channel(name, "velocity", "m/s") for name in data.sensors],
@@ -73,7 +73,7 @@ def responses_of_states(data: SteadyStates, level: int) -> StateResponses:
         name=f"level {level}",
     )
     largest = float(np.nanmax(np.abs(velocity)))
-    return StateResponses(found, std if known else None, level, largest)
+    return StateResponses(responses, std if known else None, level, largest)
 
 
 def amplitude_dependence(

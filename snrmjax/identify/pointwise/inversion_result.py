@@ -41,9 +41,9 @@ def reasons_in_words(status: Int[np.ndarray | Array, " state"]) -> str:
     """Why states have no point, the most frequent reason first, and what most often causes it."""
     kinds, counts = np.unique(np.asarray(status), return_counts=True)
     order = [k for k in np.argsort(-counts, kind="stable") if kinds[k] != PointStatus.OK]
-    found = [(PointStatus(int(kinds[k])), int(counts[k])) for k in order]
-    listed = "; ".join(f"{count} have {kind.message}" for kind, count in found)
-    causes = [_USUAL_CAUSE[kind] for kind, _ in found[:1] if kind in _USUAL_CAUSE]
+    reasons = [(PointStatus(int(kinds[k])), int(counts[k])) for k in order]
+    listed = "; ".join(f"{count} have {kind.message}" for kind, count in reasons)
+    causes = [_USUAL_CAUSE[kind] for kind, _ in reasons[:1] if kind in _USUAL_CAUSE]
     return ". ".join([listed, *causes])
 
 

@@ -51,11 +51,11 @@ def resonances(
         return np.signbit(at.excess(load))
 
     weak = too_weak(_on_backbone(backbone, amplitude))
-    found = []
+    tips = []
     for k in np.flatnonzero(weak[:-1] != weak[1:]):
         root = np.mean(_change(backbone, too_weak, amplitude[k], amplitude[k + 1]))
-        found.append(_resonance(backbone, modes, force, float(root)))
-    return found
+        tips.append(_resonance(backbone, modes, force, float(root)))
+    return tips
 
 
 def predict_response(

@@ -48,10 +48,10 @@ def snrm_velocity(
     """
     j = modes.mode_of_interest
     constant = modes.mode_shape[:, j] * (modes.participation[j] * jnp.asarray(force)[..., None])
-    own = nonlinear_mode_velocity(
+    of_mode = nonlinear_mode_velocity(
         constant,
         jnp.asarray(natural_frequency)[..., None],
         jnp.asarray(damping_ratio)[..., None],
         jnp.asarray(frequency)[..., None],
     )
-    return own + residual_velocity(modes, frequency, force)
+    return of_mode + residual_velocity(modes, frequency, force)

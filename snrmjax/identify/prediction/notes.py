@@ -15,26 +15,26 @@ _SURE = 0.975  # probability of a resonance that needs no word
 _WORTH = 0.025  # probability of negative damping that needs one
 
 
-def where_in_words(one: ResonanceDistribution) -> Fact:
+def where_in_words(distribution: ResonanceDistribution) -> Fact:
     """Whether a further level has the resonance, and its 95 % ranges."""
-    low, high = (one.frequency[[0, -1]] / HERTZ).tolist()
-    slow, fast = one.velocity[[0, -1]].tolist()
+    low, high = (distribution.frequency[[0, -1]] / HERTZ).tolist()
+    slow, fast = distribution.velocity[[0, -1]].tolist()
     return Fact(
         "resonance_of_a_level",
-        probability=one.probability,
-        sure=one.probability >= _SURE,
-        ratio=one.largest_amplitude_ratio,
+        probability=distribution.probability,
+        sure=distribution.probability >= _SURE,
+        ratio=distribution.largest_amplitude_ratio,
         frequency_hz=(low, high),
         velocity=(slow, fast),
-        another_day=one.another_day,
+        another_day=distribution.another_day,
     )
 
 
-def notes_on_resonance(one: ResonanceDistribution, load: Fact) -> list[Fact]:
+def notes_on_resonance(distribution: ResonanceDistribution, load: Fact) -> list[Fact]:
     """Which curves were left out."""
-    if not one.negative_damping > _WORTH:
+    if not distribution.negative_damping > _WORTH:
         return []
-    return [Fact("negative_damping_left_out", load=load, share=one.negative_damping)]
+    return [Fact("negative_damping_left_out", load=load, share=distribution.negative_damping)]
 
 
 def notes_on_trends(trends: Sequence[LevelTrend], load: Fact) -> list[Fact]:
@@ -42,13 +42,13 @@ def notes_on_trends(trends: Sequence[LevelTrend], load: Fact) -> list[Fact]:
     return [
         Fact(
             "levels_follow_force",
-            error=one.kind,
-            change=one.last - one.first,
-            there=one.there,
-            p_value=one.p_value,
+            error=trend.kind,
+            change=trend.last - trend.first,
+            there=trend.there,
+            p_value=trend.p_value,
             load=load,
         )
-        for one in trends
+        for trend in trends
     ]
 
 

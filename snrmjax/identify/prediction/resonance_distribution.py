@@ -105,12 +105,12 @@ def resonance_distribution(
     speed = amplitude * omega
     root = _Root.of(speed * damping / load[:, None])
     kept = root.found | ~np.any(damping[:, edge:] <= 0, axis=1) | self_excited
-    at, own = root.at(omega), root.at(speed, at_rest=0.0)
+    at, of_mode = root.at(omega), root.at(speed, at_rest=0.0)
     recorded = np.exp(0 * gain if gain_of_force else gain)
     known = np.isfinite(at)
     quantiles = np.full((2, len(QUANTILES)), np.nan)
     if known.sum() >= _FEWEST:
-        total = recorded * np.abs(own + other(np.where(known, at, np.nanmedian(at))))
+        total = recorded * np.abs(of_mode + other(np.where(known, at, np.nanmedian(at))))
         quantiles = np.quantile([at[known], total[known]], QUANTILES, axis=1).T
     return ResonanceDistribution(
         force=force,

@@ -97,7 +97,10 @@ def _partners(without: LinearModalFit, with_mass: LinearModalFit) -> tuple[np.nd
             f"it, but shows {len(after)}: choose the same band, or the poles by hand."
         )
     # A mass lowers each frequency, and not below the next lower one.
-    chosen = [int(np.argmin(np.where(after <= one, one - after, np.inf))) for one in before]
+    chosen = [
+        int(np.argmin(np.where(after <= frequency, frequency - after, np.inf)))
+        for frequency in before
+    ]
     if len(set(chosen)) < len(chosen):
         raise ValueError(
             "the modes of both tests cannot be paired: choose the same band, or the poles by hand."

@@ -37,12 +37,12 @@ def rigid_body_mode(
     """
     lower, std = fit.lower / gain, fit.lower_std / abs(gain)
     at, sign = drive or (0, 1.0)
-    own = own_std = np.nan
+    residual = residual_std = np.nan
     if drive is not None and std[at] > 0:
-        own, own_std = sign * lower[at], std[at]
-    shows = own < -_CERTAIN * own_std
+        residual, residual_std = sign * lower[at], std[at]
+    shows = residual < -_CERTAIN * residual_std
     if free is None:
-        note = (Fact("low_residual_of_free_mass", mass_kg=float(-1 / own)),) if shows else ()
+        note = (Fact("low_residual_of_free_mass", mass_kg=float(-1 / residual)),) if shows else ()
         return RigidBodyMode(None, 0.0, note)
     if free < 0 or not np.isfinite(free):
         raise ValueError(f"the mass of a free structure must be positive (kg), but is {free:g}.")
@@ -50,19 +50,23 @@ def rigid_body_mode(
         ones = np.full(len(fit.sensors), free**-0.5)
         if not shows:
             return RigidBodyMode(ones, free**-0.5, (Fact("rigid_body_of_stated_mass"),))
-        ratio = float(-1 / own / free)
+        ratio = float(-1 / residual / free)
         off = not 1 / _APART < ratio < _APART
         note = (Fact("low_residual_of_mass", mass_kg=ratio * free, ratio=ratio, off=off),)
         signs = np.sign(lower) * np.sign(lower[at])
         ones = ones * np.where(signs == 0, 1.0, signs) * sign
         return RigidBodyMode(ones, free**-0.5, note)
     if not shows:
-        what = "is not known" if np.isnan(own) else f"is {own:.3g} ± {1.96 * own_std:.2g} 1/kg"
+        what = (
+            "is not known"
+            if np.isnan(residual)
+            else f"is {residual:.3g} ± {1.96 * residual_std:.2g} 1/kg"
+        )
         raise ValueError(
             f"a free structure answers −1/(m Ω²) at low frequency, but the low residual at the "
             f"drive point {what}: state its mass, or do not call it free."
         )
-    participation = float(np.sqrt(-own))
-    mass = {"mass_kg": float(-1 / own), "std_kg": float(own_std / own**2)}
+    participation = float(np.sqrt(-residual))
+    mass = {"mass_kg": float(-1 / residual), "std_kg": float(residual_std / residual**2)}
     note = (Fact("rigid_body_of_residuals", **mass, scaled_by=scaled_by),)
     return RigidBodyMode(-lower / participation, participation, note)

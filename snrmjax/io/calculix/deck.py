@@ -55,13 +55,13 @@ class Deck(eqx.Module):
 
     def node_index(self, number: int) -> int:
         """Row of a node in `nodes`. Raises `ValueError` where no element has it."""
-        found = np.flatnonzero(self.nodes == number)
-        if not len(found):
+        rows = np.flatnonzero(self.nodes == number)
+        if not len(rows):
             raise ValueError(
                 f"{self.name} has no element with node {number} (nodes {self.nodes[0]} to "
                 f"{self.nodes[-1]})."
             )
-        return int(found[0])
+        return int(rows[0])
 
     def nearest_node(self, point: tuple[float, float, float]) -> int:
         """The number of the node next to a point (m)."""
@@ -125,20 +125,20 @@ def _small_displacements(blocks: list[Block]) -> bool:
 
 def _thickness(blocks: list[Block], coordinates: Float[np.ndarray, "node 3"]) -> float:
     """The smallest dimension of shell and beam sections, or of the mesh where it has neither."""
-    found = []
+    dimensions = []
     for block in blocks:
         beam = block.keyword == "BEAM SECTION"
         if (beam or block.keyword == "SHELL SECTION") and block.data:
             line = block.data[0]
             entries = line.entries[: 2 if beam else 1]
-            found += [_number(line, entry, "a dimension") for entry in entries if entry]
-            if found[-1:] and not min(found) > 0:
+            dimensions += [_number(line, entry, "a dimension") for entry in entries if entry]
+            if dimensions[-1:] and not min(dimensions) > 0:
                 raise ValueError(
                     f"{line.place}: dimensions of a section must be positive, but one is "
-                    f"{min(found):g}."
+                    f"{min(dimensions):g}."
                 )
-    if found:
-        return min(found)
+    if dimensions:
+        return min(dimensions)
     spans = np.ptp(coordinates, axis=0)
     return float(np.min(spans[spans > 0], initial=np.inf)) if np.any(spans > 0) else 1.0
 

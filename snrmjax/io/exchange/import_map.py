@@ -95,12 +95,12 @@ class Assumptions(dict[str, Assumption]):
         """Record an assumption."""
         self[key] = Assumption(why, value)
 
-    def unit(self, key: str, told: str, file_unit: str) -> None:
+    def unit(self, key: str, stated: str, file_unit: str) -> None:
         """Record where a unit comes from: the map wins over the file."""
-        if not told and file_unit:
+        if not stated and file_unit:
             self.add(key, Fact("unit_of_file"), file_unit)
-        elif told and file_unit and told != file_unit:
-            self.add(key, Fact("unit_stated_over_file", unit=file_unit), told)
+        elif stated and file_unit and stated != file_unit:
+            self.add(key, Fact("unit_stated_over_file", unit=file_unit), stated)
 
 
 class ResponseMap(NamedTuple):
@@ -199,7 +199,7 @@ def map_of_options(map_file: Path | None, given: Mapping[str, Any]) -> ImportMap
             "states one: leave one of the two out."
         )
     if unit and not response:
-        responses = tuple(one._replace(unit=unit) for one in responses)
+        responses = tuple(response._replace(unit=unit) for response in responses)
     for key in RESPONSE_KEYS:
         each = given.get(key) or ()
         if each and len(each) != len(responses):
@@ -209,9 +209,12 @@ def map_of_options(map_file: Path | None, given: Mapping[str, Any]) -> ImportMap
             )
         if each:
             pairs = zip(responses, each, strict=True)
-            responses = tuple(one._replace(**{key: word}) for one, word in pairs)
-    names = [one.sensor for one in responses if one.sensor]
-    for what, listed in (("--sensor", names), ("--response", [one.channel for one in responses])):
+            responses = tuple(response._replace(**{key: word}) for response, word in pairs)
+    names = [response.sensor for response in responses if response.sensor]
+    for what, listed in (
+        ("--sensor", names),
+        ("--response", [response.channel for response in responses]),
+    ):
         doubled = [name for name in listed if listed.count(name) > 1]
         if doubled:
             raise ValueError(f"{what} names {doubled[0]!r} twice.")
@@ -227,7 +230,7 @@ def _option(key: str) -> str:
 def _stated_amplitudes(words: Sequence[str]) -> tuple[str, ...]:
     if list(words) == ["z"]:
         return ("z",)
-    found = []
+    amplitudes = []
     for word in words:
         try:
             number = float(word)
@@ -238,8 +241,8 @@ def _stated_amplitudes(words: Sequence[str]) -> tuple[str, ...]:
                 f"--force-amplitude must be a positive number in N, or z alone, but is "
                 f"{shown(word)}."
             )
-        found.append(repr(number))
-    return tuple(found)
+        amplitudes.append(repr(number))
+    return tuple(amplitudes)
 
 
 def read_import_map(path: FilePath) -> ImportMap:
@@ -247,14 +250,14 @@ def read_import_map(path: FilePath) -> ImportMap:
     file = file_name(path)
     table = parsed_toml(read_text(path), file)
     table.check_keys((), (*KEYS, "response", "steps"))
-    found = {key: _value(table, key) for key in KEYS if key in table.entries}
+    values = {key: _value(table, key) for key in KEYS if key in table.entries}
     responses = []
-    for one in table.tables("response", file):
-        one.check_keys(("channel",), ResponseMap._fields[1:])
-        if "quantity" in one.entries:
-            one.choice("quantity", ("", *_MOTIONS))
-        responses.append(ResponseMap(**{key: one.text(key) for key in one.entries}))
-    return ImportMap(tuple(responses), **found)
+    for response in table.tables("response", file):
+        response.check_keys(("channel",), ResponseMap._fields[1:])
+        if "quantity" in response.entries:
+            response.choice("quantity", ("", *_MOTIONS))
+        responses.append(ResponseMap(**{key: response.text(key) for key in response.entries}))
+    return ImportMap(tuple(responses), **values)
 
 
 def _value(table: TomlTable, key: str) -> Any:
@@ -304,11 +307,11 @@ def map_text(
         *(["# files: " + shlex.join(files)] if files else []),
         *(f"# note: {' '.join(str(note).split())}" for note in notes),
     ]
-    for key, one in KEYS.items():
+    for key, spec in KEYS.items():
         value = getattr(used, key)
         if key == "force_amplitude":
-            value = "z" if value == ("z",) else [float(one) for one in value]
-        lines.append(f"{_line(key, value)}  # {_comment(key, value, assumed) or one.meaning}")
+            value = "z" if value == ("z",) else [float(spec) for spec in value]
+        lines.append(f"{_line(key, value)}  # {_comment(key, value, assumed) or spec.meaning}")
     for k, response in enumerate(used.responses):
         lines += ["", "[[response]]"]
         for key, value in response._asdict().items():
@@ -323,8 +326,8 @@ def _comment(key: str, value: object, assumed: Mapping[str, Assumption]) -> str:
     """Why a value was assumed, and what else it could be; empty for one that was stated."""
     if key not in assumed:
         return ""
-    one = assumed[key]
-    why = " ".join(str(one.why if one.value == value else one).split())
+    assumption = assumed[key]
+    why = " ".join(str(assumption.why if assumption.value == value else assumption).split())
     choices = KEYS[key].choices if key in KEYS else ()
     others = ", ".join(word for word in choices if word != value)
     return f"assumed: {why}" + (f" (else {others})" if others else "")

@@ -72,21 +72,20 @@ def import_files(paths: Sequence[Path], mapping: ImportMap) -> Imported:
     if mapping.dataset == "" and len(datasets) == 1:
         mapping = mapping._replace(dataset=datasets[0].name)
     file = datasets[0].file
-    records = [
-        (one.content, one.file) for one in datasets if isinstance(one.content, TimeRecording)
-    ]
-    tables = [(one.content, one.file) for one in datasets if isinstance(one.content, NumberTable)]
+    contents = [(dataset.content, dataset.file) for dataset in datasets]
+    records = [(content, name) for content, name in contents if isinstance(content, TimeRecording)]
+    tables = [(content, name) for content, name in contents if isinstance(content, NumberTable)]
     if records:
         return _records(records, mapping, assumed, notes)
-    own = [(table, name) for table, name in tables if is_ours(table.columns)]
-    if own and not mapping.responses:
-        parts = [restated(states_of_own_table(table, name), mapping) for table, name in own]
+    ours = [(table, name) for table, name in tables if is_ours(table.columns)]
+    if ours and not mapping.responses:
+        parts = [restated(states_of_own_table(table, name), mapping) for table, name in ours]
         notes.append(restated_how(mapping))
         return Imported(join_steady_states(parts), (), mapping, assumed, tuple(notes))
     imported = [import_table(table, mapping, name, assumed) for table, name in tables] or [
-        import_responses(one.content, one.z, mapping, one.file, assumed)
-        for one in datasets
-        if isinstance(one.content, tuple)
+        import_responses(content, z, mapping, name, assumed)
+        for _, name, content, z in datasets
+        if not isinstance(content, TimeRecording | NumberTable)
     ]
     used, force = imported[-1][1:3]
     measured = [part for part, *_ in imported]
@@ -96,19 +95,19 @@ def import_files(paths: Sequence[Path], mapping: ImportMap) -> Imported:
 
 def _datasets(held: LaboratoryFile, mapping: ImportMap) -> list[_Dataset]:
     """What of a file is imported. Raises `ValueError` with a question where that is not one."""
-    every = [_Dataset(record.name or "record", held.name, record) for record in held.recordings]
-    every += [_Dataset(table.name, held.name, table) for table in held.tables]
+    parts = [_Dataset(record.name or "record", held.name, record) for record in held.recordings]
+    parts += [_Dataset(table.name, held.name, table) for table in held.tables]
     if held.responses:
-        every.append(_Dataset("responses", held.name, held.responses, held.levels))
-    names = ", ".join(dataset.name for dataset in every)
-    named = [dataset for dataset in every if dataset.name == mapping.dataset != ""]
-    if named or len(every) == 1:
-        return named or every
+        parts.append(_Dataset("responses", held.name, held.responses, held.levels))
+    names = ", ".join(dataset.name for dataset in parts)
+    named = [dataset for dataset in parts if dataset.name == mapping.dataset != ""]
+    if named or len(parts) == 1:
+        return named or parts
     if mapping.dataset:
         raise ValueError(f"--dataset names {mapping.dataset!r}, but {held.name} has {names}.")
-    if len(every) > len(held.recordings):
+    if len(parts) > len(held.recordings):
         raise ValueError(f"which part of {held.name} is meant? --dataset names it, of {names}.")
-    return every
+    return parts
 
 
 def _records(
@@ -138,8 +137,7 @@ def _records(
             parts.append(states)
     counted = joined_counts(steps) if steps else None
     if counted is not None:
-        reasons = tuple(counted.left_out.items())
-        notes.append(Fact("steps_used", used=counted.used, left_out=reasons))
+        notes.append(counted.fact)
     if not parts:
         return Imported(None, tuple(kept), used, assumed, tuple(notes))
     if mapping.level == "file" or (len(parts) > 1 and not mapping.level):

@@ -28,19 +28,19 @@ def listed_contents(held: LaboratoryFile) -> list[str]:
             f"  record {record.name or 'record'}: {len(record.channels)} channels of "
             f"{record.n_samples} samples at {record.sampling_rate:.6g} Hz "
             f"({record.duration:.4g} s)",
-            *_short([f"    {one}" for one in record.channels]),
+            *_short([f"    {channel}" for channel in record.channels]),
         ]
     for table in held.tables:
         lines += [f"  table {table.name}: {table.n_rows} rows", *_columns(table)]
-    for one, z in zip(held.responses[:_MOST], held.levels, strict=False):
-        hertz = one.frequency / _HERTZ
+    for sets, z in zip(held.responses[:_MOST], held.levels, strict=False):
+        hertz = sets.frequency / _HERTZ
         level = f", z axis {z:g}" if np.isfinite(z) else ""
         lines.append(
-            f"  responses {one.name}: {len(one.responses)} over {len(one.references)} at "
+            f"  responses {sets.name}: {len(sets.responses)} over {len(sets.references)} at "
             f"{len(hertz)} frequencies, {hertz[0]:.6g} to {hertz[-1]:.6g} Hz{level}"
         )
-        lines += _short([f"    response {channel}" for channel in one.responses])
-        lines += _short([f"    reference {channel}" for channel in one.references])
+        lines += _short([f"    response {channel}" for channel in sets.responses])
+        lines += _short([f"    reference {channel}" for channel in sets.references])
     if len(held.responses) > _MOST:
         lines.append(f"  … {len(held.responses) - _MOST} further sets of responses")
     return [*lines, *(f"  note: {note}" for note in held.notes[:_MOST])]
@@ -69,8 +69,8 @@ def _columns(table: NumberTable) -> list[str]:
         size = np.abs(table.columns[force])
         if np.all(size > 0) and np.isfinite(size).all():
             number, rule = number_levels("auto", size, None, np.real(table.columns[frequency]))
-            found = Fact("levels_counted", n=len(np.unique(number)), by=rule)
-            lines.append(f"    found: {found}")
+            fact = Fact("levels_counted", n=len(np.unique(number)), by=rule)
+            lines.append(f"    found: {fact}")
     lines += [
         f"    {name}: text, {', '.join(list(dict.fromkeys(words))[:4])}"
         for name, words in table.words.items()
@@ -94,11 +94,11 @@ class _Candidate(NamedTuple):
 def suggested_command(paths: Sequence[Path], held: LaboratoryFile) -> list[str]:
     """A command line that imports the file, with what names and units say; capitals are open."""
     files = " ".join(shlex.quote(str(path)) for path in paths)
-    tables = sorted(held.tables, key=lambda one: (not _first(one, "frequency"), -one.n_rows))
+    tables = sorted(held.tables, key=lambda table: (not _first(table, "frequency"), -table.n_rows))
     ratios = False
     if held.responses and not held.recordings:
         dataset, candidates = "responses", _of_channels(held.responses[0].responses)
-        ratios = not any(one.kind == "force" and one.unit for one in candidates)
+        ratios = not any(candidate.kind == "force" and candidate.unit for candidate in candidates)
     elif held.recordings and not (tables and _first(tables[0], "frequency")):
         record = held.recordings[0]
         dataset, candidates = record.name or "record", _of_channels(record.channels)
@@ -134,11 +134,11 @@ def _channels_of_import(
     candidates: Sequence[_Candidate], levels: Sequence[float], *, ratios: bool
 ) -> list[str]:
     """Options for force and response, each the likeliest of the candidates."""
-    known = sorted(candidates, key=lambda one: not one.unit)
+    known = sorted(candidates, key=lambda candidate: not candidate.unit)
 
     def likeliest(*kinds: str) -> _Candidate:
-        found = (one for kind in kinds for one in known if one.kind == kind)
-        return next(found, _Candidate("CHANNEL", "", ""))
+        matching = (candidate for kind in kinds for candidate in known if candidate.kind == kind)
+        return next(matching, _Candidate("CHANNEL", "", ""))
 
     if ratios:
         known_level = levels and np.isfinite(levels[0]) and levels[0] > 0
@@ -146,19 +146,19 @@ def _channels_of_import(
     else:
         force = likeliest("force", "voltage", "drive")
         words = ["--force", force.name, *([] if force.unit else ["--force-unit", "UNIT"])]
-    one = likeliest(*_MOTIONS, "amplitude", "real")
-    if one.name == "CHANNEL" and len(candidates) == 1:
-        one = candidates[0]
-    kind = one.kind if one.kind in _MOTIONS else "" if one.unit else "QUANTITY"
-    words += ["--response", f"{one.name}:{kind}" if kind else one.name]
-    return words if one.unit else [*words, "--unit", "UNIT"]
+    candidate = likeliest(*_MOTIONS, "amplitude", "real")
+    if candidate.name == "CHANNEL" and len(candidates) == 1:
+        candidate = candidates[0]
+    kind = candidate.kind if candidate.kind in _MOTIONS else "" if candidate.unit else "QUANTITY"
+    words += ["--response", f"{candidate.name}:{kind}" if kind else candidate.name]
+    return words if candidate.unit else [*words, "--unit", "UNIT"]
 
 
 def _at_the_force(sets: Sequence[FrequencyResponses]) -> str:
     """The response at the place and along the axis of a reference; nothing where nobody said."""
-    for one in sets:
-        for reference in one.references:
-            for response in one.responses:
+    for responses in sets:
+        for reference in responses.references:
+            for response in responses.responses:
                 same = response.direction.lstrip("+-") == reference.direction.lstrip("+-")
                 if reference.point and response.point == reference.point and same:
                     return response.name
@@ -167,8 +167,8 @@ def _at_the_force(sets: Sequence[FrequencyResponses]) -> str:
 
 def _of_channels(channels: Sequence[Channel]) -> list[_Candidate]:
     return [
-        _Candidate(one.name, role_of(one.name), "")
-        if one.quantity == "unknown"
-        else _Candidate(one.name, one.quantity, one.unit or one.si_unit)
-        for one in channels
+        _Candidate(channel.name, role_of(channel.name), "")
+        if channel.quantity == "unknown"
+        else _Candidate(channel.name, channel.quantity, channel.unit or channel.si_unit)
+        for channel in channels
     ]

@@ -48,16 +48,18 @@ def mapped_record(
         )
         assumed.unit("force_unit", mapping.force_unit, unit)
     filled = []
-    for number, one in enumerate(mapping.responses):
-        k = _number(record, one.channel, file, "--response")
+    for number, response in enumerate(mapping.responses):
+        k = _number(record, response.channel, file, "--response")
         old = channels[k]
-        if old.quantity == "voltage" and not one.unit:
+        if old.quantity == "voltage" and not response.unit:
             old = old._replace(unit="")
-        assumed.unit(f"response {number + 1}.unit", one.unit, old.unit)
-        quantity, factor, unit = motion_meaning(one.quantity, one.unit, old.unit, one.channel)
+        assumed.unit(f"response {number + 1}.unit", response.unit, old.unit)
+        quantity, factor, unit = motion_meaning(
+            response.quantity, response.unit, old.unit, response.channel
+        )
         channels[k] = old._replace(quantity=quantity, unit=unit, calibration=factor)  # type: ignore[arg-type]
-        sensor = sensor_of(one, mapping, number + 1, assumed)
-        filled.append(ResponseMap(one.channel, quantity, one.unit, sensor))
+        sensor = sensor_of(response, mapping, number + 1, assumed)
+        filled.append(ResponseMap(response.channel, quantity, response.unit, sensor))
     if mapping.drive:
         k = _number(record, mapping.drive, file, "--drive")
         if channels[k].quantity == "unknown":
@@ -70,7 +72,7 @@ def mapped_record(
 
 def import_record(
     record: TimeRecording, mapping: ImportMap, file: str, assumed: Assumptions
-) -> tuple[SteadyStates | None, ImportMap, tuple[str, ...], StepCounts | None]:
+) -> tuple[SteadyStates | None, ImportMap, tuple[Fact | str, ...], StepCounts | None]:
     """Steady states of a record of steps or of sweeps, or None for one that stays a record.
 
     Returns them, the map with what was found, notes, and how many of the steps were used.
@@ -91,10 +93,10 @@ def import_record(
     level = _DIRECT.get(mapping.level, "auto")
     said: dict[str, Any] = {
         "level": level,
-        "sensors": [one.sensor for one in mapping.responses],
+        "sensors": [response.sensor for response in mapping.responses],
         "drive": mapping.drive or None,
     }
-    read = record, mapping.force, [one.channel for one in mapping.responses]
+    read = record, mapping.force, [response.channel for response in mapping.responses]
     failed = []
     for kind in (mapping.record,) if mapping.record else ("steps", "sweep"):
         try:
@@ -123,15 +125,15 @@ def import_record(
 def record_columns(record: TimeRecording, mapping: ImportMap) -> dict[str, Channel]:
     """Names of the columns of a record's table, with the channels that they hold, in SI."""
     columns: dict[str, Channel] = {}
-    by_name = {one.name: one for one in record.channels}
+    by_name = {response.name: response for response in record.channels}
     if mapping.force:
         force = by_name[mapping.force]
         columns["drive_v" if force.quantity == "voltage" else "force_n"] = force
     endings = {"velocity": "m_s", "acceleration": "m_s2", "displacement": "m"}
-    for one in mapping.responses:
-        lead = "" if len(mapping.responses) == 1 else f"{one.sensor}."
-        quantity = by_name[one.channel].quantity
-        columns[f"{lead}{quantity}_{endings[quantity]}"] = by_name[one.channel]
+    for response in mapping.responses:
+        lead = "" if len(mapping.responses) == 1 else f"{response.sensor}."
+        quantity = by_name[response.channel].quantity
+        columns[f"{lead}{quantity}_{endings[quantity]}"] = by_name[response.channel]
     return columns
 
 

@@ -31,7 +31,7 @@ def import_responses(
     Raises `ValueError` with a question that names the option for what cannot be told.
     """
     if not mapping.responses:
-        named = ", ".join(dict.fromkeys(c.name for one in sets for c in one.responses))
+        named = ", ".join(dict.fromkeys(c.name for level_set in sets for c in level_set.responses))
         raise ValueError(
             f"which channel of {file} is the response? --response CHANNEL names it, of {named}."
         )
@@ -41,34 +41,38 @@ def import_responses(
         )
     if mapping.level == "z" and not np.isfinite(z).all():
         raise ValueError(f"--level z: {file} states no value on the z axis: --level order.")
-    spectra = bool(mapping.force) and all(mapping.force in _names(one.responses) for one in sets)
+    spectra = bool(mapping.force) and all(
+        mapping.force in _names(level_set.responses) for level_set in sets
+    )
     keys = z if mapping.level == "z" else np.arange(1.0, len(sets) + 1)
-    columns = {_FREQUENCY: np.concatenate([_or_nothing(one.frequency) for one in sets])}
-    columns[_SET] = np.repeat(keys, [one.frequency.size for one in sets])
+    columns = {_FREQUENCY: np.concatenate([_or_nothing(level_set.frequency) for level_set in sets])}
+    columns[_SET] = np.repeat(keys, [level_set.frequency.size for level_set in sets])
     units = {_FREQUENCY: "rad/s"}
     rule = mapping.level if mapping.level in _RULES else _SET
     as_table = mapping._replace(frequency=_FREQUENCY, frequency_unit="", level=rule)
     if not spectra:
         amplitude = _amplitudes(sets, z, mapping, file)
         pairs = zip(amplitude, sets, strict=True)
-        columns[_FORCE] = np.concatenate([np.full(one.frequency.size, size) for size, one in pairs])
+        columns[_FORCE] = np.concatenate(
+            [np.full(level_set.frequency.size, size) for size, level_set in pairs]
+        )
         units[_FORCE] = "V" if _reference_force(sets, mapping, file).is_voltage else "N"
         as_table = as_table._replace(
             force=_FORCE, force_unit="", force_amplitude=(), over_force=True
         )
-    asked = [(one.channel, one.unit, "--response") for one in mapping.responses]
+    asked = [(response.channel, response.unit, "--response") for response in mapping.responses]
     for name, unit, option in [
         *asked,
         *([(mapping.force, mapping.force_unit, "--force")] * spectra),
     ]:
         parts = []
-        for one in sets:
-            names = _names(one.responses)
+        for level_set in sets:
+            names = _names(level_set.responses)
             require_name(option, name, names, "responses", file)
             row = names.index(name)
-            channel = one.responses[row]
+            channel = level_set.responses[row]
             # A known channel's values are in SI already: its own unit, or the one that is stated.
-            values = one.values[row, _reference(one, mapping, file, spectra=spectra)]
+            values = level_set.values[row, _reference(level_set, mapping, file, spectra=spectra)]
             parts.append(values / channel.calibration if unit else values)
         columns[name] = (
             np.concatenate(parts) if option == "--response" else _or_nothing(np.concatenate(parts))
@@ -98,8 +102,8 @@ def _or_nothing(values: np.ndarray) -> np.ndarray:
 
 def _reference_force(sets: Sequence[FrequencyResponses], mapping: ImportMap, file: str) -> Force:
     """What the responses are over."""
-    for one in sets:
-        channel = one.references[_reference(one, mapping, file, spectra=False)]
+    for level_set in sets:
+        channel = level_set.references[_reference(level_set, mapping, file, spectra=False)]
         if mapping.force_unit and _si(channel) not in ("", mapping.force_unit):
             raise ValueError(
                 f"--force-unit says {mapping.force_unit}, but the responses of {file} are over "
@@ -130,7 +134,7 @@ def _amplitudes(
             )
         values = np.asarray(z, dtype=float)
     else:
-        values = np.asarray([float(one) for one in stated])
+        values = np.asarray([float(newtons) for newtons in stated])
     if values.size not in (1, len(sets)):
         raise ValueError(
             f"--force-amplitude must be one for all or one for each of the {len(sets)} sets of "
@@ -147,10 +151,12 @@ def _names(channels: Sequence[Channel]) -> list[str]:
     return [channel.name for channel in channels]
 
 
-def _reference(one: FrequencyResponses, mapping: ImportMap, file: str, *, spectra: bool) -> int:
-    names = _names(one.references)
+def _reference(
+    level_set: FrequencyResponses, mapping: ImportMap, file: str, *, spectra: bool
+) -> int:
+    names = _names(level_set.references)
     if mapping.force and not spectra:
-        what = f"responses {', '.join(_names(one.responses))}, and over the references"
+        what = f"responses {', '.join(_names(level_set.responses))}, and over the references"
         require_name("--force", mapping.force, names, what, file)
         return names.index(mapping.force)
     if len(names) > 1:

@@ -96,7 +96,10 @@ def import_table(
             f"displacement) names it, of {source.listed}."
         )
     size, force = _force(source)
-    units = {one.channel: one.unit or source.unit(one.channel) for one in mapping.responses}
+    units = {
+        response.channel: response.unit or source.unit(response.channel)
+        for response in mapping.responses
+    }
     units = {} if mapping.over_force else units
     units |= {mapping.force: force.unit} if mapping.force else {}
     peak = amplitude_factor(mapping, units, assumed) if units else 1.0
@@ -104,9 +107,9 @@ def import_table(
     # Over the force only its amplitude counts; else phases are of one clock with the force's own.
     turn = np.abs(size) if mapping.over_force else peak * np.exp(-1j * np.angle(size))
     velocity, responses, errors = [], [], []
-    for k, one in enumerate(mapping.responses):
-        one = _with_errors_by_name(source, one, k + 1)
-        row, filled, scale = _response(source, one, omega, k + 1)
+    for k, response in enumerate(mapping.responses):
+        response = _with_errors_by_name(source, response, k + 1)
+        row, filled, scale = _response(source, response, omega, k + 1)
         velocity.append(row * turn)
         responses.append(filled)
         errors.append(_errors(source, filled, np.abs(scale * turn)))
@@ -127,14 +130,14 @@ def import_table(
 
 def _frequency_column(source: _Source) -> str:
     """The only column that is a frequency by its name."""
-    found = source.with_role("frequency")
-    if len(found) != 1:
+    columns = source.with_role("frequency")
+    if len(columns) != 1:
         raise ValueError(
             f"which column of {source.file} is the frequency? --frequency names it, of "
-            f"{', '.join(found) or source.listed}."
+            f"{', '.join(columns) or source.listed}."
         )
     source.assumed.add("frequency", Fact("column_by_name"))
-    return found[0]
+    return columns[0]
 
 
 def _force(source: _Source) -> tuple[Complex[np.ndarray, " row"], Force]:
@@ -160,21 +163,21 @@ def _force(source: _Source) -> tuple[Complex[np.ndarray, " row"], Force]:
 
 
 def _response(
-    source: _Source, one: ResponseMap, omega: Float[np.ndarray, " row"], number: int
+    source: _Source, response: ResponseMap, omega: Float[np.ndarray, " row"], number: int
 ) -> tuple[Complex[np.ndarray, " row"], ResponseMap, Complex[np.ndarray, " row"]]:
     """The velocity phasors of one response (over the force where the table has it so).
 
     And the map with what was found, and what a number of the response is multiplied with.
     """
-    mapping, file, assumed, name = source.mapping, source.file, source.assumed, one.channel
+    mapping, file, assumed, name = source.mapping, source.file, source.assumed, response.channel
     values = source.column(name, "--response")
     quantity, factor, unit = motion_meaning(
-        one.quantity, one.unit, source.unit(name), name, is_ratio=mapping.over_force
+        response.quantity, response.unit, source.unit(name), name, is_ratio=mapping.over_force
     )
-    assumed.unit(f"response {number}.unit", one.unit, source.unit(name))
-    if not one.quantity:
+    assumed.unit(f"response {number}.unit", response.unit, source.unit(name))
+    if not response.quantity:
         assumed.add(f"response {number}.quantity", Fact("quantity_by_unit", unit=unit))
-    imaginary, phase = one.imaginary, one.phase
+    imaginary, phase = response.imaginary, response.phase
     if not (np.iscomplexobj(values) or imaginary or phase):
         imaginary, phase = _partner(source, name)
         if not (imaginary or phase):
@@ -199,17 +202,19 @@ def _response(
                 "--imaginary COLUMN names the other one."
             )
         phasor = values * np.exp(1j * source.phase(phase, "--phase"))
-    sensor = sensor_of(one, mapping, number, assumed)
+    sensor = sensor_of(response, mapping, number, assumed)
     turn = velocity_factors([Channel(name, quantity)], [1], omega)[:, 0, 0]  # type: ignore[arg-type]
-    filled = one._replace(quantity=quantity, sensor=sensor, phase=phase, imaginary=imaginary)
+    filled = response._replace(quantity=quantity, sensor=sensor, phase=phase, imaginary=imaginary)
     return phasor * factor * turn, filled, factor * turn
 
 
-def sensor_of(one: ResponseMap, mapping: ImportMap, number: int, assumed: Assumptions) -> str:
+def sensor_of(response: ResponseMap, mapping: ImportMap, number: int, assumed: Assumptions) -> str:
     """The sensor of a response: stated, the only one, or named like its channel."""
-    if not one.sensor:
+    if not response.sensor:
         assumed.add(f"response {number}.sensor", Fact("sensor_not_stated"))
-    return one.sensor or (UNNAMED_SENSOR[0] if len(mapping.responses) == 1 else one.channel)
+    return response.sensor or (
+        UNNAMED_SENSOR[0] if len(mapping.responses) == 1 else response.channel
+    )
 
 
 def _partner(source: _Source, channel: str) -> tuple[str, str]:
@@ -227,9 +232,9 @@ def _partner(source: _Source, channel: str) -> tuple[str, str]:
 def _swap(name: str) -> str:
     """The name of an imaginary part beside that of a real part."""
     for old, new in (("real", "imag"), ("Real", "Imag"), ("re", "im"), ("Re", "Im")):
-        found = re.sub(rf"(?<![A-Za-z]){old}(?![A-Za-z])|(?<=_){old}(?=_|$)", new, name)
-        if found != name:
-            return found
+        swapped = re.sub(rf"(?<![A-Za-z]){old}(?![A-Za-z])|(?<=_){old}(?=_|$)", new, name)
+        if swapped != name:
+            return swapped
     last = {"X": "Y", "x": "y"}.get(name[-1:], "")
     return last and name[:-1] + last
 
@@ -269,31 +274,31 @@ def _check(omega: Float[np.ndarray, " row"], force: Float[np.ndarray, " row"], f
 # Standard deviations, as lock-in amplifiers list them.
 
 
-def _with_errors_by_name(source: _Source, one: ResponseMap, number: int) -> ResponseMap:
+def _with_errors_by_name(source: _Source, response: ResponseMap, number: int) -> ResponseMap:
     """A response with the columns of its errors: those that are named after it and its phase."""
     phases = source.with_role("phase")
-    phase = one.phase or (phases[0] if len(phases) == 1 else "")
-    found: dict[str, Any] = {}
-    for key, of in {"amplitude_std": one.channel, "phase_std": phase}.items():
+    phase = response.phase or (phases[0] if len(phases) == 1 else "")
+    named_columns: dict[str, Any] = {}
+    for key, of in {"amplitude_std": response.channel, "phase_std": phase}.items():
         named = [name for name in source.with_role("deviation") if _bare(name) == _bare(of)]
-        if of and not getattr(one, key) and len(named) == 1:
-            found[key] = named[0]
+        if of and not getattr(response, key) and len(named) == 1:
+            named_columns[key] = named[0]
             source.assumed.add(f"response {number}.{key}", Fact("deviation_of_one_row"))
-    return one._replace(**found)
+    return response._replace(**named_columns)
 
 
 def _errors(
-    source: _Source, one: ResponseMap, scale: Float[np.ndarray, " row"]
+    source: _Source, response: ResponseMap, scale: Float[np.ndarray, " row"]
 ) -> Float[np.ndarray, "2 row"]:
     """1σ of the velocity (m/s) and of the phase (rad) of every row; NaN where none is stated.
 
     Arguments: `scale` is what an amplitude of the table is multiplied with; phases' errors have
     the unit of the phases.
     """
-    turn = 1.0 if _in_radians(source, one) else np.pi / 180
+    turn = 1.0 if _in_radians(source, response) else np.pi / 180
     stated = (
-        (one.amplitude_std, "--amplitude-std", scale),
-        (one.phase_std, "--phase-std", np.asarray(turn)),
+        (response.amplitude_std, "--amplitude-std", scale),
+        (response.phase_std, "--phase-std", np.asarray(turn)),
     )
     missing = np.full(source.table.n_rows, np.nan)
     return np.stack(
@@ -301,9 +306,9 @@ def _errors(
     )
 
 
-def _in_radians(source: _Source, one: ResponseMap) -> bool:
+def _in_radians(source: _Source, response: ResponseMap) -> bool:
     """Whether an error of the phase is in radians: as its name, its unit or the phase's says."""
-    for name in (one.phase_std, one.phase):
+    for name in (response.phase_std, response.phase):
         unit = source.unit(name).lower()
         if unit.startswith("rad") or re.search(r"rad(?![a-z])", name.lower()):
             return True

@@ -214,9 +214,9 @@ def _unit(name: str) -> tuple[Decimal, _Powers]:
                 return size.scaleb(power), powers
     base = _registry().Quantity(Decimal(1), _registry().parse_units(name)).to_base_units()
     of = {str(key).strip("[]"): int(power) for key, power in base.dimensionality.items()}
-    powers = tuple(of.pop(key, 0) for key in ("length", "mass", "time", "current"))
+    length, mass, time, current = (of.pop(key, 0) for key in ("length", "mass", "time", "current"))
     turns = int("radian" in str(base.units))
-    return base.magnitude, (0, 0, 0, 0, 0) if of else (*powers, turns)
+    return base.magnitude, (0, 0, 0, 0, 0) if of else (length, mass, time, current, turns)
 
 
 @functools.cache

@@ -35,11 +35,11 @@ def read_laboratory_file(path: FilePath, text_format: TextFormat | None = None) 
     module, function = _READERS[kind]
     read = getattr(importlib.import_module(f"{_ROOM}.{module}"), function)
     options = (text_format,) if kind == "csv" else ()
-    found: LaboratoryFile = read(Path(path), *options)
-    if found.is_empty:
-        why = f": {' '.join(map(str, found.notes[:_MOST_REASONS]))}" if found.notes else "."
-        raise ValueError(f"{found.name} holds nothing that could be read{why}")
-    return found
+    held: LaboratoryFile = read(Path(path), *options)
+    if held.is_empty:
+        why = f": {' '.join(map(str, held.notes[:_MOST_REASONS]))}" if held.notes else "."
+        raise ValueError(f"{held.name} holds nothing that could be read{why}")
+    return held
 
 
 def _kind(path: FilePath) -> Kind:

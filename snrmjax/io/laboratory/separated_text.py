@@ -58,10 +58,10 @@ def read_separated_text(path: Path, text_format: TextFormat | None = None) -> La
         tree[name] = held(column, {"unit": units[name]} if units.get(name) else {})
     mark = next(word for word, each in _SEPARATORS.items() if each == separator)
     notes.append(Fact("text_read", separator=mark, decimal=decimal, first_row=first + 1))
-    found = read_struct("", tree, entry=len(rows) == 1)
-    tables = tuple(table._replace(name=path.stem or "table") for table in found.numbered())
-    records = tuple(found.recordings)
-    return LaboratoryFile(file, "csv", records, (), tables, (*notes, *found.notes))
+    contents = read_struct("", tree, entry=len(rows) == 1)
+    tables = tuple(table._replace(name=path.stem or "table") for table in contents.numbered())
+    records = tuple(contents.recordings)
+    return LaboratoryFile(file, "csv", records, (), tables, (*notes, *contents.notes))
 
 
 def _text(path: Path) -> str:
@@ -226,10 +226,10 @@ def _columns(
     except (ValueError, OverflowError) as error:  # pandas' own errors are among them
         said = " ".join(str(error).split())[:160]
         raise ValueError(f"{file} is damaged or no table of text ({said}).") from error
-    found: dict[str, np.ndarray | list[str]] = {}
+    columns: dict[str, np.ndarray | list[str]] = {}
     for name, column in table.items():
         if column.dtype.kind in "biuf":
-            found[name] = column.to_numpy(dtype=float, na_value=np.nan)
+            columns[name] = column.to_numpy(dtype=float, na_value=np.nan)
             continue
         values = pandas.to_numeric(column, errors="coerce").to_numpy(dtype=float)
         words = np.flatnonzero(np.isnan(values) & column.notna().to_numpy())
@@ -238,5 +238,5 @@ def _columns(
             raise ValueError(
                 f"column {name} must be numbers, but row {row} of {file} has {shown(word)}."
             )
-        found[name] = ["" if pandas.isna(word) else str(word) for word in column]
-    return found
+        columns[name] = ["" if pandas.isna(word) else str(word) for word in column]
+    return columns

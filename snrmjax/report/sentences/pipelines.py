@@ -78,7 +78,7 @@ SENTENCES: dict[str, Wording] = {
     ),
     "mode_not_followed": _not_followed,
     "curve_ended": _ended,
-    "events_not_located": "force {force:g} N: not located: {kinds}.",
+    "curve_events_not_located": "force {force:g} N: not located: {kinds}.",
     "stability_not_computed": (
         "force {force:g} N: the stability of {n} points could not be computed; response.csv has 0 "
         "there and says so in `event`."

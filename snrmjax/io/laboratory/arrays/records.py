@@ -51,34 +51,36 @@ def recording_of(
     if isinstance(axis, Fact):
         return FoundRecord(notes=(axis,))
     sampled = {
-        key: one
-        for key, one in numbers.items()
-        if key not in axis.used and not one.is_complex and len(one.sides) < 3
+        key: array
+        for key, array in numbers.items()
+        if key not in axis.used and not array.is_complex and len(array.sides) < 3
     }
-    lengths = [max(one.shape, default=1) for one in sampled.values()]
+    lengths = [max(array.shape, default=1) for array in sampled.values()]
     long = axis.length or max(lengths, default=0)
     if long < _SHORTEST:
         return FoundRecord()
-    alike = {key: one for key, one in sampled.items() if long in one.shape}
-    if any(role_of(key) == "frequency" and one.length == long for key, one in alike.items()):
+    alike = {key: array for key, array in sampled.items() if long in array.shape}
+    if any(role_of(key) == "frequency" and array.length == long for key, array in alike.items()):
         return FoundRecord()
     places: list[ChannelPlace] = []
     channels: list[Channel] = []
-    for key, one in alike.items():
-        side = one.shape.index(long)
-        others = 1 if one.length is not None else one.size // long
+    for key, array in alike.items():
+        side = array.shape.index(long)
+        others = 1 if array.length is not None else array.size // long
         labels = _labels(words, others)
-        told = _told(words, others) if labels else [{} for _ in range(others)]
+        said = _said_of(words, others) if labels else [{} for _ in range(others)]
         for k in range(others):
             alone = key if others == 1 else f"{key}_{k + 1}"
-            places.append(ChannelPlace(one, side, k))
+            places.append(ChannelPlace(array, side, k))
             name_of = (labels[k] if labels else "") or alone
-            channels.append(_channel(name_of, {**one.attributes, **told[k]}))
-    names = [one.name for one in channels]
+            channels.append(_channel(name_of, {**array.attributes, **said[k]}))
+    names = [channel.name for channel in channels]
     if not channels or len(channels) > _MOST_CHANNELS:
         return FoundRecord()
     if len(set(names)) < len(names):
-        channels = [one._replace(name=f"{one.name} #{k + 1}") for k, one in enumerate(channels)]
+        channels = [
+            channel._replace(name=f"{channel.name} #{k + 1}") for k, channel in enumerate(channels)
+        ]
     record = time_recording(
         PlacedSamples(places, long),
         channels,
@@ -101,14 +103,14 @@ def _labels(words: Mapping[str, Sequence[str]], count: int) -> Sequence[str] | N
     return alike[0] if alike else None
 
 
-def _told(words: Mapping[str, Sequence[str]], count: int) -> list[dict[str, str]]:
+def _said_of(words: Mapping[str, Sequence[str]], count: int) -> list[dict[str, str]]:
     """What lists of text say of each column of a matrix."""
-    told: list[dict[str, str]] = [{} for _ in range(count)]
+    said: list[dict[str, str]] = [{} for _ in range(count)]
     for key, word in words.items():
         if key.lower() in _SAID and len(word) == count:
-            for k, one in enumerate(word):
-                told[k][_SAID[key.lower()]] = one
-    return told
+            for k, text in enumerate(word):
+                said[k][_SAID[key.lower()]] = text
+    return said
 
 
 def _channel(name: str, said: Mapping[str, str]) -> Channel:
@@ -117,14 +119,16 @@ def _channel(name: str, said: Mapping[str, str]) -> Channel:
     quantity, calibration = channel_meaning(unit)
     if quantity == "unknown":
         known: tuple[Quantity, ...] = get_args(Quantity)
-        quantity = next((one for one in known if one == said.get("quantity")), "unknown")
+        quantity = next((name for name in known if name == said.get("quantity")), "unknown")
     place = said.get("point", ""), said.get("direction", "")
     return Channel(name, quantity, unit, calibration, *place)
 
 
 def _time_axis(numbers: Mapping[str, Numbers]) -> _Axis | Fact | None:
     """The rate of samples: stated, or of a time vector; a note where that one is uneven."""
-    single = {key: one for key, one in numbers.items() if one.size == 1 and not one.is_complex}
+    single = {
+        key: array for key, array in numbers.items() if array.size == 1 and not array.is_complex
+    }
     starts = [key for key in single if key in ("start_time_s", "start_time", "t0")][-1:]
     start = _only(single[starts[0]]) if starts else 0.0
     if not np.isfinite(start):
@@ -137,11 +141,11 @@ def _time_axis(numbers: Mapping[str, Numbers]) -> _Axis | Fact | None:
             stated = (value, key) if np.isfinite(value) and value > 0 else None
     vectors = [
         key
-        for key, one in numbers.items()
+        for key, array in numbers.items()
         if role_of(key.removesuffix("_s")) == "time"
-        and one.length is not None
-        and one.length >= _SHORTEST
-        and not one.is_complex
+        and array.length is not None
+        and array.length >= _SHORTEST
+        and not array.is_complex
     ]
     if stated is not None:
         used = (stated[1], *starts, *vectors[:1])
@@ -155,10 +159,10 @@ def _time_axis(numbers: Mapping[str, Numbers]) -> _Axis | Fact | None:
     return _even_axis(vectors[0], numbers[vectors[0]])
 
 
-def _even_axis(key: str, one: Numbers) -> _Axis | Fact:
+def _even_axis(key: str, array: Numbers) -> _Axis | Fact:
     """Rate and start of a time vector, looked at whole or, where it is long, at three places."""
-    n = one.length or 0
-    first, last = float(one.stretch(0, 1)[0]), float(one.stretch(n - 1, n)[0])
+    n = array.length or 0
+    first, last = float(array.stretch(0, 1)[0]), float(array.stretch(n - 1, n)[0])
     step = (last - first) / (n - 1)
     uneven = Fact("uneven_time", name=key)
     if not (np.isfinite(step) and step > 0 and np.isfinite(1 / step)):
@@ -167,25 +171,25 @@ def _even_axis(key: str, one: Numbers) -> _Axis | Fact:
         stop = min(start + _LOOK, n)
         expected = first + step * np.arange(start, stop)
         # Times of many seconds in few digits: rounding by the resolution of what is written.
-        slack = _EVEN * step + 4e-16 * abs(last) + _single(one) * abs(last)
-        if not np.all(np.abs(one.stretch(start, stop) - expected) <= slack):
+        slack = _EVEN * step + 4e-16 * abs(last) + _single(array) * abs(last)
+        if not np.all(np.abs(array.stretch(start, stop) - expected) <= slack):
             return uneven
     rate = 1 / step
     whole = round(rate)
     if whole and abs(rate - whole) < 1e-6 * rate * min(1.0, 1e3 / n):
         rate = float(whole)
-    unit = one.unit.lower()
+    unit = array.unit.lower()
     factor = 1e3 if unit in ("ms", "msec") else 1e6 if unit in ("us", "µs", "μs") else 1.0
     notes = (Fact("time_seen_in_places", name=key),) if n > 3 * _LOOK else ()
     return _Axis(n, rate * factor, first / factor, (key,), notes)
 
 
-def _single(one: Numbers) -> float:
+def _single(array: Numbers) -> float:
     """Relative resolution of times that are stored in single precision, else 0."""
-    kind = one.stretch(0, 1).dtype
+    kind = array.stretch(0, 1).dtype
     return 1.2e-7 if kind == np.float32 else 0.0
 
 
-def _only(one: Numbers) -> float:
+def _only(array: Numbers) -> float:
     """A single number."""
-    return float(one.read(tuple(slice(0, 1) for _ in one.shape)).reshape(-1)[0])
+    return float(array.read(tuple(slice(0, 1) for _ in array.shape)).reshape(-1)[0])

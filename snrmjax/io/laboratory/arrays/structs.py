@@ -56,14 +56,14 @@ def file_of_tree(
     name: str, kind: Kind, tree: Mapping[str, Node], notes: Sequence[Fact]
 ) -> LaboratoryFile:
     """All that is found in a tree; `notes` say what of the file is not in it."""
-    found = read_struct("", tree)
-    every = [*notes, *found.notes]
-    if not (every or found.recordings or found.responses or found.tables):
+    contents = read_struct("", tree)
+    every = [*notes, *contents.notes]
+    if not (every or contents.recordings or contents.responses or contents.tables):
         every = [Fact("nothing_measured", names=tuple(tree)[:_MOST_NAMED])]
     return LaboratoryFile(
-        *(name, kind, tuple(found.recordings), tuple(found.responses), found.numbered()),
+        *(name, kind, tuple(contents.recordings), tuple(contents.responses), contents.numbered()),
         tuple(dict.fromkeys(every)),
-        tuple(np.nan for _ in found.responses),
+        tuple(np.nan for _ in contents.responses),
     )
 
 
@@ -73,35 +73,35 @@ def read_struct(name: str, fields: Mapping[str, Node], *, entry: bool = False) -
     Arguments: `name` as results are called; `entry` says that the struct is one of a list, whose
     single numbers hold for each of its rows.
     """
-    found = Struct([], [], {}, [])
+    contents = Struct([], [], {}, [])
     numbers = {key: node for key, node in fields.items() if isinstance(node, Numbers)}
     words: dict[str, list[str]] = {}
     for key, node in fields.items():
         several = node if isinstance(node, list) else [node]
-        texts = [one for one in several if isinstance(one, str)]
+        texts = [text for text in several if isinstance(text, str)]
         if 0 < len(texts) == len(several):
             words[key] = texts
-    _read_numbers(name, numbers, words, found, entry=entry)
+    _read_numbers(name, numbers, words, contents, entry=entry)
     cells: dict[int, dict[str, list[Node]]] = {}
     for key, node in fields.items():
         path = f"{name}.{key}" if name else key
         if isinstance(node, dict):
-            found.add(key, read_struct(path, node, entry=entry))
+            contents.add(key, read_struct(path, node, entry=entry))
         elif isinstance(node, list) and node and key not in words:
-            structs = [one for one in node if isinstance(one, dict)]
-            rows = [one for one in node if isinstance(one, list)]
+            structs = [item for item in node if isinstance(item, dict)]
+            rows = [item for item in node if isinstance(item, list)]
             if len(structs) == len(node):
-                found.add(key, _entries(path, structs))
+                contents.add(key, _entries(path, structs))
             elif len(rows) == len(node):
                 named = [{str(k + 1): cell for k, cell in enumerate(row)} for row in rows]
-                found.add(key, _entries(path, named))
-            elif any(isinstance(one, Numbers | dict) for one in node):
+                contents.add(key, _entries(path, named))
+            elif any(isinstance(item, Numbers | dict) for item in node):
                 cells.setdefault(len(node), {})[key] = node
     for count, group in cells.items():
         each = [{key: nodes[k] for key, nodes in group.items()} for k in range(count)]
         key = next(iter(group)) if len(group) == 1 else "entries"
-        found.add(key, _entries(f"{name}.{key}" if name else key, each))
-    return found
+        contents.add(key, _entries(f"{name}.{key}" if name else key, each))
+    return contents
 
 
 def _entries(name: str, structs: Sequence[Mapping[str, Node]]) -> Struct:
@@ -109,32 +109,34 @@ def _entries(name: str, structs: Sequence[Mapping[str, Node]]) -> Struct:
     if len(structs) > _MOST_ENTRIES:
         raise ValueError(f"{name} is a list of {len(structs)} entries, more than {_MOST_ENTRIES}.")
     several = len(structs) > 1
-    found = Struct([], [], {}, [])
+    contents = Struct([], [], {}, [])
     parts: dict[str, list[tuple[int, Columns]]] = {}
     for k, fields in enumerate(structs, 1):
         below = read_struct(f"{name}({k})" if several else name, fields, entry=several)
-        found.add("", below._replace(tables={}))
+        contents.add("", below._replace(tables={}))
         for place, columns in below.tables.items():
             parts.setdefault(place, []).append((k, columns))
     for place, rows in parts.items():
-        found.tables[place] = _joined(rows) if several else rows[0][1]
-    return found
+        contents.tables[place] = _joined(rows) if several else rows[0][1]
+    return contents
 
 
 def _joined(parts: Sequence[tuple[int, Columns]]) -> Columns:
     """Tables of several entries under one another; NaN where an entry lacks a column."""
-    names = list(dict.fromkeys(key for _, one in parts for key in one.values))
-    sized = [(len(next(iter(one.values.values()))), one) for _, one in parts]
+    names = list(dict.fromkeys(key for _, table in parts for key in table.values))
+    sized = [(len(next(iter(table.values.values()))), table) for _, table in parts]
     entry = np.repeat([float(k) for k, _ in parts], [n for n, _ in sized])
     values = {"entry" if "entry" not in names else "entry number": entry}
     units: dict[str, str] = {}
     for key in names:
-        values[key] = np.concatenate([one.values.get(key, np.full(n, np.nan)) for n, one in sized])
-        stated = [one.units[key] for _, one in sized if key in one.units]
+        values[key] = np.concatenate(
+            [table.values.get(key, np.full(n, np.nan)) for n, table in sized]
+        )
+        stated = [table.units[key] for _, table in sized if key in table.units]
         units |= {key: stated[0]} if stated else {}
-    texts = dict.fromkeys(key for _, one in sized for key in one.words if key not in values)
+    texts = dict.fromkeys(key for _, table in sized for key in table.words if key not in values)
     words = {
-        key: tuple(word for n, one in sized for word in one.words.get(key, ("",) * n))
+        key: tuple(word for n, table in sized for word in table.words.get(key, ("",) * n))
         for key in texts
     }
     return Columns(values, units, words)
@@ -144,64 +146,64 @@ def _read_numbers(
     name: str,
     numbers: Mapping[str, Numbers],
     words: Mapping[str, Sequence[str]],
-    found: Struct,
+    contents: Struct,
     *,
     entry: bool,
 ) -> None:
     """The arrays of one struct: first time records, then responses, then tables."""
     record, used, notes = recording_of(name, numbers, words)
-    found.recordings.extend([] if record is None else [record])
-    found.notes.extend(notes)
-    rest = {key: one for key, one in numbers.items() if key not in used}
-    rest = _responses(name, rest, found)
+    contents.recordings.extend([] if record is None else [record])
+    contents.notes.extend(notes)
+    rest = {key: array for key, array in numbers.items() if key not in used}
+    rest = _responses(name, rest, contents)
     levels = _by_level(rest)
     if levels is not None:
-        found.add("", _entries(name, levels))
+        contents.add("", _entries(name, levels))
         return
-    single = {key: one for key, one in rest.items() if one.size == 1}
+    single = {key: array for key, array in rest.items() if array.size == 1}
     groups: dict[int, dict[str, Numbers]] = {}
-    for key, one in rest.items():
-        if one.size > 1 and one.length is not None:
-            groups.setdefault(one.length, {})[key] = one
-    for key, one in rest.items():
-        if one.length is None and one.size:
-            _spread(key, one, groups, words, found.notes)
+    for key, array in rest.items():
+        if array.size > 1 and array.length is not None:
+            groups.setdefault(array.length, {})[key] = array
+    for key, array in rest.items():
+        if array.length is None and array.size:
+            _spread(key, array, groups, words, contents.notes)
     if not groups and single and (entry or any(role_of(key) == "frequency" for key in single)):
         groups[1] = {}
     for n, group in groups.items():
         repeated = single if entry or n == 1 else {}
-        columns = {key: np.repeat(one.vector(key), n) for key, one in repeated.items()}
-        columns |= {key: one.vector(key) for key, one in group.items()}
-        units = {key: one.unit for key, one in (repeated | group).items() if one.unit}
+        columns = {key: np.repeat(array.vector(key), n) for key, array in repeated.items()}
+        columns |= {key: array.vector(key) for key, array in group.items()}
+        units = {key: array.unit for key, array in (repeated | group).items() if array.unit}
         texts = {
             key: tuple(word) if len(word) == n else tuple(word) * n
             for key, word in words.items()
             if (len(word) == n or (entry and len(word) == 1)) and key not in columns
         }
         in_order = {key: columns[key] for key in (*group, *repeated)}
-        found.tables["" if len(groups) == 1 else f"rows{n}"] = Columns(in_order, units, texts)
+        contents.tables["" if len(groups) == 1 else f"rows{n}"] = Columns(in_order, units, texts)
 
 
 def _spread(
     key: str,
-    one: Numbers,
+    array: Numbers,
     groups: dict[int, dict[str, Numbers]],
     words: Mapping[str, Sequence[str]],
     notes: list[Fact],
 ) -> None:
     """A matrix as columns: beside vectors of one of its sides, else along its longer side."""
-    sides = one.sides
+    sides = array.sides
     axis = 0 if sides[0] in groups or (sides[1] not in groups and sides[0] >= sides[1]) else 1
     if len(sides) != 2 or sides[1 - axis] > _WIDEST:
         notes.append(Fact("not_a_table", name=key, sides=tuple(sides)))
         return
     n, width = sides[axis], sides[1 - axis]
-    values = one.all(key).reshape(sides)
+    values = array.all(key).reshape(sides)
     values = values if axis == 0 else values.T
     labels = next((word for word in words.values() if len(word) == width), None)
     for k in range(width):
         label = f"{key}.{labels[k]}" if labels else f"{key}_{k + 1}"
-        groups.setdefault(n, {})[label] = held(values[:, k], one.attributes)
+        groups.setdefault(n, {})[label] = held(values[:, k], array.attributes)
 
 
 def _by_level(numbers: Mapping[str, Numbers]) -> list[Mapping[str, Node]] | None:
@@ -210,23 +212,25 @@ def _by_level(numbers: Mapping[str, Numbers]) -> list[Mapping[str, Node]] | None
     They are where two matrices have one shape, and the frequency or a force is one of them or
     stands once a column.
     """
-    shapes = [one.shape for one in numbers.values() if len(one.shape) == 2 and min(one.shape) > 1]
-    shape = next((one for one in shapes if shapes.count(one) > 1), None)
+    shapes = [
+        array.shape for array in numbers.values() if len(array.shape) == 2 and min(array.shape) > 1
+    ]
+    shape = next((sides for sides in shapes if shapes.count(sides) > 1), None)
     names = {key: role_of(key) for key in numbers}
     frequency = [key for key in numbers if names[key] == "frequency"]
     if shape is None or max(shape) > _MOST_ENTRIES or not frequency:
         return None
-    matrices = {key: one for key, one in numbers.items() if one.shape == shape}
+    matrices = {key: array for key, array in numbers.items() if array.shape == shape}
     base = numbers[frequency[0]]
     axis = 0 if base.shape == shape or base.length == shape[0] else 1
     if base.shape != shape and base.length != shape[axis]:
         return None
     count = shape[1 - axis]
-    a_column = {key for key, one in numbers.items() if one.length == count != shape[axis]}
+    a_column = {key for key, array in numbers.items() if array.length == count != shape[axis]}
     driven = {key for key in numbers if names[key] in ("force", "drive", "level")}
     if base.shape != shape and driven.isdisjoint(a_column) and driven.isdisjoint(matrices):
         return None
-    arrays = {key: one.all(key) for key, one in numbers.items() if one.size <= 2**22}
+    arrays = {key: array.all(key) for key, array in numbers.items() if array.size <= 2**22}
     structs: list[Mapping[str, Node]] = []
     for k in range(count):
         fields: dict[str, Node] = {}
@@ -242,23 +246,23 @@ def _by_level(numbers: Mapping[str, Numbers]) -> list[Mapping[str, Node]] | None
     return structs
 
 
-def _responses(name: str, numbers: Mapping[str, Numbers], found: Struct) -> dict[str, Numbers]:
+def _responses(name: str, numbers: Mapping[str, Numbers], contents: Struct) -> dict[str, Numbers]:
     """Complex matrices along a frequency axis as frequency responses; returns what is left."""
     left = dict(numbers)
-    axes = [key for key, one in numbers.items() if role_of(key) == "frequency" and one.length]
-    for key, one in numbers.items():
-        sides = one.sides
+    axes = [key for key, array in numbers.items() if role_of(key) == "frequency" and array.length]
+    for key, array in numbers.items():
+        sides = array.sides
         axis = next((other for other in axes if numbers[other].length in sides), None)
-        if not one.is_complex or len(sides) not in (2, 3) or axis is None:
+        if not array.is_complex or len(sides) not in (2, 3) or axis is None:
             continue
         hertz = numbers[axis].vector(axis).astype(float)
         if not (np.isfinite(hertz).all() and hertz[0] >= 0 and np.all(np.diff(hertz) > 0)):
             continue
-        values = np.moveaxis(one.all(key).reshape(sides), sides.index(hertz.size), -1)
+        values = np.moveaxis(array.all(key).reshape(sides), sides.index(hertz.size), -1)
         values = values.reshape(values.shape[0], -1, hertz.size)
         if not np.isfinite(values).any() or np.isinf(values).any():
             continue
-        found.responses.append(
+        contents.responses.append(
             frequency_responses(
                 hertz * (1.0 if numbers[axis].unit.lower().startswith("rad") else _HERTZ),
                 values,

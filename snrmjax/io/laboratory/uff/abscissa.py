@@ -21,16 +21,16 @@ class EvenAbscissa(NamedTuple):
     notes: tuple[Fact, ...] = ()
 
 
-def even_abscissa(one: Mapping[str, Any]) -> EvenAbscissa | None:
+def even_abscissa(function: Mapping[str, Any]) -> EvenAbscissa | None:
     """Start and rate of a function's abscissa, or None where its steps are uneven.
 
     The header has both to six digits. Where these digits allow one whole number of samples per
     unit (4.88281E-04 s: 2048 Hz), that is taken.
     """
-    x = np.asarray(one["x"])
-    if one["abscissa_spacing"] != 1:
+    x = np.asarray(function["x"])
+    if function["abscissa_spacing"] != 1:
         return _of_values(x)
-    first, step = float(one["abscissa_min"]), float(one["abscissa_inc"])
+    first, step = float(function["abscissa_min"]), float(function["abscissa_inc"])
     if not (math.isfinite(step) and step > 0):
         return None
     half = 0.5 * 10.0 ** (math.floor(math.log10(step)) - _DIGITS)
@@ -42,14 +42,14 @@ def even_abscissa(one: Mapping[str, Any]) -> EvenAbscissa | None:
     return EvenAbscissa(first, 1 / step, (Fact("six_digits", off=(x.size - 1) * half),))
 
 
-def abscissa(one: Mapping[str, Any]) -> Float[np.ndarray, " point"]:
+def abscissa(function: Mapping[str, Any]) -> Float[np.ndarray, " point"]:
     """The abscissa of a function, value by value."""
-    if one["abscissa_spacing"] != 1:
-        return np.asarray(one["x"], dtype=float)
-    even = even_abscissa(one)
+    if function["abscissa_spacing"] != 1:
+        return np.asarray(function["x"], dtype=float)
+    even = even_abscissa(function)
     if even is None:
-        return np.asarray(one["x"], dtype=float)
-    return even.first + np.arange(len(one["x"])) / even.rate
+        return np.asarray(function["x"], dtype=float)
+    return even.first + np.arange(len(function["x"])) / even.rate
 
 
 def _of_values(x: Float[np.ndarray, " point"]) -> EvenAbscissa | None:

@@ -38,23 +38,23 @@ def unit_system(sets: Sequence[Mapping[str, Any]]) -> UnitSystem:
     """The units of a file; SI where no data set 164 states them."""
     if not sets:
         return UnitSystem(notes=(Fact("no_unit_system"),))
-    one = sets[0]
-    length, force = float(one["length"]), float(one["force"])
+    function = sets[0]
+    length, force = float(function["length"]), float(function["force"])
     if not (0 < length < float("inf") and 0 < force < float("inf")):
         raise ValueError(f"the factors of units (data set 164) must be positive: {length}, {force}")
     if length == force == 1:
         return UnitSystem()
-    name = stated(one["units_description"])
+    name = stated(function["units_description"])
     return UnitSystem(length, force, (Fact("unit_system", name=name, length=length, force=force),))
 
 
-def axis_unit(one: Mapping[str, Any], axis: str, units: UnitSystem) -> AxisUnit:
+def axis_unit(function: Mapping[str, Any], axis: str, units: UnitSystem) -> AxisUnit:
     """The unit of an axis ("ordinate", "orddenom"): its label, else the file's system of units.
 
     A label such as (mm/s)/lbf of an ordinate is that of response over reference.
     """
-    quantity = _QUANTITIES.get(one.get(f"{axis}_spec_data_type", 0), "unknown")
-    label = stated(one.get(f"{axis}_axis_units_lab", ""))
+    quantity = _QUANTITIES.get(function.get(f"{axis}_spec_data_type", 0), "unknown")
+    label = stated(function.get(f"{axis}_axis_units_lab", ""))
     if not label:
         factor = 1 / (units.force if quantity == "force" else units.length)
         known = quantity != "unknown"

@@ -28,14 +28,14 @@ class _Source(NamedTuple):
     units: UnitSystem
     notes: list[Fact]
 
-    def channel(self, one: _Function, side: str, axis: str) -> Channel:
+    def channel(self, function: _Function, side: str, axis: str) -> Channel:
         """The channel of one side of a function."""
-        unit = axis_unit(one, axis, self.units)
+        unit = axis_unit(function, axis, self.units)
         self.notes.extend(unit.notes)
-        node = one.get(f"{side}_node", 0)
+        node = function.get(f"{side}_node", 0)
         return Channel(
-            *(_place(one, side), unit.quantity, unit.unit, unit.calibration),
-            *(str(node) if node else "", direction_of(one.get(f"{side}_dir", 0))),
+            *(_place(function, side), unit.quantity, unit.unit, unit.calibration),
+            *(str(node) if node else "", direction_of(function.get(f"{side}_dir", 0))),
         )
 
 
@@ -62,7 +62,7 @@ def read_uff(path: Path) -> LaboratoryFile:
         level = float(group[0]["z_axis_value"])
         for part in _without_doubles(group):
             x = abscissa(part[0])
-            if not any(one["func_type"] in _RESPONSE for one in part):
+            if not any(function["func_type"] in _RESPONSE for function in part):
                 source.notes.append(Fact("coherence_alone"))
             elif np.all(np.diff(x) > 0) and x[0] >= 0:
                 responses.append(_responses(part, x, source))
@@ -70,10 +70,10 @@ def read_uff(path: Path) -> LaboratoryFile:
             else:
                 source.notes.append(Fact("frequencies_do_not_rise"))
                 tables.append(_table(part, f"responses {len(tables) + 1}", source))
-    others = {one["func_type"] for one in measured} - {_TIME, _COHERENCE, *_RESPONSE}
+    others = {function["func_type"] for function in measured} - {_TIME, _COHERENCE, *_RESPONSE}
     for group in _grouped(measured, *others):
         tables.append(_table(group, f"functions {len(tables) + 1}", source))
-    models = [stated(one.get("model_name", "")) for one in sets.of_type(151)]
+    models = [stated(function.get("model_name", "")) for function in sets.of_type(151)]
     source.notes.extend(Fact("model_named", name=name) for name in models if name)
     return LaboratoryFile(
         *(path.name, "uff", tuple(recordings), tuple(responses), tuple(tables)),
@@ -85,38 +85,38 @@ def read_uff(path: Path) -> LaboratoryFile:
 def _grouped(sets: Sequence[_Function], *kinds: int) -> list[list[_Function]]:
     """Functions of some kinds, those with the same abscissa and z value together."""
     groups: list[list[_Function]] = []
-    for one in (each for each in sets if each["func_type"] in kinds):
+    for function in (each for each in sets if each["func_type"] in kinds):
         for group in groups:
-            alike = one["z_axis_value"] == group[0]["z_axis_value"]
-            if alike and np.array_equal(one["x"], group[0]["x"]):
-                group.append(one)
+            alike = function["z_axis_value"] == group[0]["z_axis_value"]
+            if alike and np.array_equal(function["x"], group[0]["x"]):
+                group.append(function)
                 break
         else:
-            groups.append([one])
+            groups.append([function])
     return groups
 
 
-def _place(one: _Function, side: str) -> str:
+def _place(function: _Function, side: str) -> str:
     """Where a function was measured, in words; of a record without a place, what its axis says."""
-    entity = stated(one.get(f"{side}_ent_name", ""))
-    node = one.get(f"{side}_node", 0)
-    point = f"{node}{direction_of(one.get(f'{side}_dir', 0))}"
+    entity = stated(function.get(f"{side}_ent_name", ""))
+    node = function.get(f"{side}_node", 0)
+    point = f"{node}{direction_of(function.get(f'{side}_dir', 0))}"
     if entity and entity.lower() != point:
         return entity if not node else f"{entity}:{point}"
-    label = stated(one.get("ordinate_axis_lab", "")) if one["func_type"] == _TIME else ""
+    label = stated(function.get("ordinate_axis_lab", "")) if function["func_type"] == _TIME else ""
     return label if label and not node else point
 
 
 def _unique(channels: Sequence[Channel]) -> list[Channel]:
     """Channels with names of their own: doubled ones get the quantity, then a number."""
     named = list(channels)
-    for ending in ("{one.quantity}", "#{number}"):
-        names = [one.name for one in named]
+    for ending in ("{channel.quantity}", "#{number}"):
+        names = [channel.name for channel in named]
         named = [
-            one._replace(name=f"{one.name} {ending.format(one=one, number=k)}")
-            if names.count(one.name) > 1
-            else one
-            for k, one in enumerate(named, 1)
+            channel._replace(name=f"{channel.name} {ending.format(channel=channel, number=k)}")
+            if names.count(channel.name) > 1
+            else channel
+            for k, channel in enumerate(named, 1)
         ]
     return named
 
@@ -127,17 +127,17 @@ def _recording(group: Sequence[_Function], source: _Source) -> TimeRecording | N
     if even is None:
         source.notes.append(Fact("uneven_record"))
         return None
-    channels = _unique([source.channel(one, "rsp", "ordinate") for one in group])
-    if any(np.iscomplexobj(one["data"]) for one in group):
+    channels = _unique([source.channel(function, "rsp", "ordinate") for function in group])
+    if any(np.iscomplexobj(function["data"]) for function in group):
         raise ValueError("a time record of complex numbers is no time record.")
-    described = [stated(one["id1"]) for one in group]
+    described = [stated(function["id1"]) for function in group]
     said = [
         Fact("channel_described", name=channel.name, text=text)
         for channel, text in zip(channels, described, strict=True)
         if text
     ]
     return time_recording(
-        np.stack([one["data"] for one in group]),
+        np.stack([function["data"] for function in group]),
         channels,
         even.rate,
         start_time=even.first,
@@ -150,37 +150,43 @@ def _without_doubles(group: Sequence[_Function]) -> list[list[_Function]]:
     """Runs of functions in which no pair of response and reference stands twice."""
     parts: list[list[_Function]] = [[]]
     seen: set[tuple] = set()
-    for one in group:
+    for function in group:
         key = (
-            *(one["func_type"] == _COHERENCE, _place(one, "rsp"), _place(one, "ref")),
-            one.get("ordinate_spec_data_type"),
+            *(
+                function["func_type"] == _COHERENCE,
+                _place(function, "rsp"),
+                _place(function, "ref"),
+            ),
+            function.get("ordinate_spec_data_type"),
         )
         if key in seen:
             parts.append([])
             seen = set()
         seen.add(key)
-        parts[-1].append(one)
+        parts[-1].append(function)
     return parts
 
 
 def _responses(part: Sequence[_Function], x: np.ndarray, source: _Source) -> FrequencyResponses:
     """Frequency responses of one frequency axis with their coherences."""
-    measured = [one for one in part if one["func_type"] in _RESPONSE]
-    outputs = [source.channel(one, "rsp", "ordinate") for one in measured]
-    inputs = [source.channel(one, "ref", "orddenom") for one in measured]
+    measured = [function for function in part if function["func_type"] in _RESPONSE]
+    outputs = [source.channel(function, "rsp", "ordinate") for function in measured]
+    inputs = [source.channel(function, "ref", "orddenom") for function in measured]
     rows = {key: k for k, key in enumerate(dict.fromkeys(outputs))}
     columns = {key: k for k, key in enumerate(dict.fromkeys(inputs))}
     values = np.full((len(rows), len(columns), x.size), np.nan, dtype=complex)
     coherence = np.full(values.shape, np.nan)
     coherent = {
-        (_place(one, "rsp"), _place(one, "ref")): one["data"].real
-        for one in part
-        if one["func_type"] == _COHERENCE
+        (_place(function, "rsp"), _place(function, "ref")): function["data"].real
+        for function in part
+        if function["func_type"] == _COHERENCE
     }
-    for one, output, given in zip(measured, outputs, inputs, strict=True):
+    for function, output, given in zip(measured, outputs, inputs, strict=True):
         at = rows[output], columns[given]
-        values[at] = one["data"]
-        coherence[at] = coherent.get((_place(one, "rsp"), _place(one, "ref")), coherence[at])
+        values[at] = function["data"]
+        coherence[at] = coherent.get(
+            (_place(function, "rsp"), _place(function, "ref")), coherence[at]
+        )
     even = even_abscissa(measured[0])
     return frequency_responses(
         x * _HERTZ,
@@ -193,11 +199,11 @@ def _responses(part: Sequence[_Function], x: np.ndarray, source: _Source) -> Fre
     )
 
 
-def _column(one: _Function, name: str) -> str:
+def _column(function: _Function, name: str) -> str:
     """The name of a function in a table."""
-    if one["func_type"] == _COHERENCE:
-        return f"coherence of {name} over {_place(one, 'ref')}"
-    return f"{name} over {_place(one, 'ref')}" if one["func_type"] in _RESPONSE else name
+    if function["func_type"] == _COHERENCE:
+        return f"coherence of {name} over {_place(function, 'ref')}"
+    return f"{name} over {_place(function, 'ref')}" if function["func_type"] in _RESPONSE else name
 
 
 def _table(
@@ -205,18 +211,18 @@ def _table(
 ) -> NumberTable:
     """Functions of one abscissa as columns beside it."""
     kind = "time" if group[0].get("abscissa_spec_data_type") == 17 else first
-    channels = [source.channel(one, "rsp", "ordinate") for one in group]
+    channels = [source.channel(function, "rsp", "ordinate") for function in group]
     named = _unique(
         [
-            channel._replace(name=_column(one, channel.name))
-            for one, channel in zip(group, channels, strict=True)
+            channel._replace(name=_column(function, channel.name))
+            for function, channel in zip(group, channels, strict=True)
         ]
     )
     unit = stated(group[0].get("abscissa_axis_units_lab", "")) or ("s" if kind == "time" else "Hz")
     columns, units = {kind: abscissa(group[0])}, {kind: unit}
-    for one, channel in zip(group, named, strict=True):
+    for function, channel in zip(group, named, strict=True):
         key = channel.name if channel.name not in columns else f"{channel.name} value"
-        columns[key] = one["data"]
+        columns[key] = function["data"]
         units |= {key: channel.unit} if channel.unit else {}
     if level := group[0]["z_axis_value"]:
         columns["z_axis_value"] = np.full(len(group[0]["x"]), float(level))
