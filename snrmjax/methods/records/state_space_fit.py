@@ -317,14 +317,8 @@ def _over_stretches(start: Start, periods: Periods, exponents: Exponents, natura
             first = jnp.asarray(one[len(flat) :].reshape(-1, states))
             model = rebuild(jnp.asarray(one[: len(flat)]))
             found, slopes = _in_bounds(*_output_slopes(model, first, force, exponents))
-            steep = np.zeros((*found.shape, len(one)))
-            steep[..., : len(flat)] = slopes[..., : len(flat)]
-            for k in range(len(steep)):
-                at = len(flat) + k * states
-                steep[k, :, at : at + states] = slopes[k, :, len(flat) :]
-            trials.append(
-                StateSpaceTrial((found - target).ravel() / unit, steep.reshape(-1, len(one)) / unit)
-            )
+            steep = _with_own_states(slopes, len(flat)) / unit
+            trials.append(StateSpaceTrial((found - target).ravel() / unit, steep))
         return trials
 
     point = np.concatenate([np.asarray(flat), own.ravel()])
@@ -362,15 +356,9 @@ def _fitted(
             first = jnp.asarray(one[len(flat) :].reshape(count, states))
             found, slopes = _in_bounds(*_output_slopes(model, first, force, exponents))
             left = (_spectrum(found, lines) - target) / std
-            steep = np.zeros((count, len(lines), len(one)), dtype=complex)
             steepness = _spectrum(np.moveaxis(slopes, 2, 1), lines) / std
-            for k, part in enumerate(np.moveaxis(steepness, 1, 2)):
-                own = len(flat) + k * states
-                steep[k, :, : len(flat)] = part[:, : len(flat)]
-                steep[k, :, own : own + states] = part[:, len(flat) :]
-            trials.append(
-                StateSpaceTrial(as_real(left.ravel()), as_real(steep.reshape(-1, len(one))))
-            )
+            steep = _with_own_states(np.moveaxis(steepness, 1, 2), len(flat))
+            trials.append(StateSpaceTrial(as_real(left.ravel()), as_real(steep)))
         return trials
 
     left = _spectrum(_simulated(start, starts, periods, exponents), lines) - target
@@ -395,6 +383,15 @@ def _fitted(
         inverse[: len(flat), : len(flat)],
         point[len(flat) :].reshape(count, states),
     )
+
+
+def _with_own_states(slopes: np.ndarray, shared: int) -> np.ndarray:
+    """Slopes of stretches (stretch, row, …) by `shared` coefficients and each by its own state."""
+    count, rows, width = slopes.shape
+    own = np.zeros((count, rows, count, width - shared), dtype=slopes.dtype)
+    own[np.arange(count), :, np.arange(count)] = slopes[..., shared:]
+    blocks = [slopes[..., :shared], own.reshape(count, rows, -1)]
+    return np.concatenate(blocks, axis=2).reshape(count * rows, -1)
 
 
 def _lines(periods: Periods, natural: float) -> np.ndarray:

@@ -21,7 +21,7 @@ from snrmjax.simulate.virtual_test.appropriation import (
     mode_phase,
     phase_limits,
     spread_in_phase,
-    states_at_phases,
+    states_near,
 )
 from snrmjax.simulate.virtual_test.integrated_test import stepped_states
 from snrmjax.simulate.virtual_test.recording import (
@@ -173,10 +173,7 @@ def _along_curves(
     if not rows:
         nothing = VisitedStates(*(np.zeros(0),) * 4, np.zeros((0, 2 * harmonic_order + 1, 1)))
         return _Visited(nothing, jumps, curves, 0)
-    number, load, frequency, motion, wanted = (np.array(c) for c in zip(*rows, strict=True))
-    order = np.linspace(0.0, 1.0, len(rows))
-    states = VisitedStates(number, order, load, frequency, motion)
-    exact = states_at_phases(model, states, wanted)
+    exact = states_near(model, rows)
     return _Visited(exact, jumps, curves, len(rows) - len(exact.level))
 
 
