@@ -103,9 +103,9 @@ class PrescribedMotion(eqx.Module):
             rigid = -1j * jnp.abs(force) / self.frequency * share[:, None] * per_force
             velocity = velocity + rigid
         size, seen = jnp.abs(force)[None], velocity[None]
-        own = displacement_phasors(coefficients)[1, modes.mode_of_interest]
+        modal = displacement_phasors(coefficients)[1, modes.mode_of_interest]
         for effect in self.model.measurement_effects:
-            size, seen = effect.recorded(self.frequency[None], size, seen, jnp.abs(own)[None])
+            size, seen = effect.recorded(self.frequency[None], size, seen, jnp.abs(modal)[None])
         return size[0] * phase, seen[0] * phase**order
 
     def solved(self, start: Float[Array, " unknown"]) -> Float[Array, " unknown"]:

@@ -154,8 +154,8 @@ def assembled(
         balance, curve, truncation = taken(balances, number), labelled[number], None
         if stability:
             multipliers = floquet_multipliers(balance.model, *balance.motions(curve.points))
-            one = jax.tree.map(lambda a: np.asarray(a)[None] if eqx.is_array(a) else a, balance)
-            curve = with_bifurcations(one, curve, multipliers, steps)
+            stacked = jax.tree.map(lambda a: np.asarray(a)[None] if eqx.is_array(a) else a, balance)
+            curve = with_bifurcations(stacked, curve, multipliers, steps)
         motions = motions_of(balance, curve.points)
         if stability:
             (truncation,) = by_blocks(

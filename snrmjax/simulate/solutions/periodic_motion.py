@@ -160,13 +160,13 @@ def motions_at_velocities(
     differentiable as `periodic_motion` is.
     """
 
-    def one(coefficients: Array, frequency: Array, value: Array) -> PeriodicMotion:
+    def motion_near(coefficients: Array, frequency: Array, value: Array) -> PeriodicMotion:
         start = (coefficients, frequency)
         return periodic_motion(model, force, start, condition="velocity", value=value)
 
     coefficients, frequency = (jnp.asarray(part, dtype=jnp.float64) for part in starts)
     values = jnp.broadcast_to(jnp.asarray(velocities, dtype=jnp.float64), frequency.shape)
-    return mapped(one, coefficients, frequency, values)
+    return mapped(motion_near, coefficients, frequency, values)
 
 
 def _crossings(

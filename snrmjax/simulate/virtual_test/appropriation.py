@@ -115,7 +115,7 @@ def _at_phases(
     n, j = model.n_modes, model.modes.mode_of_interest
     harmonic_order = (start.shape[1] - 1) // 2
 
-    def one(row: tuple) -> tuple[Array, Array, Array]:
+    def at_phase(row: tuple) -> tuple[Array, Array, Array]:
         order, force, phase, frequency, start = row
         now = eqx.tree_at(lambda m: m.test_order, model, order)
         scale = jnp.max(jnp.abs(start))
@@ -129,4 +129,4 @@ def _at_phases(
         omega = found.point[-1] * balance.frequency_scale
         return omega, balance.coefficients(found.point), found.converged
 
-    return jax.lax.map(one, (order, force, phase, frequency, start))
+    return jax.lax.map(at_phase, (order, force, phase, frequency, start))

@@ -174,10 +174,10 @@ def _with_errors(
     gain = errors.level_gain * normal(keys[3], len(groups))[group]
     turn = errors.level_phase * normal(keys[4], len(groups))[group]
     shared = (1 + gain) * np.exp(1j * turn)
-    own = (1 + errors.amplitude * normal(keys[0], n, n_sensors)) * np.exp(
+    alone = (1 + errors.amplitude * normal(keys[0], n, n_sensors)) * np.exp(
         1j * errors.phase * normal(keys[1], n, n_sensors)
     )
-    factor = shared[:, None] * own
+    factor = shared[:, None] * alone
     size = np.abs(factor)  # a phase is an error of time: h times as large of harmonic h
     harmonics = (
         np.stack([velocity[:, h] * size * (factor / size) ** h for h in keep_harmonics], axis=2)
