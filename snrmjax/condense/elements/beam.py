@@ -26,6 +26,18 @@ def _stiffness(value: Number | None) -> Float[Array, ""] | None:
     return _number(value)
 
 
+def _check(part: eqx.Module, rule: Rule, *names: str) -> None:
+    """Raises `ValueError` for a number that breaks the rule, where it has a value."""
+    for name in names:
+        value = getattr(part, name)
+        if value is None or not have_values(value):
+            continue
+        if np.ndim(value):
+            raise ValueError(f"`{name}` must be one number, but has shape {np.shape(value)}.")
+        if not (np.isfinite(value) and rule.good(value)):
+            raise ValueError(f"`{name}` must be {rule.expected}, but is {float(value):g}.")
+
+
 class Support(eqx.Module):
     """Springs between an end and the ground: None (or infinite) is held, zero is free.
 
@@ -194,15 +206,3 @@ def rise_of_radius(length: Number, radius: Number) -> Float[Array, ""]:
     """
     half = 0.5 * jnp.asarray(length)
     return half**2 / (radius + jnp.sqrt(jnp.asarray(radius) ** 2 - half**2))
-
-
-def _check(part: Support | PointMass | Beam, rule: Rule, *names: str) -> None:
-    """Raises `ValueError` for a number that breaks the rule, where it has a value."""
-    for name in names:
-        value = getattr(part, name)
-        if value is None or not have_values(value):
-            continue
-        if np.ndim(value):
-            raise ValueError(f"`{name}` must be one number, but has shape {np.shape(value)}.")
-        if not (np.isfinite(value) and rule.good(value)):
-            raise ValueError(f"`{name}` must be {rule.expected}, but is {float(value):g}.")
