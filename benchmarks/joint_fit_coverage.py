@@ -177,7 +177,7 @@ def one_test(case: Case, truth: Truth, seed: int, *, level_known: bool) -> dict:
             fit.unknowns.squared_frequency.label,
             fit.unknowns.modal_damping.label,
         ],
-        "notes": list(fit.notes),
+        "notes": [str(note) for note in fit.notes],
     }
     curves = sj.identify.fitted_response(fit, case.predicted)
     tips = sorted((p for c in curves for p in c.resonances), key=lambda p: -p.velocity)
@@ -208,7 +208,7 @@ def one_pointwise_test(case: Case, truth: Truth, seed: int, *, level_known: bool
         "damping_band": float(np.mean(values.modal_damping_std / values.modal_damping)),
         "noise": found.fit.noise.scale,
         "families": ["points"],
-        "notes": list(found.notes),
+        "notes": [str(note) for note in found.notes],
     }
 
 

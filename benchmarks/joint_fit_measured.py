@@ -121,7 +121,7 @@ def describe(name: str, fit: sj.identify.JointFit, seconds: float) -> None:
         noise_scale=fit.noise.scale,
         level_std=fit.noise.level_std,
         whitened_rms=np.sqrt(np.mean(fit.residuals**2)),
-        notes=fit.notes,
+        notes=[str(note) for note in fit.notes],
     )
 
 
@@ -149,7 +149,7 @@ def halves(data: sj.measure.SteadyStates, model: sj.model.Structure, free: tuple
         **{f"{k}_within_2_std": np.mean(np.abs(np.asarray(v)) < 2) for k, v in gaps.items()},
         frequency_gap_hz=np.max(np.abs(one.natural_frequency - two.natural_frequency)) / HERTZ,
         damping_gap_relative=np.max(np.abs(one.modal_damping / two.modal_damping - 1)),
-        notes=[fit.notes for fit in fits],
+        notes=[[str(note) for note in fit.notes] for fit in fits],
     )
 
 

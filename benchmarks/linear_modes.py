@@ -247,7 +247,7 @@ def run_measured(_):
                     "stated_modal_mass_kg": None
                     if volts
                     else round(float(1 / stated.mode_shape[0, 0] / stated.participation[0]), 3),
-                    "notes": notes,
+                    "notes": [str(note) for note in notes],
                 }
             ),
             flush=True,

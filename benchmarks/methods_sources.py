@@ -423,7 +423,7 @@ def spring_in_a_chain() -> None:
     data = sj.measure.steady_states(
         *(level, omega, force, 1j * omega[:, None] * motion), sensors=names
     )
-    v = describing_function(sensor_states(data, modes, "arslan_ozguven"), modes)
+    v = describing_function(sensor_states(data, modes), modes)
     theirs, elsewhere, mode = [], [], []
     end = np.eye(count)[tip]
     for at, push, moved in zip(omega, force, motion, strict=True):

@@ -38,12 +38,14 @@ class SteadyStates(AbstractResult):
 
     coordinates: ClassVar[tuple[str, ...]] = ("state", "sensor", "harmonic", "level")
 
+    measured: Bool[Array, "state sensor"]
+    harmonic_order: tuple[int, ...] = eqx.field(static=True)
+    sensors: tuple[str, ...] = eqx.field(static=True)
     level: Int[Array, " state"] = quantity("state", "1", "level of the test")
     frequency: Float[Array, " state"] = quantity("state", "Hz", "forcing frequency")
     force: Float[Array, " state"] = quantity("state", "N", "force amplitude")
     # Fundamental, relative to the force.
     velocity: Complex[Array, "state sensor"] = quantity("state sensor", "m/s", "velocity")
-    measured: Bool[Array, "state sensor"]
     # NaN in what follows: not stated, not measured; of the drive, that the force is known.
     velocity_std: Float[Array, "state sensor"] = quantity(
         "state sensor", "m/s", "1σ of the amplitude"
@@ -60,8 +62,6 @@ class SteadyStates(AbstractResult):
     harmonic_std: Float[Array, "state sensor"] = quantity(
         "state sensor", "m/s", "rms error of a harmonic"
     )
-    harmonic_order: tuple[int, ...] = eqx.field(static=True)
-    sensors: tuple[str, ...] = eqx.field(static=True)
     notes: tuple[Fact | str, ...] = setting(default=())
 
     def summary(self) -> tuple[str, ...]:
@@ -96,12 +96,11 @@ class SteadyStates(AbstractResult):
 
     def variables(self) -> dict[str, Variable]:
         """The columns of a table of steady states."""
-        seen = np.where(self.measured, self.velocity, np.nan)
+        seen: Any = np.where(self.measured, self.velocity, np.nan)
         masked = dataclasses.replace(self, velocity=seen)
         orders = np.asarray(self.harmonic_order, dtype=int)
         return {
             **super(SteadyStates, masked).variables(),
-            "state": Variable(("state",), np.arange(self.n_states), "1", "steady state"),
             "sensor": Variable(("sensor",), np.asarray(self.sensors), "", "sensor"),
             "harmonic": Variable(("harmonic",), orders, "1", "harmonic of the forcing frequency"),
         }
@@ -234,8 +233,8 @@ def _on_host(data: SteadyStates, *names: str) -> SteadyStates:
     columns = [getattr(data, name) for name in names]
     if any(isinstance(column, jax.core.Tracer) for column in columns):
         return data
-    own: dict[str, Any] = dict(zip(names, map(np.asarray, columns), strict=True))
-    return dataclasses.replace(data, **own)
+    on_host: dict[str, Any] = dict(zip(names, map(np.asarray, columns), strict=True))
+    return dataclasses.replace(data, **on_host)
 
 
 def check_phases(data: SteadyStates, purpose: str) -> None:
@@ -309,12 +308,12 @@ def join_steady_states(*parts: SteadyStates | Iterable[SteadyStates]) -> SteadyS
 
 def with_levels_apart(tests: Iterable[SteadyStates]) -> tuple[SteadyStates, ...]:
     """Tests whose levels follow one another, so that joined no two of them share one."""
-    found, offset = [], 0
+    apart, offset = [], 0
     for test in tests:
-        one = test.renumbered(offset)
-        offset = int(one.level.max())
-        found.append(one)
-    return tuple(found)
+        moved = test.renumbered(offset)
+        offset = int(moved.level.max())
+        apart.append(moved)
+    return tuple(apart)
 
 
 def _with_harmonics(data: SteadyStates, orders: tuple[int, ...]) -> SteadyStates:
