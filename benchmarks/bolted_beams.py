@@ -44,8 +44,8 @@ SCALE = 1e-4  # m, of the sliders' limits
 SETTLED = 300  # cycles a step
 TIMES = 1.96  # standard deviations of a 95 % band
 WAYS = ("joint", "pointwise")
-WARNINGS = ("systematic error", "levels differ", "modal mass", "not converged", "cannot be told")
-"""What a note has that says that bands may be wrong; noise that is not stated is no warning."""
+WARNINGS = {"residuals_correlated", "levels_differ", "modal_mass_moved", "fit_not_converged"}
+"""Kinds of notes that say that bands may be wrong; noise that is not stated is no warning."""
 
 
 class Test(NamedTuple):
@@ -197,7 +197,10 @@ def judged(job: tuple[Path, str]) -> dict[str, object]:
     return {
         **errors,
         "bands": bands,
-        "notes": {"joint": fit.notes, "pointwise": points.notes},
+        "notes": {
+            way: [note.kind for note in found.notes]
+            for way, found in zip(WAYS, (fit, points), strict=True)
+        },
         "families": [fit.unknowns.squared_frequency.label, fit.unknowns.modal_damping.label],
         "converged": fit.converged,
         "missed": len(_last_column(folder / f"{name}.truth")) - len(rows),
@@ -261,10 +264,7 @@ def summary(mine: list[dict]) -> dict[str, object]:
 
 def warned(row: dict) -> dict[str, bool]:
     """Whether a way warned."""
-    return {
-        way: any(word in note for note in map(str, row["notes"][way]) for word in WARNINGS)
-        for way in WAYS
-    }
+    return {way: not WARNINGS.isdisjoint(row["notes"][way]) for way in WAYS}
 
 
 def main() -> None:

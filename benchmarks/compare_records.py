@@ -39,9 +39,9 @@ def laboratory(noise):
     beam = sj.model.structure(
         modes, sj.model.polynomial_potential({"1111": CUBIC * shape**2 / 4}, 1)
     )
-    shaker = sj.methods.Shaker(30.0, 8.0, mass=0.05, damping=1.0, stiffness=500.0)
-    instruments = sj.methods.Instruments(force_noise=noise, velocity_noise=0.2 * noise)
-    return sj.methods.Laboratory(beam, shaker, instruments, RATE)
+    shaker = sj.simulate.Shaker(30.0, 8.0, mass=0.05, damping=1.0, stiffness=500.0)
+    instruments = sj.simulate.Instruments(force_noise=noise, velocity_noise=0.2 * noise)
+    return sj.simulate.Laboratory(beam, shaker, instruments, RATE)
 
 
 def recorded(path, record, *, forced=True):
@@ -68,12 +68,12 @@ def main() -> None:
     )
     omega = HERTZ * np.linspace(36.5, 43.0, 24)
     for name, voltage in (("stepped_low", 1.5), ("stepped_high", 5.0)):
-        test = sj.methods.stepped_sine_test(bench, voltage, omega, settle_cycles=90)
+        test = sj.simulate.stepped_sine_test(bench, voltage, omega, settle_cycles=90)
         recorded(folder / f"{name}.csv", test.record)
-    test = sj.methods.decay_test(bench, 8.0, 3.0)
+    test = sj.simulate.decay_test(bench, 8.0, 3.0)
     recorded(folder / "decay.csv", test.record, forced=False)
     lines = np.arange(20, 80)
-    test = sj.methods.multisine_test(bench, 8.0, lines, 2000, 6, seed=1)
+    test = sj.simulate.multisine_test(bench, 8.0, lines, 2000, 6, seed=1)
     recorded(folder / "multisine.csv", test.record)
     names = ("stepped_low", "stepped_high", "decay", "multisine")
     begin = time.perf_counter()

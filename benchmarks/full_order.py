@@ -133,7 +133,7 @@ def condensed(beam: sj.condense.Beam, modes: Sequence[int], damping_ratio: np.nd
         return sj.condense.static_cases(beam, basis, force)
 
     wanted = sj.condense.displacement_for_ratio(basis, solve, start=float(beam.thickness) / 4)
-    found = sj.condense.condense(basis, solve(sj.condense.modal_loads(basis, wanted).force))
+    found = sj.condense.reduced_model(basis, solve(sj.condense.modal_loads(basis, wanted).force))
     seconds = time.perf_counter() - begin
     model = found.structure(
         damping_ratio,

@@ -120,7 +120,7 @@ def scored(structure, found):
         (found.natural_frequency - structure.natural_frequency) / found.natural_frequency_std,
         (found.damping_ratio - structure.damping_ratio) / found.damping_ratio_std,
     ]
-    if isinstance(found, identify.ScaledModes) and found.mass_normalised:
+    if getattr(found, "mass_normalised", False):
         shape = np.linalg.norm(found.shape, axis=0) / np.linalg.norm(exact, axis=0) - 1
         z.append(((found.shape - exact) / found.shape_std).ravel())
     else:

@@ -79,7 +79,7 @@ def continuation(laboratory, velocity, force, seed):
     omega, ratio = float(modes.natural_frequency[0]), float(modes.damping_ratio[0])
     per_force = abs(float(modes.mode_shape[0, 0] * modes.participation[0]))
     gain = _GAIN * 2 * ratio * omega / per_force
-    settings = sj.methods.FeedbackSettings(gain, record_cycles=40, filter_rate=omega / 4)
+    settings = sj.simulate.FeedbackSettings(gain, record_cycles=40, filter_rate=omega / 4)
     return sj.methods.control_based_continuation(
         laboratory, velocity + force / gain, settings, seed=seed
     )
@@ -88,16 +88,16 @@ def continuation(laboratory, velocity, force, seed):
 def tests(bench, noise, model, forces, true, methods, seed):
     """Results of some methods for one seed."""
     largest, velocity = float(forces[-1]), float(true[0, -1])
-    instruments = sj.methods.Instruments(
+    instruments = sj.simulate.Instruments(
         force_noise=noise * largest, velocity_noise=noise * velocity
     )
-    shaker = sj.methods.Shaker(bench.coil, bench.coil)
+    shaker = sj.simulate.Shaker(bench.coil, bench.coil)
     reach = float(3 * velocity / model.modes.natural_frequency[0])  # of friction's tables, m
-    laboratory = sj.methods.Laboratory(
+    laboratory = sj.simulate.Laboratory(
         *(model, shaker, instruments, bench.rate, bench.substeps), largest_displacement=reach
     )
     omega = float(model.modes.natural_frequency[0])
-    gains = sj.methods.LoopGains(omega / 4, omega / 20) if bench.fast else None
+    gains = sj.simulate.LoopGains(omega / 4, omega / 20) if bench.fast else None
     voltages = np.geomspace(forces[0], largest, _LEVELS)
     if "pll" in methods:
         yield (
@@ -109,11 +109,11 @@ def tests(bench, noise, model, forces, true, methods, seed):
         yield "cbc", lambda: continuation(laboratory, *motions, seed)
     recorded = [name for name in ("resonant_decay", "restoring_force", "ssm") if name in methods]
     if recorded:
-        decay = sj.methods.decay_test(laboratory, largest, 3.0, gains=gains, seed=seed)
+        decay = sj.simulate.decay_test(laboratory, largest, 3.0, gains=gains, seed=seed)
         free = recording(decay.record, bench.rate, forced=False)
     if "pnlss" in methods:
         recorded.append("pnlss")
-        played = sj.methods.multisine_test(
+        played = sj.simulate.multisine_test(
             laboratory, largest / 2, np.arange(*bench.lines), int(PERIOD * bench.rate), 5, seed=seed
         )
         broad = recording(played.record, bench.rate, forced=True)

@@ -38,6 +38,7 @@ from scipy.linalg import eigh
 
 import snrmjax as sj
 from snrmjax.methods.one_sensor import sensor_states
+from snrmjax.methods.steady.arslan_ozguven import describing_function
 
 tell = teller(__file__)
 
@@ -123,14 +124,14 @@ def _answer(result) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def phase_locked_loop() -> None:
     """A clamped beam, 20 % up from its linear frequency with gains of the linear regime."""
     model = sj.model.flat_beam()
-    shaker = sj.methods.Shaker(3.0, 0.005, mass=1e-7, damping=1e-7, stiffness=1e-3)
-    laboratory = sj.methods.Laboratory(
-        model, shaker, sj.methods.Instruments(velocity_noise=1e-4), 10000.0, substeps=4
+    shaker = sj.simulate.Shaker(3.0, 0.005, mass=1e-7, damping=1e-7, stiffness=1e-3)
+    laboratory = sj.simulate.Laboratory(
+        model, shaker, sj.simulate.Instruments(velocity_noise=1e-4), 10000.0, substeps=4
     )
     voltages = np.linspace(0.5, 8.5, 15)
     found = sj.methods.phase_locked_loop(
         *(laboratory, voltages),
-        gains=sj.methods.LoopGains(100.0, 40.0),
+        gains=sj.simulate.LoopGains(100.0, 40.0),
         settle_cycles=70,
         record_cycles=30,
     )
@@ -156,12 +157,12 @@ def continuation() -> None:
     """x'' + 0.1 x' + x + 0.04 x³ = cos ωt, tracked through its unstable branch."""
     modes = sj.model.linear_modes([1.0], [0.05], [[1.0]], [1.0])
     model = sj.model.structure(modes, sj.model.polynomial_potential({"1111": 0.01}, 1))
-    shaker = sj.methods.Shaker(1.0, 1e-3)
-    laboratory = sj.methods.Laboratory(model, shaker, sj.methods.Instruments(), 40.0)
-    settings = sj.methods.FeedbackSettings(1500.0)
+    shaker = sj.simulate.Shaker(1.0, 1e-3)
+    laboratory = sj.simulate.Laboratory(model, shaker, sj.simulate.Instruments(), 40.0)
+    settings = sj.simulate.FeedbackSettings(1500.0)
     errors, exact, falling = [], [], 0
     for omega in (1.3, 1.5, 1.7):
-        curve = sj.methods.s_curve(laboratory, omega, omega * np.linspace(0.5, 7.5, 15), settings)
+        curve = sj.simulate.s_curve(laboratory, omega, omega * np.linspace(0.5, 7.5, 15), settings)
         held = np.isfinite(curve.force)
         size = curve.velocity[held] / omega
         needed = size * np.hypot(1 + 0.03 * size**2 - omega**2, 0.1 * omega)
@@ -185,17 +186,17 @@ def continuation() -> None:
 
 def held_displacements(model, sizes, frequencies=None):
     """Response-controlled stepped sines in the laboratory, one level a displacement."""
-    shaker = sj.methods.Shaker(30.0, 8.0, mass=0.05, damping=1.0, stiffness=500.0)
-    laboratory = sj.methods.Laboratory(model, shaker, sj.methods.Instruments(), 4000.0)
+    shaker = sj.simulate.Shaker(30.0, 8.0, mass=0.05, damping=1.0, stiffness=500.0)
+    laboratory = sj.simulate.Laboratory(model, shaker, sj.simulate.Instruments(), 4000.0)
     tables = []
     for level, size in enumerate(sizes, 1):
         middle = np.sqrt(REST**2 + 0.75 * CUBIC * size**2)
-        test = sj.methods.stepped_sine_test(
+        test = sj.simulate.stepped_sine_test(
             *(laboratory, size),
             middle * np.linspace(0.975, 1.025, 13) if frequencies is None else frequencies,
             held="displacement",
         )
-        tables.append(sj.methods.steady_states_of(laboratory, test, level=level))
+        tables.append(sj.simulate.steady_states_of(laboratory, test, level=level))
     return sj.measure.join_steady_states(tables)
 
 
@@ -426,7 +427,7 @@ def spring_in_a_chain() -> None:
     data = sj.measure.steady_states(
         *(level, omega, force, 1j * omega[:, None] * motion), sensors=names
     )
-    v = sj.methods.describing_function(sensor_states(data, modes, "arslan_ozguven"), modes)
+    v = describing_function(sensor_states(data, modes), modes)
     theirs, elsewhere, mode = [], [], []
     end = np.eye(count)[tip]
     for at, push, moved in zip(omega, force, motion, strict=True):

@@ -26,9 +26,9 @@ from snrmjax.condense import (
     ReductionBasis,
     StaticCases,
     beam_modes,
-    condense,
     displacement_for_ratio,
     modal_loads,
+    reduced_model,
     rise_of_radius,
     shape_at,
     static_cases,
@@ -206,7 +206,7 @@ def condensed(
     else:
         size = np.full(len(basis.numbers), scale * beam.thickness)
     loads = modal_loads(basis, size)
-    found = condense(basis, solve(np.asarray(loads.force)), expand=False)
+    found = reduced_model(basis, solve(np.asarray(loads.force)), expand=False)
     signs = _signs(beam, midspan)
     coefficients = np.asarray(found.potential.coefficient)
     force = {

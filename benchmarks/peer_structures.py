@@ -161,7 +161,7 @@ def by_elements(strip: Strip, count: int) -> tuple[sj.model.Structure, float]:
         return sj.condense.static_cases(beam, basis, force)
 
     size = sj.condense.displacement_for_ratio(basis, solve, start=strip.thickness / 10)
-    found = sj.condense.condense(basis, solve(sj.condense.modal_loads(basis, size).force))
+    found = sj.condense.reduced_model(basis, solve(sj.condense.modal_loads(basis, size).force))
     model = found.structure(
         0.01,
         sensors={"midspan": sj.condense.shape_at(beam, basis, 0.5)},

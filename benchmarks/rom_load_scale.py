@@ -105,7 +105,7 @@ def measure(name: str, frame: Frame, modes: tuple[int, ...]) -> dict[str, object
     began = time.perf_counter()
     size = sj.condense.displacement_for_ratio(basis, solve, start=0.1 * THICKNESS)
     loads = sj.condense.modal_loads(basis, size)
-    found = sj.condense.condense(basis, solve(np.asarray(loads.force)))
+    found = sj.condense.reduced_model(basis, solve(np.asarray(loads.force)))
     study = sj.condense.load_scale_study(basis, solve, size, scales=SCALES)
     leading = np.array(study.leading)
     result: dict[str, object] = {

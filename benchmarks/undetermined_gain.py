@@ -24,6 +24,7 @@ from scipy.optimize import brentq
 
 import snrmjax as sj
 from snrmjax.identify.inference.fitted_curves import values_to_the_largest
+from snrmjax.numerics.facts import Fact
 
 tell = teller(__file__)
 
@@ -179,11 +180,16 @@ class Outcome(NamedTuple):
     words: str = ""
 
 
-def about_gain(sentences: tuple[str, ...]) -> str:
-    """The sentence that says that the gain is not known, if any does."""
-    words = ("cannot be determined", "cannot determine", "hardly determine", "not determined")
-    found = (s for s in map(str, sentences) if "gain" in s and any(word in s for word in words))
-    return next(found, "")
+OF_GAIN = {
+    *("force_gain_undetermined", "force_gain_near_resonance", "force_gain_in_answer"),
+    *("force_gain_far", "force_gain_moved", "level_errors_at_limit"),
+}
+"""Kinds of notes that say that the gain is not known."""
+
+
+def about_gain(notes: tuple[Fact, ...]) -> str:
+    """The note that says that the gain is not known, if any does."""
+    return next((str(note) for note in notes if note.kind in OF_GAIN), "")
 
 
 def largest_velocity(data: sj.measure.SteadyStates) -> float:

@@ -8,6 +8,7 @@ from . import (
     measure,
     methods,
     model,
+    pipelines,
     plot,
     simulate,
     study,
@@ -20,6 +21,7 @@ from .identify.joint.joint_fit import fit_jointly
 from .io.compilation_cache import use_compilation_cache
 from .io.models import read_model
 from .io.tables import read_steady_states
+from .report.writing import write_results
 from .simulate.solutions.forced_response import forced_response
 from .simulate.solutions.normal_modes import nonlinear_normal_mode
 from .simulate.virtual_test.phase_resonance_test import phase_resonance_test
@@ -41,12 +43,14 @@ __all__ = [
     "next_measurements",
     "nonlinear_normal_mode",
     "phase_resonance_test",
+    "pipelines",
     "plot",
     "read_model",
     "read_steady_states",
     "simulate",
     "study",
     "use_compilation_cache",
+    "write_results",
 ]
 
 __version__: str

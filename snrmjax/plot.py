@@ -1,13 +1,13 @@
 """Figures of what was measured, identified, simulated and diagnosed."""
 
 from snrmjax.report import style
-from snrmjax.report.diagnosis_figures import (
+from snrmjax.report.figures.diagnosis import (
     candidates_figure,
     comparison_figure,
     effect_laws_figure,
     misfit_figure,
 )
-from snrmjax.report.figures import (
+from snrmjax.report.figures.identification import (
     DampingSeries,
     backbone_figure,
     force_velocity_figure,
@@ -15,27 +15,26 @@ from snrmjax.report.figures import (
     response_figure,
     save_figure,
 )
-from snrmjax.report.joint_figures import (
+from snrmjax.report.figures.joint_fit import (
     FitSeries,
     contributions_figure,
     fitted_curves_figure,
     next_measurements_figure,
-    profile_figure,
     residuals_figure,
 )
-from snrmjax.report.modal.modal_figures import (
+from snrmjax.report.figures.modes import (
     decay_figure,
     modal_responses_figure,
     stabilisation_figure,
 )
-from snrmjax.report.simulation_figures import (
+from snrmjax.report.figures.simulation import (
     batch_figure,
     damped_mode_figure,
     motions_figure,
     normal_mode_figure,
     simulated_response_figure,
 )
-from snrmjax.report.uncertainty.uncertainty_figures import (
+from snrmjax.report.figures.uncertainty import (
     propagation_figure,
     sensitivity_figure,
 )
@@ -59,7 +58,6 @@ __all__ = [
     "motions_figure",
     "next_measurements_figure",
     "normal_mode_figure",
-    "profile_figure",
     "propagation_figure",
     "residuals_figure",
     "response_figure",

@@ -9,18 +9,18 @@ from collections.abc import Callable
 
 import typer
 
+from snrmjax.cli.check_command import check
 from snrmjax.cli.compare_command import compare
 from snrmjax.cli.console import refuse
 from snrmjax.cli.demo_command import demo
 from snrmjax.cli.diagnose_command import diagnose
 from snrmjax.cli.identify_command import identify
-from snrmjax.cli.laboratory.check_command import check
-from snrmjax.cli.laboratory.import_command import import_
-from snrmjax.cli.laboratory.modes_command import modes
-from snrmjax.cli.laboratory.whole_test_command import whole_test
+from snrmjax.cli.import_command import import_
+from snrmjax.cli.modes_command import modes
 from snrmjax.cli.rom_command import rom
 from snrmjax.cli.simulate_commands import nnm, simulate
 from snrmjax.cli.study_commands import study_app
+from snrmjax.cli.whole_test_command import whole_test
 from snrmjax.io.compilation_cache import use_compilation_cache
 
 app = typer.Typer(

@@ -5,10 +5,10 @@ from typing import Annotated
 
 import typer
 
-from snrmjax.cli.console import say, staged, warn
-from snrmjax.cli.measured_tests import read_measured_test
+from snrmjax.cli.console import tell, written
 from snrmjax.cli.options import Linear, Out
 from snrmjax.io.models import read_model
+from snrmjax.report.writing import staged
 
 
 def compare(
@@ -48,17 +48,14 @@ def compare(
     """
     from snrmjax.methods.comparison import compare_methods
     from snrmjax.model.structures import modes_of
-    from snrmjax.report.methods import comparison_report
+    from snrmjax.pipelines.measured_files import read_measured_test
+    from snrmjax.report.pages import comparison
 
     with staged(out) as folder:
         structure = read_model(model)
-        tests = [one for path in data for one in read_measured_test(path, structure)]
+        tests = [test for path in data for test in read_measured_test(path, structure)]
         found = compare_methods(tests, modes_of(structure), tuple(method) if method else None)
-        for line in found.records:
-            say(line)
-        for why in found.stopped.values():
-            warn(f"did not run: {why}")
-        name = ", ".join(path.stem.replace("_", " ") for path in data)
-        comparison_report.write_comparison(folder, found, name, structure.name)
-    say(comparison_report.comparison_sentence(found))
-    say(f"written to {out}: open {out / 'report.html'}")
+        title = ", ".join(path.stem.replace("_", " ") for path in data)
+        comparison.write(folder, found, title=title, model=structure.name)
+    tell(found, comparison.notes_of(found))
+    written(out)

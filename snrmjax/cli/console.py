@@ -1,13 +1,12 @@
-"""What the commands say on standard error, and folders that are written whole or not at all."""
+"""What the commands say on standard error, and how they end."""
 
-import os
-import shutil
-import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
+
+from snrmjax.report.writing import page_of
 
 console = Console(stderr=True, highlight=False, soft_wrap=True)
 
@@ -17,7 +16,7 @@ def say(message: str) -> None:
     console.print(message, markup=False)
 
 
-def warn(message: str) -> None:
+def warn(message: object) -> None:
     """A note that the reader of the results should know."""
     console.print(f"note: {message}", style="yellow", markup=False)
 
@@ -27,28 +26,14 @@ def refuse(message: str) -> None:
     console.print(f"error: {message}", style="red", markup=False)
 
 
-@contextmanager
-def staged(out: Path) -> Iterator[Path]:
-    """A folder to write into whose files move to `out` together, or not at all."""
-    out = Path(os.path.abspath(out))
-    if out.exists() and not out.is_dir():
-        raise ValueError(f"--out {out} is a file, but a folder is expected.")
-    made = [p for p in (out, *out.parents) if not p.exists()]
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        staging = Path(tempfile.mkdtemp(prefix=".snrmjax-", dir=out))
-    except OSError as error:
-        raise ValueError(f"--out {out} cannot be written: {error.strerror}.") from error
-    done = False
-    try:
-        yield staging
-        for file in sorted(one for one in staging.rglob("*") if one.is_file()):
-            target = out / file.relative_to(staging)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            os.replace(file, target)
-        done = True
-    finally:
-        shutil.rmtree(staging)
-        if not done:
-            for folder in made:
-                folder.rmdir()
+def tell(result: Any, notes: Iterable[object] | None = None) -> None:
+    """The notes of a pipeline's result, and its headline."""
+    for note in result.notes if notes is None else notes:
+        warn(note)
+    for line in page_of(result).headline(result):
+        say(line)
+
+
+def written(out: Path, page: str = "report.html") -> None:
+    """Where the results are."""
+    say(f"written to {out}: open {out / page}" if page else f"written to {out}")

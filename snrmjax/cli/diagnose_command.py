@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from snrmjax.cli.console import say, staged, warn
-from snrmjax.cli.options import FILES, OptionRow, Out, with_options
-from snrmjax.io.models import read_model
-from snrmjax.io.tables import read_steady_states
+from snrmjax.cli.console import say, warn, written
+from snrmjax.cli.options import FILES, Out, asked_for, with_options
+from snrmjax.pipelines.options import DiagnoseOptions
+from snrmjax.report.writing import staged
 
 if TYPE_CHECKING:
     from snrmjax.diagnose.diagnosis_result import Diagnosis
@@ -45,39 +45,35 @@ def diagnose(
     Without phases (`velocity_m_s`, or a `phase_std_deg` of 60 or more) the notes say what
     these data cannot decide.
     """
-    from snrmjax.io.measurement_plans import read_former_answer, read_further_states
-    from snrmjax.report.diagnosis_report import readable_verdict, write_diagnosis
+    from snrmjax.io.measurement_plans import read_former_answer
+    from snrmjax.pipelines.diagnose import diagnose_test, read_test
+    from snrmjax.report.pages import diagnosis as page
 
-    several = len(data) > 1
-    plan, add, former = options["plan"], options["add"], options["former"]
-    for option, given in (("--plan", plan), ("--add", add), ("--continue", former)):
-        if several and given:
-            raise ValueError(f"`{option}` is for one data file, but {len(data)} are given.")
-    if former is not None and not add:
-        raise ValueError("`--continue` needs further states: name their file with `--add`.")
-    if plan is not None and not plan.parent.is_dir():
-        raise ValueError(f"--plan {plan} cannot be written: its folder does not exist.")
-    before = None if former is None else read_former_answer(former)
+    asked, several = asked_for(DiagnoseOptions, options), len(data) > 1
+    for option in ("plan", "add", "former") if several else ():
+        if getattr(asked, option):
+            flag = {"former": "continue"}.get(option, option)
+            raise ValueError(f"`--{flag}` is for one data file, but {len(data)} are given.")
+    if asked.plan is not None and not asked.plan.parent.is_dir():
+        raise ValueError(f"--plan {asked.plan} cannot be written: its folder does not exist.")
     if len({path.stem for path in data}) < len(data):
         raise ValueError("two of the data files have the same name: they would share a folder.")
+    former = None if asked.former is None else read_former_answer(asked.former)
+    simulate = not several if asked.responses is None else asked.responses
     refused = []
     for path in data:
         beside = path.with_suffix(".toml")
-        own = beside if several and beside.exists() else model
         try:
             with staged(out / path.stem if several else out) as folder:
-                structure = read_model(own)
-                measured = read_steady_states(path, structure)
-                for file in add:
-                    measured = read_further_states(file, structure, measured)
+                given = beside if several and beside.exists() else model
+                structure, measured = read_test(path, given, asked.add)
                 for note in measured.notes:
                     warn(note)
-                simulate = not several if options["responses"] is None else options["responses"]
-                found, _ = write_diagnosis(
-                    folder, path.stem, structure, measured, simulate=simulate, former=before
-                )
-                if plan is not None:
-                    _write_plan(plan, found)
+                found = diagnose_test(measured, structure, simulate=simulate, former=former)
+                title = path.stem.replace("_", " ")
+                page.write(folder, found, title=title, data=path.name)
+                if asked.plan is not None:
+                    _write_plan(asked.plan, found.diagnosis)
         except ValueError as error:
             if not several:
                 raise
@@ -85,49 +81,18 @@ def diagnose(
             refused.append(path.name)
             continue
         if not several:
-            for note in found.notes:
-                warn(note)
-        effects = ", ".join(found.effects)
-        if effects:
-            effects = f" ({effects})" if found.verdict.is_answer else f"; best attempt: {effects}"
-        say(f"{path.name}: {found.verdict.replace('_', ' ')}{effects}")
-        say(f"  {readable_verdict(found)}")
-        say(f"  probability: {found.most_probable()}")
-        if found.decide_by:
-            say(f"  what would decide: {found.decide_by}")
+            for said in found.diagnosis.notes:
+                warn(said)
+        say(f"{path.name}: {page.answer_in_words(found.diagnosis)}")
+        for line in page.headline(found):
+            say(f"  {line}")
     if not several:
-        say(f"written to {out}: open {out / 'report.html'}")
+        written(out)
     if refused:
         raise ValueError(f"no diagnosis for {len(refused)} of {len(data)}: {', '.join(refused)}.")
 
 
-_RESPONSES = OptionRow(
-    *("responses", bool),
-    "Simulate the responses of the model as given and as completed, for comparison with the data. "
-    "Default: for a single file.",
-)
-_FILE_ROWS = (
-    OptionRow(
-        *("plan", Path),
-        "Write the measurement that would decide an open answer: a CSV of steady states to be "
-        "filled in.",
-        "FILE",
-    ),
-    OptionRow(
-        *("add", list[Path]),
-        "Further steady states of the same structure, such as a plan that was filled in: one "
-        "diagnosis of all states (repeatable).",
-        "FILE",
-    ),
-    OptionRow(
-        *("former", Path),
-        "diagnosis.json of the states without those of `--add`: fits begin at its answers too, and "
-        "the notes say what the further states changed.",
-        "FILE",
-        flag="--continue",
-    ),
-)
-with_options(diagnose, {None: (_RESPONSES,), FILES: _FILE_ROWS})
+with_options(diagnose, DiagnoseOptions)
 
 
 def _write_plan(file: Path, found: "Diagnosis") -> None:

@@ -1,13 +1,16 @@
 """Options and arguments that several commands have, and the panels of their help."""
 
+import dataclasses
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
 import typer
 
-FILES = "Files"
+from snrmjax.pipelines.options import FILES, checked, flag_of
+
+Asked = TypeVar("Asked")
 
 Model = Annotated[
     Path,
@@ -51,49 +54,45 @@ def require_positive(option: str, values: Sequence[float], unit: str) -> None:
             raise ValueError(f"`{option}` must be above zero, but is {value:g} {unit}.")
 
 
-class OptionRow(NamedTuple):
-    """An option of a command: its name in Python, what it takes, and the line of its help.
+def with_options(command: Callable[..., None], *of: Any) -> None:
+    """Give a command, which takes them as `**options`, the options of pipelines (dataclasses).
 
-    A `bool` that is `False` is a switch, another one has a `--no-` form; a list is repeatable.
+    A switch that is off by default has no `--no-` form; a tuple is an option to be repeated.
     """
-
-    name: str
-    kind: Any
-    help: str
-    metavar: str | None = None
-    default: Any = None
-    least: float | None = None  # that a number may be
-    flag: str = ""  # how it is written, where that is not the name
-
-
-def with_options(
-    command: Callable[..., None], panels: Mapping[str | None, Sequence[OptionRow]]
-) -> None:
-    """Give a command, which takes them as `**options`, the options of some panels of its help."""
     signature = inspect.signature(command)
-    own = [one for one in signature.parameters.values() if one.kind is not one.VAR_KEYWORD]
-    made = [_parameter(row, panel) for panel, rows in panels.items() for row in rows]
+    own = [
+        parameter
+        for parameter in signature.parameters.values()
+        if parameter.kind is not parameter.VAR_KEYWORD
+    ]
+    made = [_parameter(kind, field) for kind in of for field in dataclasses.fields(kind)]
     command.__signature__ = signature.replace(parameters=[*own, *made])  # type: ignore[attr-defined]
 
 
-def _parameter(row: OptionRow, panel: str | None) -> inspect.Parameter:
-    flag = row.flag or f"--{row.name.replace('_', '-')}"
-    if row.kind is bool and row.default is not False:
+def asked_for(kind: type[Asked], options: Mapping[str, Any]) -> Asked:
+    """The options of a pipeline from those that a command was given, if all have an effect."""
+    names = [field.name for field in dataclasses.fields(kind)]  # type: ignore[arg-type]
+    values = {name: options[name] for name in names}
+    return checked(kind(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}))
+
+
+def _parameter(of: Any, field: dataclasses.Field) -> inspect.Parameter:
+    about, kind, default = field.metadata["option"], get_type_hints(of)[field.name], field.default
+    flag = flag_of(field)
+    if bool in (kind, *get_args(kind)) and default is not False:
         flag = f"{flag}/--no-{flag[2:]}"
-    said = isinstance(row.default, float) or bool(row.default)
+    if get_origin(kind) is tuple:
+        kind, default = list[get_args(kind)[0]], []  # type: ignore[misc]
     option = typer.Option(
         *(flag,),
-        help=row.help,
-        metavar=row.metavar,
-        rich_help_panel=panel,
-        min=row.least,
-        show_default=said,
+        help=about.help,
+        metavar=about.metavar,
+        rich_help_panel=about.panel,
+        min=about.least,
+        show_default=isinstance(default, float) or bool(default),
     )
-    optional = row.default is None and not str(row.kind).startswith("list")
-    kind = row.kind | None if optional else row.kind
-    default = [] if row.default is None and not optional else row.default
     return inspect.Parameter(
-        *(row.name, inspect.Parameter.KEYWORD_ONLY),
+        *(field.name, inspect.Parameter.KEYWORD_ONLY),
         default=default,
         annotation=Annotated[kind, option],
     )

@@ -1,5 +1,6 @@
 """The commands `study run` and `study report`."""
 
+import dataclasses
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -9,8 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from snrmjax.cli.console import console, say, staged, warn
-from snrmjax.cli.options import FILES, OptionRow, Out, with_options
+from snrmjax.cli.console import console, say, warn
+from snrmjax.cli.options import FILES, Out, asked_for, with_options
+from snrmjax.pipelines.options import option
+from snrmjax.report.writing import staged
 
 if TYPE_CHECKING:
     import xarray
@@ -47,6 +50,30 @@ StudyOut = Annotated[
 ]
 
 
+@dataclasses.dataclass(frozen=True)
+class StudyOptions:
+    """What `study run` may be asked for."""
+
+    processes: int | None = option(
+        None,
+        "Processes of this machine, each on one core; by default one for every core.",
+        least=1,
+    )
+    scheduler: str | None = option(
+        None,
+        "Address of a running Dask scheduler whose workers see the same folders, such as "
+        "tcp://node1:8786.",
+        "ADDRESS",
+    )
+    shard: str | None = option(
+        None,
+        "Compute the I-th of N parts only, on a shared folder; the one that ends last makes the "
+        "data set.",
+        "I/N",
+    )
+    quiet: bool = option(False, "Say nothing but what is wrong.")
+
+
 def run(
     file: Annotated[
         Path,
@@ -65,15 +92,21 @@ def run(
     from snrmjax.study.run import run_study
     from snrmjax.study.study_file import read_study
 
-    quiet, shard = options["quiet"], options["shard"]
-    part = (1, 1) if shard is None else _shard(shard)
+    asked = asked_for(StudyOptions, options)
+    quiet = asked.quiet
+    part = (1, 1) if asked.shard is None else _shard(asked.shard)
     study = read_study(file)
     if not quiet:
         _say_study(study)
     try:
         with _progress(quiet) as progress:
-            settings = {name: options[name] for name in ("processes", "scheduler")}
-            done = run_study(study, out, shard=part, progress=progress, **settings)
+            done = run_study(
+                *(study, out),
+                processes=asked.processes,
+                scheduler=asked.scheduler,
+                shard=part,
+                progress=progress,
+            )
     except KeyboardInterrupt:
         warn("stopped; the same command continues.")
         sys.exit(_INTERRUPTED)
@@ -84,27 +117,7 @@ def run(
         _say_done(done, out)
 
 
-_RUN_ROWS = (
-    OptionRow(
-        *("processes", int),
-        "Processes of this machine, each on one core; by default one for every core.",
-        least=1,
-    ),
-    OptionRow(
-        *("scheduler", str),
-        "Address of a running Dask scheduler whose workers see the same folders, such as "
-        "tcp://node1:8786.",
-        "ADDRESS",
-    ),
-    OptionRow(
-        *("shard", str),
-        "Compute the I-th of N parts only, on a shared folder; the one that ends last makes the "
-        "data set.",
-        "I/N",
-    ),
-    OptionRow("quiet", bool, "Say nothing but what is wrong.", None, False),
-)
-with_options(run, {None: _RUN_ROWS})
+with_options(run, StudyOptions)
 study_app.command(
     epilog="Example: snrmjax study run study.toml --out study.zarr. On a batch queue, one task of "
     "four: snrmjax study run study.toml --out study.zarr --shard 3/4"

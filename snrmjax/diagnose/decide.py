@@ -6,14 +6,14 @@ a gain of the force that the data do not determine. What they refute keeps a sma
 probability; the rest is that of a law outside the library.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
 
 from snrmjax.diagnose import priors
-from snrmjax.diagnose.checks.doubts import (
+from snrmjax.diagnose.checks.alternative_laws import (
     WIDER,
     Doubt,
     acts_both_ways,
@@ -25,9 +25,13 @@ from snrmjax.diagnose.checks.doubts import (
 from snrmjax.diagnose.checks.gains import LevelForces, doubts_on_gains
 from snrmjax.diagnose.checks.residuals import HeldOutLevels, left_curve, missed_levels, pattern
 from snrmjax.diagnose.evidence import NOISE_REJECTED, NONE, UNKNOWN, Weights
+from snrmjax.diagnose.laws.law_answer import LawAnswer
 from snrmjax.diagnose.misfit.effect_fit import baseline_fit
 from snrmjax.diagnose.search.locating import Located, power_of_answer
 from snrmjax.diagnose.search.model_search import FoundEffects
+from snrmjax.numerics.facts import Fact
+
+_FEW = 2  # effects of an answer beside which no law is drawn
 
 
 class Verdict(StrEnum):
@@ -46,62 +50,11 @@ class Verdict(StrEnum):
         return self in (Verdict.NAMED, Verdict.AMBIGUOUS, Verdict.DRAWN)
 
 
-def verdict_sentence(
-    verdict: Verdict, classes: Sequence[Sequence[str]], before: float, after: float
-) -> str:
-    """A verdict in one plain sentence.
-
-    Arguments: `classes` has every effect of the answer with those that fit as well, or drawn laws
-    in words; misfits before and after it in units of noise.
-    """
-    found = _listed([group[0] for group in classes], "and")
-    falls = f"the misfit falls from {_times(before)} to {_times(after)} times the noise"
-    with_it = "with them" if len(classes) > 1 else "with it"
-    if verdict is Verdict.NOTHING_MISSING:
-        return (
-            "Nothing is missing that these data could show: the model as given fits them to "
-            f"{_times(after)} times the noise."
-        )
-    if verdict is Verdict.NOISE_REJECTED:
-        return (
-            "The stated noise does not fit the scatter of these data, so no effect is named: state "
-            "the noise of a repeated test, or none, and diagnose again."
-        )
-    if verdict is Verdict.UNKNOWN:
-        start = "Something is missing that no effect of the library explains reliably"
-        return f"{start}; the best attempt is {found}: {falls}." if found else f"{start}."
-    if verdict is Verdict.DRAWN:
-        names = "; beside it ".join(group[0] for group in classes)
-        return (
-            f"The model lacks a force that no effect of the library explains, drawn from the data: "
-            f"{names}. With it {falls}."
-        )
-    if verdict is Verdict.NAMED:
-        return f"The model lacks {found}: {with_it} {falls}, and nothing else explains as much."
-    if any(len(group) > 1 for group in classes):
-        rivals = " and ".join(_listed(group, "or") for group in classes)
-        return f"The model lacks {rivals}, and these data cannot tell which: {with_it} {falls}."
-    return (
-        f"The model probably lacks {found}: {with_it} {falls}, but something else could have the "
-        "same effect (see the notes)."
-    )
-
-
-def _times(misfit: float) -> str:
-    return f"{misfit:.1f}" if misfit < 10 else f"{misfit:.0f}"
-
-
-def _listed(names: Sequence[str], word: str) -> str:
-    """Names as in a sentence: "a, b and c"."""
-    *others, last = names or [""]
-    return f"{', '.join(others)} {word} {last}" if others else last
-
-
 class Judgement(NamedTuple):
     """A verdict, its reasons, and what stays open."""
 
     verdict: Verdict
-    reasons: tuple[str, ...]
+    reasons: tuple[Fact | str, ...]
     open_questions: tuple[Doubt, ...]
     probabilities: Mapping[str, float]
 
@@ -158,19 +111,19 @@ def decide(
     """
     probabilities = weights.probabilities()
     misfit, fit = found.misfit, found.fit
-    structure = pattern(misfit, fit) if found.p_value < priors.REJECTED else None
+    left = pattern(misfit, fit) if found.p_value < priors.REJECTED else None
     of_noise, outside = probabilities.get(NOISE_REJECTED, 0.0), probabilities.get(UNKNOWN, 0.0)
-    if of_noise > 0.5 and structure is None:
+    if of_noise > 0.5 and left is None:
         times = float(np.sqrt(fit.chi_square / (misfit.n_rows - len(fit.values))))
-        size = "overstated" if times < 1 else "understated"
-        said = f"the misfit is {times:.2g} times the stated noise, without a pattern: it is {size}."
-        return Judgement(Verdict.NOISE_REJECTED, (said,), (), probabilities)
-    if outside + (of_noise if structure is not None else 0.0) >= priors.NO_ANSWER:
-        left = structure or left_curve(misfit, fit)
-        reasons = ("no effect of the library explains what is left.", *([left] if left else []))
+        return Judgement(
+            Verdict.NOISE_REJECTED, (Fact("noise_misstated", ratio=times),), (), probabilities
+        )
+    if outside + (of_noise if left is not None else 0.0) >= priors.NO_ANSWER:
+        left = left if left is not None else left_curve(misfit, fit)
+        reasons = [Fact("no_effect_explains"), *([left] if left is not None else [])]
         # What is left has a pattern, and so is no noise of any size.
         kept = {name: p for name, p in probabilities.items() if name != NOISE_REJECTED}
-        return Judgement(Verdict.UNKNOWN, reasons, (), _else_unknown(kept))
+        return Judgement(Verdict.UNKNOWN, tuple(reasons), (), _else_unknown(kept))
     if not fit.kinds:
         return Judgement(Verdict.NOTHING_MISSING, (), (), probabilities)
     every = imitations_of(found, located)
@@ -179,24 +132,39 @@ def decide(
     if rival is not None:
         every.append(rival.doubt)
     if not every and outside > priors.NO_DOUBT:
-        said = left_curve(misfit, fit) or "what is left is small, but smoother than noise."
-        every.append(
-            Doubt(
-                f"a law outside the library has a probability of {100 * outside:.0f} %: {said}",
-                WIDER,
-                identical=True,
-            )
-        )
-    reasons = tuple(one.reason for one in every)
+        why = Fact("unknown_law", probability=outside, left=left_curve(misfit, fit))
+        every.append(Doubt(why, WIDER, identical=True))
+    doubted = tuple(one.reason for one in every)
     if any(one.refutes for one in every):
         kept = {
             name: p if name in (NONE, NOISE_REJECTED) else priors.OPEN * p
             for name, p in probabilities.items()
         }
-        return Judgement(Verdict.UNKNOWN, reasons, tuple(every), _else_unknown(kept))
+        return Judgement(Verdict.UNKNOWN, doubted, tuple(every), _else_unknown(kept))
     unclear = every or any(len(group) > 1 for group in found.classes)
     verdict = Verdict.AMBIGUOUS if unclear else Verdict.NAMED
-    return Judgement(verdict, reasons, tuple(every), probabilities)
+    return Judgement(verdict, doubted, tuple(every), probabilities)
+
+
+def law_is_asked_for(judgement: Judgement, n_effects: int) -> bool:
+    """Whether a drawn law may do better: nothing is named, or by so many effects that fit most."""
+    return judgement.verdict is Verdict.UNKNOWN or n_effects > _FEW
+
+
+def with_law(judgement: Judgement, law: LawAnswer) -> Judgement:
+    """The judgement where a law was drawn.
+
+    It has its share of what is outside the library, and of the effects in whose place it stands.
+    """
+    apart = {
+        name: p
+        for name, p in judgement.probabilities.items()
+        if name != UNKNOWN and len(name.split("+")) <= _FEW
+    }
+    outside = 1 - sum(apart.values())
+    apart["+".join(law.kinds)] = law.share * outside
+    probabilities = _else_unknown(apart)
+    return Judgement(Verdict.DRAWN, law.notes, (), probabilities)
 
 
 def imitations_of(found: FoundEffects, located: tuple[Located, ...]) -> list[Doubt]:

@@ -1,7 +1,8 @@
 """The whole diagnosis: locate the misfit, find effects that explain it, and check the answer."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,15 +11,15 @@ from jaxtyping import Float
 from snrmjax.diagnose import priors
 from snrmjax.diagnose.answers import Search, best_answer
 from snrmjax.diagnose.checks.gains import (
+    LevelGain,
     gain_found,
     level_gains,
-    notes_on_found_mass,
-    notes_on_level_forces,
-    notes_on_stated_parameters,
+    notes_on_gains,
     suspected_level_forces,
     with_forces_that_acted,
 )
 from snrmjax.diagnose.checks.residuals import (
+    HeldOutLevels,
     held_out_levels,
     held_out_places,
     neighbour_noise,
@@ -26,7 +27,14 @@ from snrmjax.diagnose.checks.residuals import (
     tolerated,
     without_level,
 )
-from snrmjax.diagnose.decide import Verdict, decide, imitations_of
+from snrmjax.diagnose.decide import (
+    Judgement,
+    Verdict,
+    decide,
+    imitations_of,
+    law_is_asked_for,
+    with_law,
+)
 from snrmjax.diagnose.design.discriminating_test import recommendation, recommended_test
 from snrmjax.diagnose.diagnosis_result import (
     Answer,
@@ -39,7 +47,6 @@ from snrmjax.diagnose.diagnosis_result import (
     FormerAnswer,
     Gap,
     completed_model,
-    what_changed,
 )
 from snrmjax.diagnose.laws.law_answer import LawAnswer, law_answer
 from snrmjax.diagnose.misfit.effect_fit import EffectFit, at_phases_of, at_reference, baseline_fit
@@ -52,7 +59,7 @@ from snrmjax.diagnose.misfit.reference import (
     with_reference,
 )
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit, weighted_misfit
-from snrmjax.diagnose.search.locating import locate_misfit
+from snrmjax.diagnose.search.locating import Located, locate_misfit
 from snrmjax.diagnose.search.model_search import FoundEffects, detection_limits
 from snrmjax.identify.calibrate.calibration_states import ASSUMED_ERROR
 from snrmjax.measure.phase_convention import naming_wrong_phases
@@ -61,9 +68,8 @@ from snrmjax.model.effect_base import AbstractLinearChange
 from snrmjax.model.effects import EFFECTS
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import on_one_core
+from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
-
-_FEW = 2  # effects of an answer beside which no law is drawn
 
 
 @on_one_core
@@ -99,133 +105,160 @@ def diagnose_model(
     Validity: steady motions with the period of the force; effects that change the motion
     moderately, so that two of them add up.
     """
-    notes: list[str] = []
-    gain = None
+    gain, notes = None, list[Fact | str]()
     if driven_by_voltage(data):
         data, gain, of_gain = with_first_gain(model, data)
         force_gain_std = force_gain_std or FREE_GAIN_STD
         notes += of_gain
+    predictions = _corrected_predictions(model, data, force_gain_std)
+    unknown, noise_stated = predictions.chosen.phase_unknown, predictions.chosen.noise_stated
+    excluded = excluded_kinds(model, force_gain_std, phases=not unknown[:, 0].all())
+    kinds = tuple(kind for kind in EFFECTS if kind not in excluded)
+    search = Search(scales_of(predictions), kinds, former.starts if former else {}, data)
+    answered = best_answer(search, predictions)
+    as_recorded, rival, best = answered.found, None, answered
+    # Beside an unknown gain nothing says which level's force is off.
+    if noise_stated and force_gain_std == 0 and not unknown.any():
+        allowed = tolerated(neighbour_noise(as_recorded.misfit, as_recorded.fit))
+        rival = suspected_level_forces(as_recorded, allowed)
+    if rival is not None and rival.is_better:
+        recorded = as_recorded.misfit.predictions
+        best = search.answered(dataclasses.replace(recorded, free_level_forces=rival.places))
+    found = best.found
+    checked = _Checked.of(found)
+    gains = checked.level_gains
+    errors = {name: one.std for name, one in checked.parameters.items()}
+    weights = best.weights.with_imitations(len(imitations_of(found, checked.located)))
+    judgement = decide(
+        found, weights, checked.located, checked.levels, errors, None if gains else rival
+    )
+    completed = _completed(model, checked)
+    answer = _answer(judgement, checked, completed)
+    if former is not None:
+        notes.append(former.changed_to(judgement.probabilities))
+    if gain is not None and answer.effects:
+        notes.append(Fact("gain_with_effects", gain=gain * answer.force_gain, before=gain))
+    asked = [doubt.decide_by for doubt in judgement.open_questions]
+    if gains and rival is not None:
+        asked = [rival.doubt.decide_by, *asked]
+        others, lead = as_recorded.fit.kinds, rival.lead
+        notes.append(Fact("best_as_recorded", effects=others, levels=rival.levels, lead=lead))
+    # Without phases the first measurement to recommend is that of the phases.
+    phases = not unknown[:, 0].any()
+    open_classes = judgement.verdict is Verdict.AMBIGUOUS and phases
+    test = recommended_test(found) if open_classes else None
+    notes += [*judgement.reasons, *_notes_on_data(checked), *_notes_on_answer(checked, completed)]
+    misfit, fit = checked.misfit, found.fit
+    diagnosis = Diagnosis(
+        verdict=judgement.verdict,
+        answer=answer,
+        recommended=recommendation(found, test, asked, phases=phases),
+        discriminating_test=test,
+        located=checked.located,
+        gap=Gap(
+            rms_misfit(as_recorded.misfit, as_recorded.baseline),
+            rms_misfit(misfit, fit),
+            *(checked.levels or (None, None)),
+        ),
+        checks=Checks(found.p_value, float(np.sqrt(checked.neighbours)), completed.without),
+        detection_limits=detection_limits(misfit, fit, search.scales, excluded),
+        table=found.table,
+        notes=tuple(notes),
+        force_misfit=_force_misfit(misfit, found.baseline, fit),
+        data=with_forces_that_acted(data, gains),
+        level_forces=gains,
+    )
+    known = noise_stated and force_gain_std == 0 and phases
+    if not known or not law_is_asked_for(judgement, len(fit.kinds)):
+        return diagnosis
+    # Laws of many knots are drawn with few harmonics.
+    law = law_answer(answered.coarse or found, model)
+    return diagnosis if law is None else _with_law(diagnosis, with_law(judgement, law), law)
+
+
+def _corrected_predictions(
+    model: Structure, data: SteadyStates, force_gain_std: float
+) -> Predictions:
+    """Predictions weighed by what the states show by themselves, of corrected records."""
     predictions = predictions_of(model, data, force_gain_std)
-    unknown = predictions.chosen.phase_unknown[:, 0]
-    n, least = len(unknown), 6
+    unknown, least = predictions.chosen.phase_unknown[:, 0], 6
+    n = len(unknown)
     if 2 * n - unknown.sum() < 2 * least:
         raise ValueError(
             f"a diagnosis needs at least {least} usable steady states, or {2 * least} where phases "
             f"are unknown, not {n}."
         )
-    # Beside an unknown gain nothing says which level's force is off.
-    estimable = force_gain_std == 0 and not predictions.chosen.phase_unknown.any()
     predictions = with_reference(predictions)
-    misfit = weighted_misfit(predictions)
-    if not np.isfinite(misfit.base).all():
+    if not np.isfinite(weighted_misfit(predictions).base).all():
         raise ValueError(
             "the model has no motion of the measured amplitude for some states: it is too far "
             "from the data to be compared."
         )
-    predictions = at_reference(predictions, data)
-    scales = scales_of(predictions)
-    excluded = excluded_kinds(model, force_gain_std, phases=not unknown.all())
-    kinds = tuple(kind for kind in EFFECTS if kind not in excluded)
-    search = Search(scales, kinds, former.starts if former else {}, data)
-    answered = best_answer(search, predictions)
-    found, weights = answered.found, answered.weights
-    as_recorded, rival = found, None
-    if predictions.chosen.noise_stated and estimable:
-        rival = suspected_level_forces(found, tolerated(neighbour_noise(found.misfit, found.fit)))
-    if rival is not None and rival.is_better:
-        own = found.misfit.predictions
-        freed = dataclasses.replace(own, free_level_forces=rival.places)
-        found, weights = search.answered(freed)[:2]
-    misfit, fit = at_phases_of(found.misfit, found.fit), found.fit
-    located = locate_misfit(misfit, found.baseline)
-    weights = weights.with_imitations(len(imitations_of(found, located)))
-    neighbours = neighbour_noise(misfit, fit)
-    levels = held_out_levels(misfit, found.baseline, fit, tolerated(neighbours))
-    parameters = _estimates(misfit, fit)
-    errors = {name: one.std for name, one in parameters.items()}
-    gains = level_gains(misfit, fit)
-    judgement = decide(found, weights, located, levels, errors, None if gains else rival)
-    test = None
-    # Without phases the first measurement to recommend is that of the phases.
-    if judgement.verdict is Verdict.AMBIGUOUS and not unknown.any():
-        test = recommended_test(found)
-    completed = completed_model(
-        model,
-        misfit.baseline_parameters(fit.rows),
-        fit.kinds,
-        {name: one.value for name, one in parameters.items()},
-    )
-    force = gain_found(misfit, fit)
+    return at_reference(predictions, data)
+
+
+class _Checked(NamedTuple):
+    """An answer with what is found of it beyond its fit."""
+
+    found: FoundEffects
+    misfit: WeightedMisfit  # with velocities of unknown phase where the answer has them
+    located: tuple[Located, ...]
+    neighbours: float  # variance over the stated one
+    levels: HeldOutLevels | None
+    parameters: dict[str, Estimate]
+    level_gains: dict[int, LevelGain]
+
+    @classmethod
+    def of(cls, found: FoundEffects) -> "_Checked":
+        """The checks of what a search found."""
+        fit, misfit = found.fit, at_phases_of(found.misfit, found.fit)
+        neighbours = neighbour_noise(misfit, fit)
+        levels = held_out_levels(misfit, found.baseline, fit, tolerated(neighbours))
+        located = locate_misfit(misfit, found.baseline)
+        estimates = _estimates(misfit, fit)
+        return cls(found, misfit, located, neighbours, levels, estimates, level_gains(misfit, fit))
+
+
+class _Completed(NamedTuple):
+    """The completed model, and by level that of the other levels' states."""
+
+    given: Structure
+    whole: CompletedModel
+    without: dict[int, Structure]
+    refused: tuple[int, ...]  # levels without which there is none
+
+
+def _completed(model: Structure, checked: _Checked) -> _Completed:
+    misfit, fit = checked.misfit, checked.found.fit
+    values = {name: one.value for name, one in checked.parameters.items()}
+    whole = completed_model(model, misfit.baseline_parameters(fit.rows), fit.kinds, values)
+    without = {}
+    for place in held_out_places(misfit) if fit.kinds else ():
+        own, baseline = without_level(misfit, fit, place)
+        of_others = dict(zip(fit.labels, own.tolist(), strict=True))
+        level = int(misfit.level_numbers[place])
+        without[level] = completed_model(model, baseline, fit.kinds, of_others).model
+    there = {level: one for level, one in without.items() if one is not None}
+    refused = tuple(level for level, one in without.items() if one is None)
+    return _Completed(model, whole, there, refused)
+
+
+def _answer(judgement: Judgement, checked: _Checked, completed: _Completed) -> Answer:
+    fit, gain = checked.found.fit, gain_found(checked.misfit, checked.found.fit)
     something = judgement.verdict is not Verdict.NOTHING_MISSING
-    answer = Answer(
+    return Answer(
         effects=fit.kinds if something else (),
-        candidates=found.classes if something else (),
-        parameters=parameters,
+        candidates=checked.found.classes if something else (),
+        parameters=checked.parameters,
         status=fit.status,
-        completed=completed.model,
-        completed_status=completed.status,
-        force_gain=1.0 if force is None else force.value,
+        completed=completed.whole.model,
+        completed_status=completed.whole.status,
+        force_gain=1.0 if gain is None else gain.value,
         probabilities=dict(judgement.probabilities),
     )
-    without, refused = _completed_without_levels(misfit, model, fit)
-    if former is not None:
-        notes.append(what_changed(former, answer.probabilities))
-    if gain is not None and answer.effects:
-        notes.append(
-            f"with the effects found the gain becomes {gain * answer.force_gain:.3g} N/V (before: "
-            f"{gain:.3g})."
-        )
-    notes += notes_on_level_forces(gains, rival, as_recorded)
-    notes += [*judgement.reasons, *_notes_on_noise(found.misfit.predictions)]
-    if levels is None:
-        n = predictions.chosen.n_levels
-        notes.append(
-            f"{n} level{'s' if n > 1 else ''} only: no level can be left out of the fit to test "
-            "the answer."
-        )
-    chosen = misfit.predictions.chosen
-    phase = np.angle(np.asarray(chosen.states.velocity)[:, 0])
-    notes += [*notes_without_phases(chosen, phase, misfit.level_numbers), *predictions.chosen.notes]
-    notes += [*notes_on_stated_parameters(misfit, fit), *notes_on_found_mass(misfit, fit)]
-    notes += _notes_on_answer(model, completed, refused, fit)
-    notes += _notes_on_fits(found)
-    diagnosis = Diagnosis(
-        verdict=judgement.verdict,
-        answer=answer,
-        decide_by=recommendation(
-            found,
-            test,
-            [
-                *([rival.remedy] if rival is not None and gains else []),
-                *(doubt.decide_by for doubt in judgement.open_questions),
-            ],
-            phases=not unknown.any(),
-        ),
-        discriminating_test=test,
-        located=located,
-        gap=Gap(
-            rms_misfit(as_recorded.misfit, as_recorded.baseline),
-            rms_misfit(misfit, fit),
-            *(levels or (None, None)),
-        ),
-        checks=Checks(found.p_value, float(np.sqrt(neighbours)), without),
-        detection_limits=detection_limits(misfit, fit, scales, excluded),
-        table=found.table,
-        notes=tuple(note for note in notes if note),
-        force_misfit=_force_misfit(misfit, found.baseline, fit),
-        data=with_forces_that_acted(data, gains),
-        level_forces=gains,
-    )
-    known = predictions.chosen.noise_stated and force_gain_std == 0 and not unknown.any()
-    # Three effects together can follow most laws: one drawn law may do as well.
-    if not known or not (judgement.verdict is Verdict.UNKNOWN or len(fit.kinds) > _FEW):
-        return diagnosis
-    # Laws of many knots are drawn with few harmonics.
-    law = law_answer(answered.coarse or found, model)
-    return diagnosis if law is None else _with_law(diagnosis, law)
 
 
-def _with_law(diagnosis: Diagnosis, law: LawAnswer) -> Diagnosis:
+def _with_law(diagnosis: Diagnosis, judgement: Judgement, law: LawAnswer) -> Diagnosis:
     """A diagnosis with a drawn law in place of effects that do not explain the data."""
     misfit, nothing = law.misfit, baseline_fit(law.misfit)
     answer = diagnosis.answer._replace(
@@ -236,40 +269,20 @@ def _with_law(diagnosis: Diagnosis, law: LawAnswer) -> Diagnosis:
         completed=law.completed,
         completed_status=CompletedStatus.COMPLETED,
         laws=law.laws,
-        probabilities=_with_probability_of_law(diagnosis.probabilities, law),
+        probabilities=dict(judgement.probabilities),
     )
-    checks = diagnosis.checks._replace(
-        p_value=law.p_value,
-        noise_scale=float(np.sqrt(law.noise)),
-        completed_without=law.completed_without,
-    )
+    gaps = rms_misfit(misfit, nothing), rms_misfit(misfit, law.fit), *(law.levels or (None, None))
     return dataclasses.replace(
         diagnosis,
-        verdict=Verdict.DRAWN,
+        verdict=judgement.verdict,
         answer=answer,
-        decide_by=law.decide_by,
+        recommended=law.decide_by,
         discriminating_test=None,
-        gap=Gap(
-            rms_misfit(misfit, nothing), rms_misfit(misfit, law.fit), *(law.levels or (None, None))
-        ),
-        checks=checks,
-        notes=(*law.notes, *misfit.predictions.chosen.notes),
+        gap=Gap(*gaps),
+        checks=Checks(law.p_value, float(np.sqrt(law.noise)), law.completed_without),
+        notes=(*judgement.reasons, *misfit.predictions.chosen.notes),
         force_misfit=_force_misfit(misfit, nothing, law.fit),
     )
-
-
-def _with_probability_of_law(
-    probabilities: Mapping[str, float], law: LawAnswer
-) -> dict[str, float]:
-    """A law's share of what is outside the library, and of the effects in whose place it stands."""
-    apart = {
-        name: p
-        for name, p in probabilities.items()
-        if name != Verdict.UNKNOWN.value and len(name.split("+")) <= _FEW
-    }
-    outside, own = 1 - sum(apart.values()), "+".join(law.kinds)
-    shares = {own: law.share * outside, Verdict.UNKNOWN.value: (1 - law.share) * outside}
-    return dict(sorted((apart | shares).items(), key=lambda pair: -pair[1]))
 
 
 def excluded_kinds(model: Structure, force_gain_std: float, *, phases: bool) -> set[str]:
@@ -282,40 +295,6 @@ def excluded_kinds(model: Structure, force_gain_std: float, *, phases: bool) -> 
     if not phases:
         excluded |= {kind for kind, effect in EFFECTS.items() if effect.only_phase}
     return excluded
-
-
-def _notes_on_noise(predictions: Predictions) -> list[str]:
-    """What is taken for noise, and for errors of levels, where neither is stated."""
-    notes = []
-    if not predictions.chosen.noise_stated:
-        size = ASSUMED_ERROR * predictions.error_scale
-        notes.append(
-            f"no noise is stated: what is left ({100 * size:.2g} % of velocity, "
-            f"{np.degrees(size):.2g}°) is taken for it, so a good fit proves nothing."
-        )
-    found = predictions.reference.posterior.differing if predictions.reference else (False,) * 4
-    free = np.where(predictions.unstated_levels, predictions.level_sizes, 0.0)
-    units = (100.0, 180 / np.pi, 50.0, 100.0)
-    words = (" % in gain", "° in phase", " % in frequency", " % in damping")
-    seen, allowed = (
-        ", ".join(
-            f"{unit * size:.2g}{word}"
-            for unit, size, word in zip(units, sizes, words, strict=True)
-            if size > 0
-        )
-        for sizes in (np.where(found, free, 0.0), np.where(found, 0.0, free))
-    )
-    if seen:
-        notes.append(
-            f"levels differ by {seen} (1σ), which nobody stated: taken for errors that the states "
-            "of a level share. State them in [measurement] if they are known."
-        )
-    if allowed:
-        notes.append(
-            f"nobody stated by how much levels may be off: {allowed} (1σ) are allowed for. State "
-            "them in [measurement] if they are known."
-        )
-    return notes
 
 
 def _estimates(misfit: WeightedMisfit, fit: EffectFit) -> dict[str, Estimate]:
@@ -331,22 +310,6 @@ def _estimates(misfit: WeightedMisfit, fit: EffectFit) -> dict[str, Estimate]:
     }
 
 
-def _completed_without_levels(
-    misfit: WeightedMisfit, model: Structure, fit: EffectFit
-) -> tuple[dict[int, Structure], list[int]]:
-    """By level: the model completed by the other levels; and the levels where that is none."""
-    found, refused, numbers = {}, [], misfit.level_numbers
-    for place in held_out_places(misfit) if fit.kinds else ():
-        values, baseline = without_level(misfit, fit, place)
-        own, level = dict(zip(fit.labels, values.tolist(), strict=True)), int(numbers[place])
-        completed = completed_model(model, baseline, fit.kinds, own)
-        if completed.model is None:
-            refused.append(level)
-        else:
-            found[level] = completed.model
-    return found, refused
-
-
 def _force_misfit(misfit: WeightedMisfit, baseline: EffectFit, fit: EffectFit) -> ForceMisfit:
     noise, chosen = misfit.noise, misfit.predictions.chosen
     mine = noise.column < 2
@@ -360,30 +323,42 @@ def _force_misfit(misfit: WeightedMisfit, baseline: EffectFit, fit: EffectFit) -
     return ForceMisfit(chosen.rows[used], chosen.sensors[0], left_of(baseline), left_of(fit))
 
 
-def _notes_on_answer(
-    model: Structure,
-    completed: CompletedModel,
-    refused: list[int],
-    fit: EffectFit,
-) -> list[str]:
-    notes = []
-    shift = _frequency_shift(model, completed.model or model)
+def _notes_on_data(checked: _Checked) -> Iterator[Fact | str]:
+    """What is taken for noise and for errors of levels where these are not stated, and phases."""
+    predictions = checked.found.misfit.predictions
+    if not predictions.chosen.noise_stated:
+        yield Fact("noise_not_stated", size=ASSUMED_ERROR * predictions.error_scale)
+    differing = predictions.reference.posterior.differing if predictions.reference else (False,) * 4
+    free = np.where(predictions.unstated_levels, predictions.level_sizes, 0.0)
+    for of_data, which in ((True, differing), (False, ~np.array(differing))):
+        gain, phase, stiffness, damping = sizes = np.where(which, free, 0.0).tolist()
+        if any(sizes):
+            shares = {"gain": gain, "frequency": 0.5 * stiffness, "damping": damping}
+            yield Fact("levels_not_stated", phase=phase, **shares, of_data=of_data)
+    chosen = checked.misfit.predictions.chosen
+    if checked.levels is None:
+        yield Fact("no_level_left_out", n_levels=chosen.n_levels)
+    phase = np.angle(np.asarray(chosen.states.velocity)[:, 0])
+    yield from notes_without_phases(chosen, phase, checked.misfit.level_numbers)
+    yield from chosen.notes
+
+
+def _notes_on_answer(checked: _Checked, completed: _Completed) -> Iterator[Fact]:
+    misfit, fit = checked.misfit, checked.found.fit
+    yield from notes_on_gains(misfit, fit)
+    shift = _frequency_shift(completed.given, completed.whole.model or completed.given)
     if abs(shift) > priors.OTHER_MODE:
-        notes.append(
-            f"the model's natural frequency is off by {100 * shift:.0f} %: are these measurements "
-            "of another mode?"
-        )
-    if completed.status is CompletedStatus.NOT_PHYSICAL:
-        notes.append(
-            f"there is no completed model: {completed.reason} The parameters that fit best are "
-            "none that a structure can have."
-        )
-    if refused:
-        levels = " and ".join(str(level) for level in refused)
-        notes.append(f"without level {levels} the parameters are none that a structure can have.")
+        yield Fact("frequency_off", share=shift)
+    if completed.whole.reason:
+        yield Fact("not_physical", reason=completed.whole.reason)
+    if completed.refused:
+        yield Fact("not_physical_without", levels=completed.refused)
     if not (fit.status.found_minimum or fit.status is MinimisationStatus.NOT_FITTED):
-        notes.append("the fit of the answer itself had not converged when it ended.")
-    return notes
+        yield Fact("answer_not_converged")
+    rows = [row for step in checked.found.table for row in step]
+    lost = {row.kind for row in rows if row.status is MinimisationStatus.NOT_FINITE}
+    if lost:
+        yield Fact("effects_not_fitted", effects=tuple(sorted(lost)))
 
 
 def _frequency_shift(model: Structure, completed: Structure) -> float:
@@ -394,14 +369,3 @@ def _frequency_shift(model: Structure, completed: Structure) -> float:
     before, after = model.linear_terms(), changed.linear_terms()
     square = after.stiffness[j] / before.stiffness[j] * (before.mass[j] / after.mass[j])
     return float(jnp.sqrt(square)) - 1
-
-
-def _notes_on_fits(found: FoundEffects) -> list[str]:
-    rows = [row for step in found.table for row in step]
-    lost = sorted({row.kind for row in rows if row.status is MinimisationStatus.NOT_FINITE})
-    if not lost:
-        return []
-    return [
-        f"{', '.join(lost)} could not be fitted: with no starting point does the model have the "
-        "measured motions."
-    ]

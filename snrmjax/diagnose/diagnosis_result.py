@@ -1,7 +1,6 @@
 """What a diagnosis finds: the answer, how well it is known, and what would decide what is open."""
 
 import dataclasses
-import textwrap
 from collections.abc import Iterable, Mapping
 from enum import StrEnum
 from typing import ClassVar, NamedTuple
@@ -12,9 +11,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from snrmjax.diagnose import priors
-from snrmjax.diagnose.checks.gains import LevelGain, level_forces_sentence
+from snrmjax.diagnose.checks.gains import LevelGain
 from snrmjax.diagnose.checks.residuals import HeldOut
-from snrmjax.diagnose.decide import Verdict, verdict_sentence
+from snrmjax.diagnose.decide import Verdict
 from snrmjax.diagnose.design.discriminating_test import DiscriminatingTest
 from snrmjax.diagnose.laws.law_search import DrawnLaw
 from snrmjax.diagnose.search.locating import Located
@@ -23,6 +22,7 @@ from snrmjax.measure.states import SteadyStates
 from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
 from snrmjax.model.parameters import parameter_rules, with_parameters
 from snrmjax.model.structures import Structure
+from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
 from snrmjax.numerics.result import AbstractResult, Variable
 from snrmjax.numerics.rules import Rule
@@ -127,22 +127,22 @@ class ForceMisfit(NamedTuple):
 class Diagnosis(AbstractResult):
     """What a model lacks, how well that is known, and what would decide what is open."""
 
+    coordinates: ClassVar[tuple[str, ...]] = ("candidate", "part", "parameter")
+
     verdict: Verdict
     answer: Answer
-    decide_by: str | None
-    discriminating_test: DiscriminatingTest | None  # of `decide_by`, where one was compared
+    recommended: Fact | None  # the measurements that would decide what is open
+    discriminating_test: DiscriminatingTest | None  # of these, where one was compared
     located: tuple[Located, ...]
     gap: Gap
     checks: Checks
     detection_limits: dict[str, float]
     table: tuple[tuple[TriedEffect, ...], ...]  # what each step of the search compared
-    notes: tuple[str, ...]
+    notes: tuple[Fact | str, ...]
     force_misfit: ForceMisfit
     data: SteadyStates  # as they were compared: in N, where a drive voltage was given
     # Of levels whose force was recorded in a wrong scale: the acting one over it.
     level_forces: dict[int, LevelGain] = eqx.field(default_factory=dict)
-
-    coordinates: ClassVar[tuple[str, ...]] = ("candidate", "part", "parameter")
 
     @property
     def effects(self) -> tuple[str, ...]:
@@ -184,56 +184,57 @@ class Diagnosis(AbstractResult):
         return self.answer.completed
 
     @property
+    def decide_by(self) -> str | None:
+        """The measurements that would decide what is open, in words."""
+        return None if self.recommended is None else str(self.recommended)
+
+    @property
     def verdict_sentence(self) -> str:
         """The verdict in one plain sentence."""
-        before, after = self.gap.before, self.gap.after
-        names = [[law.name] for law in self.answer.laws] or self.candidates
-        sentence = verdict_sentence(Verdict(self.verdict), names, before, after)
-        return f"{level_forces_sentence(self.level_forces)} {sentence}".strip()
+        levels = [
+            Fact("level_force", level=level, gain=gain.value, std=gain.std)
+            for level, gain in self.level_forces.items()
+        ]
+        verdict = Fact(
+            "verdict",
+            verdict=Verdict(self.verdict).value,
+            classes=self.candidates,
+            laws=tuple(law.name for law in self.answer.laws),
+            misfit_before=self.gap.before,
+            misfit=self.gap.after,
+        )
+        return " ".join(map(str, (*levels, verdict)))
+
+    def most_probable(self) -> Fact:
+        """The answers with the largest probabilities, each once."""
+        listed = tuple((name, p) for name, p in list(self.probabilities.items())[:5] if p >= 0.01)
+        return Fact("most_probable", verdict=self.probability, answers=listed)
 
     def summary(self) -> tuple[str, ...]:
-        """See `AbstractResult.summary`."""
+        """See `AbstractResult`."""
         gap, inner, outer = self.gap, self.gap.interpolated, self.gap.extrapolated
-        lines = [f"Diagnosis: {self.verdict_sentence}"]
-        lines += textwrap.wrap(f"probability: {self.most_probable()}", 98)
-        for name, (value, std) in self.parameters.items():
-            stated = unit_of(name)
-            unit = "" if stated == "1" else stated
-            lines.append(f"{name} = {value:.4g} ± {std:.2g} {unit}".rstrip())
-        lines.append(f"misfit: {gap.before:.3g} before, {gap.after:.3g} after, in units of noise")
-        if self.parameters and gap.after > priors.AS_NOISE:
-            lines[-1] += "; the ± above holds only if the noise is as stated"
-        lines += [
-            f"level {out.level}, left out: {out.before:.3g} before, {out.after:.3g} after"
-            for out in (inner, outer)
-            if out is not None
+        unsure = bool(self.parameters) and gap.after > priors.AS_NOISE
+        ended = self.answer.completed_status
+        lines = [
+            Fact("probability_of_verdict", probability=self.most_probable()),
+            *(
+                Fact("parameter_found", name=name, unit=unit_of(name), **pair._asdict())
+                for name, pair in self.parameters.items()
+            ),
+            Fact("misfits", before=gap.before, after=gap.after, unsure=unsure),
+            *(
+                Fact("level_left_out", level=out.level, before=out.before, after=out.after)
+                for out in (inner, outer)
+                if out is not None
+            ),
+            *([] if self.recommended is None else [Fact("to_decide", by=self.recommended)]),
+            Fact("diagnosis_ended", fit=self.answer.status.value, completed=ended.value),
+            *(Fact("diagnosis_note", note=note) for note in self.notes),
         ]
-        if self.decide_by:
-            lines.append(f"to decide: {self.decide_by}")
-        status = f"fit {self.answer.status.value.replace('_', ' ')}"
-        if self.answer.completed_status is CompletedStatus.NOTHING_ADDED:
-            status = "nothing was added to the model"
-        elif self.answer.completed_status is CompletedStatus.NOT_PHYSICAL:
-            status += ", but no structure can have these parameters: there is no completed model"
-        lines.append(f"status: {status}")
-        if self.notes:
-            lines.append("notes:")
-            for note in self.notes:
-                lines += textwrap.wrap(note, 98, initial_indent="- ", subsequent_indent="  ")
-        return tuple(lines)
-
-    def most_probable(self) -> str:
-        """The answers with the largest probabilities, each once."""
-        least = 0.01
-        listed = [
-            f"{name.replace('+', ' with ')} {probability_in_words(value)}"
-            for name, value in list(self.probabilities.items())[:5]
-            if value >= least
-        ]
-        return f"{probability_in_words(self.probability)} of this verdict ({', '.join(listed)})"
+        return (f"Diagnosis: {self.verdict_sentence}", *map(str, lines))
 
     def variables(self) -> Mapping[str, Variable]:
-        """See `AbstractResult.variables`."""
+        """See `AbstractResult`."""
         tried = [(number + 1, row) for number, step in enumerate(self.table) for row in step]
         rows = [row for _, row in tried]
         powers = [
@@ -267,7 +268,7 @@ class Diagnosis(AbstractResult):
         }
 
     def attributes(self) -> Mapping[str, str | float | int]:
-        """See `AbstractResult.attributes`."""
+        """See `AbstractResult`."""
         return {
             "verdict": self.verdict.value,
             "verdict_sentence": self.verdict_sentence,
@@ -277,7 +278,7 @@ class Diagnosis(AbstractResult):
             "gap_before": self.gap.before,
             "gap_after": self.gap.after,
             "p_value_of_fit": self.checks.p_value,
-            "notes": " ".join(self.notes),
+            "notes": " ".join(map(str, self.notes)),
         }
 
 
@@ -285,17 +286,6 @@ def unit_of(parameter: str) -> str:
     """The unit of a parameter, named by its effect and itself; "" where none is stated."""
     kind, _, name = parameter.partition(".")
     return EFFECTS[kind].parameters()[name].unit if kind in EFFECTS else ""
-
-
-def probability_in_words(probability: float) -> str:
-    """A probability in per cent, never rounded to certainty.
-
-    >>> probability_in_words(0.937), probability_in_words(0.9999)
-    ('94 %', 'above 99 %')
-    """
-    if 0.005 <= probability <= 0.995:
-        return f"{100 * probability:.0f} %"
-    return "below 1 %" if probability < 0.5 else "above 99 %"
 
 
 def _texts(texts: Iterable[str]) -> np.ndarray:
@@ -311,24 +301,18 @@ class FormerAnswer(NamedTuple):
     probabilities: Mapping[str, float]  # of the answers considered
     starts: Mapping[str, tuple[float, ...]]  # parameters of every effect that was compared
 
-
-def what_changed(former: FormerAnswer, probabilities: Mapping[str, float]) -> str:
-    """What further states did to the answers that were likely before, in one sentence."""
-    least = 0.05  # of a probability that is mentioned
-    likely = [name for name, p in former.probabilities.items() if p >= least]
-    both = [
-        f"{name} {100 * former.probabilities[name]:.0f} % → "
-        f"{100 * probabilities.get(name, 0):.0f} %"
-        for name in dict.fromkeys([*likely, *list(probabilities)[:1]])
-        if name in former.probabilities
-    ]
-    new = [
-        f"{name} now {100 * p:.0f} %"
-        for name, p in probabilities.items()
-        if p >= least and name not in former.probabilities
-    ]
-    before = " and ".join(former.effects) or "no effect"
-    return (
-        f"before the further states the verdict was {former.verdict} ({before}). Probabilities: "
-        f"{', '.join([*both, *new])}."
-    )
+    def changed_to(self, probabilities: Mapping[str, float]) -> Fact:
+        """What further states did to the answers that were likely before, or are now."""
+        least, before = 0.05, self.probabilities
+        likely = [name for name, p in before.items() if p >= least]
+        likely += [name for name in list(probabilities)[:1] if name in before]
+        likely += [name for name, p in probabilities.items() if p >= least and name not in before]
+        return Fact(
+            "answer_before",
+            verdict=self.verdict,
+            effects=self.effects,
+            probabilities=tuple(
+                (name, before.get(name), probabilities.get(name, 0.0))
+                for name in dict.fromkeys(likely)
+            ),
+        )

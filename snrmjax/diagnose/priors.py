@@ -45,6 +45,11 @@ MOST_NOISE = float(np.log(4.0))
 DISCREPANCY_SIZES = (0.3, 100.0)
 """Root-mean-square size of a discrepancy in units of noise, between which its logarithm is flat."""
 
+# --- levels of confidence, in 1σ of a normal distribution
+
+BAND, ONE_SIDED = 1.96, 1.64
+"""Of 95 % between two limits, and of 95 % beyond one."""
+
 # --- decisions
 
 NO_ANSWER = 0.9

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from snrmjax.doctor.corrections import TestCorrection, corrections
-from snrmjax.doctor.findings import Checkup, Finding, gravest_first, percent, rows_in_words
+from snrmjax.doctor.findings import Checkup, Finding, Severity, gravest_first
 from snrmjax.doctor.force_checks import deepest_fall, dropout_findings, harmonic_findings
 from snrmjax.doctor.judgement import (
     CheckedStates,
@@ -19,10 +19,10 @@ from snrmjax.doctor.priors import FEWEST_STATES, FITS_WELL, GAIN_MATTERS, MOVED_
 from snrmjax.doctor.readings import OPPOSITE, best_reading, misread
 from snrmjax.doctor.record_checks import record_findings
 from snrmjax.doctor.scale_findings import is_other_scale, scale_findings, shaker_damping
-from snrmjax.identify.test_model.states import TestStates
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.states import SteadyStates, join_steady_states
 from snrmjax.model.structures import Structure
+from snrmjax.numerics.facts import Fact
 
 
 def check_test(
@@ -58,58 +58,45 @@ def check_test(
     if not given and not recordings:
         raise ValueError("there is nothing to check: give a table or a recording.")
     found: list[Finding] = []
-    notes: list[str] = []
+    notes: list[Fact] = []
     if given:
         parts, groups = files_of_levels(given)
         data = parts[0] if len(parts) == 1 else join_steady_states(parts)
         found += _of_table(data, model, groups if len(parts) > 1 else (), notes)
+        if model is None:
+            notes.append(Fact("no_model"))
     else:
-        notes.append("no table of steady states: columns and scales were not looked at.")
-    if given and model is None:
-        notes.append("no model: the scale of force, response and shape was not looked at.")
+        notes.append(Fact("no_table"))
     for one in recordings:
-        own, said = record_findings(one)
+        own, unseen = record_findings(one)
         found += own
-        notes += said
-    return Checkup(gravest_first(_once(found)), tuple(dict.fromkeys(notes)))
+        notes += unseen
+    return Checkup(gravest_first(found), tuple(dict.fromkeys(notes)))
 
 
 def _of_table(
     data: SteadyStates,
     model: Structure | None,
     groups: tuple[tuple[int, ...], ...],
-    notes: list[str],
+    notes: list[Fact],
 ) -> list[Finding]:
     sensor = leading_sensor(data)
     rows = usable_rows(data, sensor)
-    name = data.sensors[sensor]
-    n_levels = len(given_levels(data))
+    name, n_levels = data.sensors[sensor], len(np.unique(np.asarray(data.level)))
     where = f"{n_levels} level{'s' if n_levels != 1 else ''} at {name}"
-    if rows.sum() < FEWEST_STATES:
-        notes.append(
-            f"{int(rows.sum())} states with force and phase at {name} are too few to look at: "
-            f"{FEWEST_STATES} are needed."
-        )
+    n_states = int(rows.sum())
+    if n_states < FEWEST_STATES:
+        notes.append(Fact("too_few_states", n_states=n_states, sensor=name, needed=FEWEST_STATES))
         return []
     drive = bool(np.all(np.isnan(np.asarray(data.force)[rows])))
     if drive:
-        notes.append("the force is declared as a drive voltage: its scale was not looked at.")
+        notes.append(Fact("drive_not_scaled"))
     seen = checked_states(data, model, sensor, rows, groups)
     found, fit = mode_findings(seen, model, where, drive)
     found += dropout_findings(seen, where)
     if data.harmonic_order and not any(one.severity == "error" for one in found):
         found += harmonic_findings(data, seen, fit, model, sensor, where)
     return found
-
-
-def given_levels(data: SteadyStates) -> tuple[int, ...]:
-    """Numbers of the levels of a table."""
-    return tuple(int(k) for k in np.unique(np.asarray(data.level)))
-
-
-def _once(found: Sequence[Finding]) -> list[Finding]:
-    """One finding of each kind and place."""
-    return list({(one.kind, one.where): one for one in reversed(found)}.values())[::-1]
 
 
 def mode_findings(
@@ -137,10 +124,10 @@ def mode_findings(
             base, first = scale.judged, None
     if first is None:
         first = _likeliest(seen, base)
-        first = first if first is not None and _told(first, base) else None
+        first = first if first is not None and _beats(first, base) else None
     plain = all(one.kind in ("rms_for_peak", "shape_not_mass_normalised") for one in found)
     if first is not None:
-        found.append(_mended(seen, base, first, where))
+        found.append(_finding(seen, base, first, where))
         base = first.judged
     if model is not None and not drive and plain:
         found += shaker_damping(base, model, where)
@@ -159,7 +146,7 @@ def _likeliest(seen: CheckedStates, base: Judged) -> TestCorrection | None:
     return max(mattering, key=lambda one: one.judged.evidence, default=None)
 
 
-def _told(one: TestCorrection, base: Judged) -> bool:
+def _beats(one: TestCorrection, base: Judged) -> bool:
     """Whether a correction beats the table as it is read."""
     if one.kind == "force_dropout":  # the noise of a cell is no misfit
         return one.judged.noise < FITS_WELL and one.judged.explains(base)
@@ -177,90 +164,59 @@ def _matters(one: TestCorrection, base: Judged) -> bool:
     return one.kind != "force_dropout" or one.value < base.states.force.min()
 
 
-def _mended(seen: CheckedStates, base: Judged, one: TestCorrection, where: str) -> Finding:
+def _finding(seen: CheckedStates, base: Judged, one: TestCorrection, where: str) -> Finding:
+    """What a correction undoes, as a finding."""
     states = base.states
-    left = (
-        f"; so read a state is missed by {percent(one.judged.misfit)}, not {percent(base.misfit)}."
-    )
-    if one.kind == "drift":
-        return Finding(
-            *("drift", "warning", where),
-            f"from the first to the last state the natural frequency changes by "
-            f"{100 * one.value:.3g} %{left}",
-            "repeat a level at the end of the test, let the temperature settle, or correct along "
-            "`order`.",
-        )
-    if one.kind == "different_structures":
-        return Finding(
-            *("different_structures", "error", where),
-            f"at equal amplitude the natural frequency of {one.name} is {100 * one.value:.3g} % "
-            f"from {'file 1' if len(seen.files) == 2 else 'the others'}'s{left}",
-            "identify them apart: one call and one model for each structure or assembly.",
-        )
-    if one.kind == "volts_as_force":
-        return _of_gains(one, where, left, seen.files)
-    if one.kind == "force_dropout":
-        return Finding(
-            *("force_dropout", "warning", where),
-            f"at resonance the force falls by {percent(deepest_fall(states))} into the noise of "
-            f"its cell, about {one.value:.2g} N, {percent(one.value / states.force.min())} of the "
-            "smallest.",
-            "drive harder at resonance, average longer or use a more sensitive cell.",
-        )
-    if one.kind == "unsettled_steps":
-        return Finding(
-            *("unsettled_steps", "error", where),
-            f"about {percent(one.value)} of a change is left at the end of a step{left}",
-            "dwell longer, 5/(ζω) a step; or import the time record, whose unsettled steps are "
-            "left out.",
-        )
-    return _clipping(seen, states, one, where, left)
+    severity: Severity = "error"
+    misses = {"misfit": one.judged.misfit, "misfit_before": base.misfit}
+    rows: tuple[int, ...] = ()
+    title = None
+    match one.kind:
+        case "drift":
+            severity = "warning"
+            evidence, mend = Fact("drift", change=one.value, **misses), Fact("mend_drift")
+        case "different_structures":
+            n = len(seen.files)
+            evidence = Fact(
+                "structures_differ", file=one.file, change=one.value, n_files=n, **misses
+            )
+            mend = Fact("mend_structures")
+        case "volts_as_force":
+            evidence, mend, title = _of_gains(one, misses, seen.files)
+        case "force_dropout":
+            severity, mend = "warning", Fact("mend_force_in_noise")
+            evidence = Fact(
+                "force_in_noise",
+                fall=deepest_fall(states),
+                floor=one.value,
+                smallest=float(states.force.min()),
+            )
+        case "unsettled_steps":
+            evidence = Fact("states_unsettled", share=one.value, **misses)
+            mend = Fact("mend_unsettled")
+        case _:
+            size = states.force if one.column == "force" else np.abs(states.velocity)
+            rows = tuple(int(seen.row[k]) for k in np.flatnonzero(size > one.value * 0.999))
+            mend, limited = Fact("mend_clipped_states"), {"column": one.column, "rows": rows}
+            evidence = Fact("states_clipped", limit=one.value, **limited, **misses)
+    return Finding(one.kind, severity, where, evidence, mend, rows, title=title)
 
 
 def _of_gains(
-    one: TestCorrection, where: str, left: str, files: tuple[tuple[int, ...], ...]
-) -> Finding:
-    """Forces whose scale is not the same at all levels; by name where a few of them are off."""
+    one: TestCorrection, misses: dict[str, float], files: tuple[tuple[int, ...], ...]
+) -> tuple[Fact, Fact, Fact | None]:
+    """Forces whose scale is not the same at all levels; by number where a few of them are off."""
     gains = np.array(one.gains)
-    away = np.abs(gains - np.median(gains))
-    few = np.flatnonzero(away > 0.5 * GAIN_MATTERS)
+    few = np.flatnonzero(np.abs(gains - np.median(gains)) > 0.5 * GAIN_MATTERS)
     if not len(few) or 2 * len(few) >= len(gains):
-        listed = ", ".join(f"{factor:.3g}" for factor in np.exp(gains[1:] - gains[0]))
-        return Finding(
-            *("volts_as_force", "error", where),
-            f"the force over that of the first level is off by the factors {listed} at levels 2 "
-            f"and on{left}",
-            "measure the force, or calibrate the drive at each level.",
-        )
-    factors = np.exp(gains - np.median(np.delete(gains, few)))
-    names = [
-        f"level {k + 1}" + (f" (file {files.index((k,)) + 1})" if (k,) in files else "")
-        for k in few
-    ]
-    said = [
-        f"the force of {name} is {factors[k]:.3g} times" for name, k in zip(names, few, strict=True)
-    ]
-    numbers = [f"level {k + 1} by {factors[k]:.3g}" for k in few]
-    return Finding(
-        *("volts_as_force", "error", where),
-        f"{' and '.join(said)} what the other levels ask for{left}",
-        "if the column is a voltage, measure the force; else another range or calibration was set "
-        f"there: divide the force of {' and of '.join(numbers)} in the file that it comes from.",
-        title=f"force on another scale at level {' and '.join(str(k + 1) for k in few)}",
+        factors = tuple(np.exp(gains[1:] - gains[0]).tolist())
+        return Fact("force_gains_differ", gains=factors, **misses), Fact("mend_force_gains"), None
+    factors = np.exp(gains - np.median(np.delete(gains, few))).tolist()
+    levels = tuple(
+        (k + 1, files.index((k,)) + 1 if (k,) in files else None, factors[k]) for k in few.tolist()
     )
-
-
-def _clipping(
-    seen: CheckedStates, states: TestStates, one: TestCorrection, where: str, left: str
-) -> Finding:
-    force = one.name == "force"
-    size = states.force if force else np.abs(states.velocity)
-    rows = tuple(int(seen.row[k]) for k in np.flatnonzero(size > one.value * 0.999))
-    return Finding(
-        *("clipped_channel", "error", where),
-        f"the {'force' if force else 'response'} is cut off at about {one.value:.4g} "
-        f"{'N' if force else 'm/s'} in {len(rows)} states ({rows_in_words(rows)}){left}",
-        "lower the channel's gain or range and measure these states again; leave them out until "
-        "then.",
-        rows,
+    return (
+        Fact("level_gains", gains=levels, **misses),
+        Fact("mend_level_gains", gains=levels),
+        Fact("levels_on_another_scale", levels=tuple(level for level, *_ in levels)),
     )

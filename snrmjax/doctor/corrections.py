@@ -9,14 +9,7 @@ from jaxtyping import Float
 from snrmjax.doctor.findings import Kind
 from snrmjax.doctor.force_checks import deepest_fall
 from snrmjax.doctor.judgement import CheckedStates, Judged, judge, likelier
-from snrmjax.doctor.priors import (
-    CLEARLY,
-    FORCE_FALLS,
-    GAIN_MATTERS,
-    MOVES,
-    OTHER_GAIN,
-    SCATTER,
-)
+from snrmjax.doctor.priors import CLEARLY, FORCE_FALLS, GAIN_MATTERS, MOVES, OTHER_GAIN, SCATTER
 from snrmjax.identify.test_model.states import TestStates
 
 
@@ -24,10 +17,11 @@ class TestCorrection(NamedTuple):
     """A table read with one thing undone."""
 
     kind: Kind
-    name: str  # which of that kind
     judged: Judged
     value: float = np.nan  # its own parameter
     gains: tuple[float, ...] = ()  # ln of each level's force over what it should be
+    file: int = 0  # that is of another structure, from 1
+    column: str = ""  # that is cut off: "response" or "force"
 
 
 def corrections(seen: CheckedStates, states: TestStates, base: Judged) -> Iterator[TestCorrection]:
@@ -35,18 +29,18 @@ def corrections(seen: CheckedStates, states: TestStates, base: Judged) -> Iterat
 
     Arguments: `states` as they are read; `base` how they fit.
     """
-    yield _moving("drift", "frequency", states, base, seen.order - 0.5)
+    yield TestCorrection("drift", *_moving(states, base, seen.order - 0.5))
     for k, levels in enumerate(seen.files):
         if k > 0 or len(seen.files) > 2:  # of two the first differs as the second from it
-            own = np.isin(states.level, levels)
-            along = own - float(np.mean(own))
-            yield _moving("different_structures", f"file {k + 1}", states, base, along)
+            member = np.isin(states.level, levels)
+            moved = _moving(states, base, member - float(np.mean(member)))
+            yield TestCorrection("different_structures", *moved, file=k + 1)
     gains = base.posterior.level_errors[:, 0]
     if states.n_levels > 1 and (base.misfit > SCATTER or np.ptp(gains) > GAIN_MATTERS):
         std = (OTHER_GAIN, *states.level_std[1:])
         judged = _freer(states._replace(force_is_free=True, level_std=std), base)
         gains = judged.posterior.level_errors[:, 0]
-        yield TestCorrection("volts_as_force", "gain_of_level", judged, gains=tuple(gains.tolist()))
+        yield TestCorrection("volts_as_force", judged, gains=tuple(gains.tolist()))
     yield from _clipped(states, base)
     yield from _unsettled(seen, states, base)
     yield from _noisy_force(states, base)
@@ -57,12 +51,10 @@ def _freer(states: TestStates, base: Judged) -> Judged:
     return likelier((judge(states), judge(states, start=base)))
 
 
-def _moving(
-    kind: Kind, name: str, states: TestStates, base: Judged, along: np.ndarray
-) -> TestCorrection:
-    """A natural frequency that changes in proportion to something, by `value` (relative)."""
+def _moving(states: TestStates, base: Judged, along: np.ndarray) -> tuple[Judged, float]:
+    """A natural frequency that changes in proportion to something, and by how much (relative)."""
     judged = _freer(states._replace(trend=along, trend_std=MOVES), base)
-    return TestCorrection(kind, name, judged, 0.5 * judged.posterior.trend[0])
+    return judged, 0.5 * judged.posterior.trend[0]
 
 
 class Tried(NamedTuple):
@@ -100,10 +92,12 @@ def _clipped(states: TestStates, base: Judged) -> Iterator[TestCorrection]:
         moved = states._replace(velocity=states.velocity * true / size, errors=errors)
         tried.append(Tried(limit, moved, float(np.sum(np.log(stretch)))))
     value, judged = likeliest(base, tried)
-    yield TestCorrection("clipped_channel", "velocity", judged, value * float(size.max()))
+    value *= float(size.max())
+    yield TestCorrection("clipped_channel", judged, value, column="response")
     undone = [states._replace(force=unclipped(force, x * force.max())[0]) for x in limits]
     value, judged = likeliest(base, [Tried(*pair) for pair in zip(limits, undone, strict=True)])
-    yield TestCorrection("clipped_channel", "force", judged, value * float(force.max()))
+    value *= float(force.max())
+    yield TestCorrection("clipped_channel", judged, value, column="force")
 
 
 def unclipped(
@@ -152,7 +146,7 @@ def _unsettled(seen: CheckedStates, states: TestStates, base: Judged) -> Iterato
         moved = states._replace(velocity=true, errors=errors)
         tried.append(Tried(share, moved, 2 * float(np.sum(np.log(stretch)))))
     value, judged = likeliest(base, tried)
-    yield TestCorrection("unsettled_steps", "turning", judged, value)
+    yield TestCorrection("unsettled_steps", judged, value)
 
 
 def _noisy_force(states: TestStates, base: Judged) -> Iterator[TestCorrection]:
@@ -166,4 +160,4 @@ def _noisy_force(states: TestStates, base: Judged) -> Iterator[TestCorrection]:
         errors = np.hypot(states.errors, np.stack([floor, 0 * floor, floor], axis=1))
         tried.append(Tried(ratio, states._replace(errors=errors)))
     ratio, judged = likeliest(base, tried)
-    yield TestCorrection("force_dropout", "floor", judged, ratio * least * judged.noise)
+    yield TestCorrection("force_dropout", judged, ratio * least * judged.noise)

@@ -1,4 +1,4 @@
-"""What the doctor finds, and how it says it."""
+"""What the doctor finds: kinds, severities, and what an import does about them."""
 
 from collections.abc import Sequence
 from typing import ClassVar, Literal, NamedTuple, get_args
@@ -6,7 +6,8 @@ from typing import ClassVar, Literal, NamedTuple, get_args
 import equinox as eqx
 import numpy as np
 
-from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.result import AbstractResult, Variable, setting
 
 Severity = Literal["error", "warning", "info"]
 
@@ -33,7 +34,6 @@ KINDS: tuple[str, ...] = get_args(Kind)
 
 FORCE_HARMONICS: Kind = "force_harmonics"
 """Of the force that was measured; an effect of the model has this name, too."""
-
 
 _MEANINGS = {
     "kind": "what is wrong",
@@ -66,20 +66,20 @@ class Finding(NamedTuple):
     kind: Kind
     severity: Severity
     where: str  # file, level, rows or channel
-    evidence: str  # one fact in numbers
-    mend: str  # the line or option that mends it
+    evidence: Fact | str
+    mend: Fact | str  # the line or option that mends it
     rows: tuple[int, ...] = ()
     repairs: tuple[Repair, ...] = ()  # that an import can do, the likeliest first
-    title: str = ""  # where the kind is wider than what was found
+    title: Fact | None = None  # where the kind is wider than what was found
 
     @property
     def name(self) -> str:
         """What a reader is told first."""
-        return self.title or self.kind.replace("_", " ")
+        return str(self.title or self.kind.replace("_", " "))
 
     def as_dict(self) -> dict[str, str]:
         """What `check.json` has of it."""
-        return {name: getattr(self, name) for name in _MEANINGS}
+        return {name: str(getattr(self, name)) for name in _MEANINGS}
 
 
 class Checkup(AbstractResult):
@@ -91,25 +91,25 @@ class Checkup(AbstractResult):
     coordinates: ClassVar[tuple[str, ...]] = ("finding",)
 
     findings: tuple[Finding, ...] = eqx.field(static=True, default=())
-    notes: tuple[str, ...] = eqx.field(static=True, default=())
+    notes: tuple[Fact, ...] = setting(default=())
 
     def summary(self) -> tuple[str, ...]:
         """See `AbstractResult`."""
-        n = len(self.findings)
+        n, line = len(self.findings), "{severity}: {kind} in {where}: {evidence} Mend: {mend}"
         return (
             f"Checkup: {n} finding{'s' if n != 1 else ''}" if n else "Checkup: nothing found",
-            *(line(one) for one in self.findings),
+            *(line.format(**one.as_dict()) for one in self.findings),
             *(f"note: {note}" for note in self.notes),
         )
 
     def variables(self) -> dict[str, Variable]:
         """See `AbstractResult`; a row a finding."""
-        at = ("finding",)
-        found = {"finding": Variable(at, np.arange(len(self.findings)), "1", "number")}
-        for name, meaning in _MEANINGS.items():
-            values = np.array([getattr(one, name) for one in self.findings], dtype=str)
-            found[name] = Variable(at, values, "", meaning)
-        return found
+        at, said = ("finding",), [one.as_dict() for one in self.findings]
+        number = Variable(at, np.arange(len(said)), "1", "number")
+        return {"finding": number} | {
+            name: Variable(at, np.array([one[name] for one in said], dtype=str), "", meaning)
+            for name, meaning in _MEANINGS.items()
+        }
 
     @property
     def kinds(self) -> tuple[str, ...]:
@@ -117,23 +117,10 @@ class Checkup(AbstractResult):
         return tuple(one.kind for one in self.findings)
 
 
-def line(one: Finding) -> str:
-    """A finding in one line."""
-    return f"{one.severity}: {one.kind} in {one.where}: {one.evidence} Mend: {one.mend}"
-
-
 def gravest_first(findings: Sequence[Finding]) -> tuple[Finding, ...]:
-    """Findings by severity, otherwise in their order."""
+    """Findings by severity, otherwise in their order; one of each kind and place."""
     ranks = get_args(Severity)
-    return tuple(sorted(findings, key=lambda one: ranks.index(one.severity)))
-
-
-def percent(share: float) -> str:
-    """A share in per cent."""
-    return f"{100 * share:.2g} %" if share < 0.995 else "100 % or more"
-
-
-def rows_in_words(rows: Sequence[int], most: int = 6) -> str:
-    """Rows as a table's reader counts them, from 1 below the header."""
-    shown = ", ".join(str(k + 1) for k in rows[:most])
-    return f"rows {shown}{' and others' if len(rows) > most else ''}"
+    once: dict[tuple[str, str], Finding] = {}
+    for one in findings:
+        once.setdefault((one.kind, one.where), one)
+    return tuple(sorted(once.values(), key=lambda one: ranks.index(one.severity)))

@@ -5,12 +5,13 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Int
 
-from snrmjax.doctor.findings import FORCE_HARMONICS, Finding, percent, rows_in_words
+from snrmjax.doctor.findings import FORCE_HARMONICS, Finding
 from snrmjax.doctor.judgement import CheckedStates, Judged
 from snrmjax.doctor.priors import CERTAIN, CLEARLY, FORCE_FALLS, FORCE_HARMONIC, HELD, TOGETHER
 from snrmjax.identify.test_model.states import TestStates
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.structures import Structure
+from snrmjax.numerics.facts import Fact
 
 
 def dropout_findings(seen: CheckedStates, where: str) -> list[Finding]:
@@ -27,17 +28,10 @@ def dropout_findings(seen: CheckedStates, where: str) -> list[Finding]:
         return []
     worst, at = max(dropped, key=lambda one: one[0])
     rows = tuple(int(seen.row[j]) for j in at)
-    return [
-        Finding(
-            *("force_dropout", "warning", where),
-            f"at resonance the force falls by up to {percent(worst)} of what it is beside it, on "
-            f"{len(dropped)} of {states.n_levels} levels ({rows_in_words(rows)}): the structure "
-            "moves the shaker.",
-            "use the measured force of every state (`force_n`), never the nominal one; or control "
-            "the force.",
-            rows,
-        )
-    ]
+    evidence = Fact(
+        "force_falls", fall=worst, n_levels=len(dropped), of_levels=states.n_levels, rows=rows
+    )
+    return [Finding("force_dropout", "warning", where, evidence, Fact("mend_force_falls"), rows)]
 
 
 def _falls(states: TestStates) -> Iterator[tuple[Int[np.ndarray, " state"], float, float]]:
@@ -92,18 +86,11 @@ def harmonic_findings(
             continue
         ratio, error, gain = _of_force(seen, fit, model, h, std, order, good)
         if ratio > max(FORCE_HARMONIC, CERTAIN * error) and gain > CLEARLY:
-            found.append(f"{100 * ratio:.3g} ± {100 * error:.1g} % of order {order}")
+            found.append((order, ratio, error))
     if not found:
         return []
-    return [
-        Finding(
-            *(FORCE_HARMONICS, "warning", where),
-            f"the force has harmonics, {', '.join(found)} of its fundamental: that part of the "
-            "response's harmonics keeps its phase to the force.",
-            "control the harmonics of the force, or put their sizes into the model as an effect on "
-            "the force's spectrum.",
-        )
-    ]
+    evidence = Fact("response_harmonics_of_force", harmonics=tuple(found))
+    return [Finding(FORCE_HARMONICS, "warning", where, evidence, Fact("mend_harmonics"))]
 
 
 def _of_force(
@@ -136,8 +123,7 @@ def _of_force(
     made = (mobility * force / noise)[:, None]
     amplitude = size / states.frequency[good]
     amplitude = amplitude / amplitude.max()
-    best: tuple[float, np.ndarray] | None = None
-    plain = np.inf
+    best, plain = (np.inf, 0.0, np.inf), np.inf  # criterion, size and 1σ; criterion without
     n = 2 * len(target)
     for powers in ((), (0, order - 1), (0, 1, 2), (0, 2, 4), (0, 1, 2, 3), (0, 1, 2, 3, 4)):
         curves = amplitude[:, None] ** np.array(powers, dtype=float)
@@ -150,12 +136,11 @@ def _of_force(
             square = float(np.sum(np.abs(target - design @ theta) ** 2))
             scale = max(1.0, square / max(n / 2 - design.shape[1], 1))
             criterion = square / scale + n * np.log(scale) + 2 * design.shape[1] * np.log(n)
-            if with_force and (best is None or criterion < best[0]):
+            if not with_force:
+                plain = min(plain, criterion)
+            elif criterion < best[0]:
                 inverse = np.linalg.pinv(design.conj().T @ design)
                 error = float(np.sqrt(scale * abs(inverse[0, 0])))
-                best = criterion, np.array([abs(theta[0]), error])
-            elif not with_force:
-                plain = min(plain, criterion)
-    if best is None:
-        return 0.0, np.inf, 0.0
-    return float(best[1][0]), float(best[1][1]), 0.5 * float(plain - best[0])
+                best = criterion, float(abs(theta[0])), error
+    criterion, ratio, error = best
+    return ratio, error, 0.5 * float(plain - criterion) if np.isfinite(criterion) else 0.0

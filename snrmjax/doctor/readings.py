@@ -6,10 +6,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
-from snrmjax.doctor.findings import Finding, Kind, Repair, percent
+from snrmjax.doctor.findings import Finding, Kind, Repair
 from snrmjax.doctor.judgement import CheckedStates, Judged, Scale, any_mass, judge
 from snrmjax.doctor.priors import CLEARLY, MODAL_MASS, OTHER_SCALE, SCATTER
 from snrmjax.identify.test_model.states import TestStates
+from snrmjax.numerics.facts import Fact
 
 _DEGREES = 180 / np.pi
 
@@ -17,86 +18,47 @@ Phasors = Complex[np.ndarray, " state"]
 
 
 class Meaning(NamedTuple):
-    """A reading of phasors, and what is said of it."""
+    """A reading of phasors, by a name that its sentences have."""
 
+    name: str
     change: Callable[[Phasors, Float[np.ndarray, " state"]], Phasors]  # of V and Ω
     kind: Kind | None  # None as recorded
-    said: str = ""
-    mend: str = ""
     repair: Repair | None = None
     log_jacobian: float = 0.0  # of a recorded phasor's logarithm to the one that is read
 
 
-_SIGN = "import again with the other phase sign, or negate `velocity_im_m_s`."
-AS_RECORDED = Meaning(lambda v, _: v, None)
-OPPOSITE = Meaning(
-    lambda v, _: -v,
-    "shape_not_mass_normalised",
-    "of turned sign: the shape, the sensor or the force has the other one",
-    "negate this sensor's entry of `shape` in the model, or both velocity columns.",
-)
-CONJUGATED = Meaning(
-    lambda v, _: v.conj(),
-    "conjugated_response",
-    "complex conjugates",
-    _SIGN,
-    Repair(conjugate=True),
-)
-CONJUGATED_OPPOSITE = Meaning(
-    lambda v, _: -v.conj(),
-    "conjugated_response",
-    "complex conjugates of turned sign",
-    "negate `velocity_re_m_s`; or import again with the other phase sign, and turn the sensor's.",
-)
+_ACCELERATION: Kind = "acceleration_as_velocity"
+_DISPLACEMENT: Kind = "displacement_as_velocity"
+_PHASE: Kind = "conjugated_response"
+_UNIT: Kind = "degrees_for_radians"
+AS_RECORDED = Meaning("as_recorded", lambda v, _: v, None)
+OPPOSITE = Meaning("opposite", lambda v, _: -v, "shape_not_mass_normalised")
+CONJUGATED = Meaning("conjugated", lambda v, _: v.conj(), _PHASE, Repair(conjugate=True))
 OTHERS = (
     OPPOSITE,
     CONJUGATED,
-    CONJUGATED_OPPOSITE,
+    Meaning("conjugated_opposite", lambda v, _: -v.conj(), _PHASE),
     Meaning(
-        lambda v, w: v / (1j * w),
-        "acceleration_as_velocity",
-        "accelerations (m/s²)",
-        "divide by iΩ: import again as accelerations.",
-        Repair(quantity="acceleration"),
+        "acceleration", lambda v, w: v / (1j * w), _ACCELERATION, Repair(quantity="acceleration")
     ),
     Meaning(
-        lambda v, w: v * 1j * w,
-        "displacement_as_velocity",
-        "displacements (m)",
-        "multiply by iΩ: import again as displacements.",
-        Repair(quantity="displacement"),
+        "displacement", lambda v, w: v * 1j * w, _DISPLACEMENT, Repair(quantity="displacement")
     ),
     Meaning(
+        "radians_as_degrees",
         lambda v, _: np.abs(v) * np.exp(1j * _DEGREES * np.angle(v)),
-        "degrees_for_radians",
-        "phases in radians that were read as degrees",
-        "import again with phases in radians.",
-        Repair(phase_unit="rad"),
-        log_jacobian=float(np.log(_DEGREES)),
+        *(_UNIT, Repair(phase_unit="rad"), float(np.log(_DEGREES))),
     ),
 )
 OF_SIZES = (
-    Meaning(
-        lambda v, w: v / w,
-        "acceleration_as_velocity",
-        "amplitudes of accelerations (m/s²) with the phases of velocities",
-        "divide the amplitudes by Ω = 2πf, not the phases, in the laboratory's file.",
-    ),
-    Meaning(
-        lambda v, w: v * w,
-        "displacement_as_velocity",
-        "amplitudes of displacements (m) with the phases of velocities",
-        "multiply the amplitudes by Ω = 2πf, not the phases, in the laboratory's file.",
-    ),
+    Meaning("sizes_of_acceleration", lambda v, w: v / w, _ACCELERATION),
+    Meaning("sizes_of_displacement", lambda v, w: v * w, _DISPLACEMENT),
 )
 """Where κ is 1/Ω and Ω of the median state."""
 IN_DEGREES = Meaning(
+    "degrees_as_radians",
     lambda v, _: v,
-    "degrees_for_radians",
-    "phases in degrees that were read as radians",
-    "import again with phases in degrees.",
-    Repair(phase_unit="deg"),
-    log_jacobian=-float(np.log(_DEGREES)),
+    *(_UNIT, Repair(phase_unit="deg"), -float(np.log(_DEGREES))),
 )
 
 
@@ -115,6 +77,11 @@ class Reading(NamedTuple):
         return self.scale.judged.gain(self.as_modelled) > CLEARLY
 
     @property
+    def evidence(self) -> float:
+        """ln of the density of what was recorded, read so."""
+        return self.judged.evidence
+
+    @property
     def judged(self) -> Judged:
         """The likelier fit."""
         found = self.scale.judged if self.rescaled and self.scale else self.as_modelled
@@ -126,7 +93,7 @@ class Reading(NamedTuple):
         """With its likeliest modal mass, too, also `far` from the model's."""
         if self.scale is not None or self.as_modelled is None:
             return self
-        jacobian = self.judged.evidence - self.judged.posterior.log_evidence
+        jacobian = self.evidence - self.judged.posterior.log_evidence
         return self._replace(scale=any_mass(self.as_modelled.states, jacobian, far=far))
 
 
@@ -155,7 +122,8 @@ def best_reading(seen: CheckedStates, known_mass: bool) -> tuple[Reading, Readin
         tried = [one.of_any_mass() for one in tried]
     if not any(one.judged.fits for one in (recorded, *tried)):
         tried += _in_degrees(seen, known_mass)
-    best = max((one for one in tried if one.judged.damped), key=_evidence, default=recorded)
+    damped = [one for one in tried if one.judged.damped]
+    best = max(damped, key=lambda one: one.evidence, default=recorded)
     if not best.judged.beats(recorded.judged):
         return recorded, recorded
     return recorded, _rescaled(best, SCATTER)
@@ -179,10 +147,10 @@ def _judged(
     meaning: Meaning, states: TestStates, known_mass: bool, start: Reading | None = None
 ) -> Reading:
     jacobian = len(states.level) * meaning.log_jacobian
-    if known_mass:
-        begin = None if start is None else start.as_modelled
-        return Reading(meaning, judge(states, jacobian, start=begin), None)
-    return Reading(meaning, None, any_mass(states, jacobian))
+    if not known_mass:
+        return Reading(meaning, None, any_mass(states, jacobian))
+    begin = None if start is None else start.as_modelled
+    return Reading(meaning, judge(states, jacobian, start=begin), None)
 
 
 def _of_sizes(seen: CheckedStates, recorded: Reading) -> Reading | None:
@@ -199,25 +167,20 @@ def _of_sizes(seen: CheckedStates, recorded: Reading) -> Reading | None:
     return None
 
 
-def _evidence(one: Reading) -> float:
-    return one.judged.evidence
-
-
 def misread(recorded: Judged, best: Reading, where: str) -> Finding:
     """That phasors are something else than what they are taken for."""
     meaning = best.meaning
     if meaning.kind is None:
         raise ValueError("the table as recorded is no misreading of itself.")
-    as_they_are = f"{percent(recorded.misfit)} as recorded"
-    if not recorded.damped:
-        as_they_are = "as recorded the mode would gain energy"
-    return Finding(
-        *(meaning.kind, "error", where),
-        f"the responses are {meaning.said}: so read one mode misses a state by "
-        f"{percent(best.judged.misfit)}, {as_they_are}.",
-        meaning.mend,
-        repairs=() if meaning.repair is None else (meaning.repair,),
+    evidence = Fact(
+        "misread",
+        reading=meaning.name,
+        misfit=best.judged.misfit,
+        misfit_as_recorded=recorded.misfit if recorded.damped else None,
     )
+    repairs = () if meaning.repair is None else (meaning.repair,)
+    mend = Fact("mend_reading", reading=meaning.name)
+    return Finding(meaning.kind, "error", where, evidence, mend, repairs=repairs)
 
 
 def _in_degrees(seen: CheckedStates, known_mass: bool) -> list[Reading]:
@@ -235,7 +198,7 @@ def _in_degrees(seen: CheckedStates, known_mass: bool) -> list[Reading]:
         return _judged(IN_DEGREES, states, known_mass, start)
 
     tried = [nearest(guess, None) for guess in _phases_of_amplitudes(seen)]
-    tried = sorted(tried, key=_evidence)[-2:]
+    tried = sorted(tried, key=lambda one: one.evidence)[-2:]
     for k, found in enumerate(tried):
         for _ in range(8):
             # The phase that the curves have at these amplitudes and frequencies.
@@ -243,7 +206,7 @@ def _in_degrees(seen: CheckedStates, known_mass: bool) -> list[Reading]:
             omega = judged.states.frequency
             stiffness = judged.stiffness - omega**2 + 1j * omega * judged.damping
             again = nearest(0.5 * np.pi - np.angle(stiffness), found)
-            if _evidence(again) <= _evidence(found):
+            if again.evidence <= found.evidence:
                 break
             tried[k] = found = again
     return tried

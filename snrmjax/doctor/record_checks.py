@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 from jaxtyping import Float
 
-from snrmjax.doctor.findings import FORCE_HARMONICS, Finding, percent
+from snrmjax.doctor.findings import FORCE_HARMONICS, Finding
 from snrmjax.doctor.force_checks import fall
 from snrmjax.doctor.priors import (
     CERTAIN,
@@ -22,13 +22,14 @@ from snrmjax.doctor.priors import (
 from snrmjax.measure.recordings.steps import Step, recognise_steps
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.recordings.tone_track import track_tone
+from snrmjax.numerics.facts import Fact
 
 _HIGHEST = 12  # harmonic of the force
 
 
-def record_findings(recording: TimeRecording) -> tuple[list[Finding], list[str]]:
-    """Findings of one record, and notes on what could not be looked at."""
-    name = recording.name or "record"
+def record_findings(recording: TimeRecording) -> tuple[list[Finding], list[Fact]]:
+    """Findings of one record, and what could not be looked at."""
+    name, rate = recording.name or "record", recording.sampling_rate
     forces = [c.name for c in recording.channels if c.quantity in ("force", "voltage")]
     motions = [
         c.name
@@ -37,39 +38,37 @@ def record_findings(recording: TimeRecording) -> tuple[list[Finding], list[str]]
     ]
     stop = min(recording.n_samples, 2**23)
     values = {c: recording.values([c], 0, stop)[0] for c in (*forces, *motions)}
-    found = [one for c, x in values.items() if (one := _flat_runs(x, f"{name}, channel {c}"))]
-    notes = [f"{name}: only the first {stop} samples were looked at."] * (
-        stop < recording.n_samples
-    )
+    where = {c: f"{name}, channel {c}" for c in values}
+    clipped = {c: one for c, x in values.items() if (one := _flat_runs(x, where[c]))}
+    notes: list[Fact] = []
+    if stop < recording.n_samples:
+        notes.append(Fact("record_cut", record=name, n_samples=stop))
     if not forces:
-        return found, [*notes, f"{name}: no channel is a force or a voltage: steps were not found."]
+        return [*clipped.values()], [*notes, Fact("record_without_force", record=name)]
     force = forces[0]
     try:
         track = track_tone(recording, force)
-        steps = recognise_steps(
-            track, recording.sampling_rate, least_amplitude_step=0.05, least_step=0.0
-        )
+        steps = recognise_steps(track, rate, least_amplitude_step=0.05, least_step=0.0)
     except ValueError as error:
-        return found, [*notes, f"{name}: {error}"]
-    rate = recording.sampling_rate
+        unheard = Fact("record_without_tone", record=name, error=str(error))
+        return [*clipped.values()], [*notes, unheard]
     steps = [
         one
         for one in _joined(steps, rate)
         if one.stop <= stop and _cycles(one, rate) >= FEWEST_CYCLES
     ]
     if not steps:
-        return found, [*notes, f"{name}: no step of four cycles was recognised."]
-    where = {c: f"{name}, channel {c}" for c in values}
-    clipped = {one.where for one in found}
-    flat = [_flat_cycles(values[c], steps, rate, w) for c, w in where.items() if w not in clipped]
-    found += [one for one in flat if one is not None]
-    clipped = {one.where for one in found}
+        return [*clipped.values()], [*notes, Fact("record_without_steps", record=name)]
+    for c in values.keys() - clipped.keys():
+        if flat := _flat_cycles(values[c], steps, rate, where[c]):
+            clipped[c] = flat
+    found = [clipped[c] for c in values if c in clipped]
     found += _harmonics(values[force], steps, rate, where[force])
     for c in motions:
         found += _unsettled(values[force], values[c], steps, rate, where[c])
-        found += _dropped(values[force], values[c], steps, rate, where[c])
+        found += _dropped(values[force], values[c], steps, where[c])
     for c in (force, *motions):
-        if where[c] not in clipped:
+        if c not in clipped:
             found += _folded(values[c], steps, rate, where[c])
     return found, notes
 
@@ -109,10 +108,10 @@ def _flat_runs(x: Float[np.ndarray, " sample"], where: str) -> Finding | None:
         piled += _piled_up(sign * x, at, 2e-6 * size)
     if share < PILED_UP and not piled:
         return None
-    said = f"{percent(share)} of the samples stand in a row"
-    if share < PILED_UP:
-        said = f"{piled} samples, more than at any other value, stand"
-    return _clipping(where, f"{said} at {bottom:.4g} or {top:.4g}")
+    crowd = piled if share < PILED_UP else None
+    return _clipping(
+        where, Fact("channel_full_scale", share=share, n_samples=crowd, low=bottom, high=top)
+    )
 
 
 def _piled_up(x: Float[np.ndarray, " sample"], at: np.ndarray, width: float) -> int:
@@ -130,12 +129,8 @@ def _piled_up(x: Float[np.ndarray, " sample"], at: np.ndarray, width: float) -> 
     return number if number > 0.5 * CERTAIN * elsewhere else 0
 
 
-def _clipping(where: str, evidence: str) -> Finding:
-    return Finding(
-        *("clipped_channel", "error", where),
-        f"{evidence}: the channel is at the end of its range.",
-        "widen the channel's range (or lower the gain) and record again.",
-    )
+def _clipping(where: str, evidence: Fact) -> Finding:
+    return Finding("clipped_channel", "error", where, evidence, Fact("mend_range"))
 
 
 def _middle(step: Step, share: float = 0.5) -> slice:
@@ -175,9 +170,7 @@ def _flat_cycles(x: np.ndarray, steps: list[Step], rate: float, where: str) -> F
             best = flat
     if best is None or best < FLAT_TOP:
         return None
-    return _clipping(
-        where, f"{100 * best:.3g} % of a mean cycle lies within 3 % of its extremes, of a sine 16 %"
-    )
+    return _clipping(where, Fact("cycle_flat", share=best))
 
 
 def _harmonics(x: np.ndarray, steps: list[Step], rate: float, where: str) -> list[Finding]:
@@ -187,14 +180,8 @@ def _harmonics(x: np.ndarray, steps: list[Step], rate: float, where: str) -> lis
     order = int(np.argmax(worst))
     if not worst[order] > FORCE_HARMONIC:
         return []
-    return [
-        Finding(
-            *(FORCE_HARMONICS, "warning", where),
-            f"harmonic {order + 2} of the force is {percent(worst[order])} of its fundamental.",
-            "lower the amplifier's distortion or control the harmonics; else put them into the "
-            "model as an effect on the force's spectrum.",
-        )
-    ]
+    evidence = Fact("record_force_harmonic", order=order + 2, ratio=float(worst[order]))
+    return [Finding(FORCE_HARMONICS, "warning", where, evidence, Fact("mend_amplifier"))]
 
 
 def _lines(x: np.ndarray, rows: slice, frequency: float, rate: float) -> np.ndarray:
@@ -242,20 +229,17 @@ def _unsettled(
     if len(moving) < max(1, STEPS_MOVE * len(steps)):
         return []
     worst, one, _ = max(moving, key=lambda found: found[0])
-    return [
-        Finding(
-            *("unsettled_steps", "error", where),
-            f"in {len(moving)} of {len(steps)} steps the response over the force still moves at "
-            f"the end, by up to {percent(worst)} (from {one.start / rate:.4g} s on).",
-            "dwell longer, 5/(ζω) a step; or import this record, whose unsettled steps are left "
-            "out.",
-        )
-    ]
+    evidence = Fact(
+        "steps_move",
+        n_moving=len(moving),
+        n_steps=len(steps),
+        change=worst,
+        time_s=one.start / rate,
+    )
+    return [Finding("unsettled_steps", "error", where, evidence, Fact("mend_unsettled"))]
 
 
-def _dropped(
-    force: np.ndarray, x: np.ndarray, steps: list[Step], rate: float, where: str
-) -> list[Finding]:
+def _dropped(force: np.ndarray, x: np.ndarray, steps: list[Step], where: str) -> list[Finding]:
     """Force that falls where the response over it is strongest, and comes back beside it.
 
     Where it does not come back another level begins, whose force is another.
@@ -269,14 +253,8 @@ def _dropped(
     back = beside > nominal * (1 - 0.5 * drop)
     if drop < FORCE_FALLS or not back or np.ptp(np.log(v)) < 0.25:
         return []
-    return [
-        Finding(
-            *("force_dropout", "warning", where),
-            f"the force falls from {nominal:.4g} N by {percent(drop)} where the response is "
-            "strongest.",
-            "use the measured force of every step, or control the force.",
-        )
-    ]
+    evidence = Fact("record_force_falls", force=nominal, fall=drop)
+    return [Finding("force_dropout", "warning", where, evidence, Fact("mend_record_force"))]
 
 
 def _folded(x: np.ndarray, steps: list[Step], rate: float, where: str) -> list[Finding]:
@@ -314,26 +292,8 @@ def _folded(x: np.ndarray, steps: list[Step], rate: float, where: str) -> list[F
                 images.append((size / fundamental, f, int(orders[off.argmin()])))
             else:
                 others.append((size / fundamental, f))
-    if images:
-        size, f, order = max(images)
-        text = (
-            f"a line at {f:.5g} Hz, {100 * size:.2g} % of the fundamental, is no harmonic of the "
-            f"drive but the image of harmonic {order} folded about half the rate of {rate:.6g} Hz"
-        )
-    elif others:
-        size, f = max(others)
-        text = (
-            f"a line at {f:.5g} Hz, {100 * size:.2g} % of the fundamental, is neither a harmonic "
-            f"of the drive nor mains: the likely image of {rate - f:.6g} Hz or more at a rate of "
-            f"{rate:.6g} Hz"
-        )
-    else:
+    if not (images or others):
         return []
-    return [
-        Finding(
-            *("missing_anti_alias", "warning", where),
-            text + ".",
-            "switch on the recorder's anti-alias filter, or sample faster and filter before "
-            "thinning.",
-        )
-    ]
+    size, line, order = max(images) if images else (*max(others), None)
+    evidence = Fact("line_folded", frequency_hz=line, ratio=size, rate_hz=rate, order=order)
+    return [Finding("missing_anti_alias", "warning", where, evidence, Fact("mend_folded"))]

@@ -5,11 +5,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from snrmjax.doctor.findings import Finding, Repair, Severity, percent
+from snrmjax.doctor.findings import Finding, Repair, Severity
 from snrmjax.doctor.judgement import Judged, Scale, judge
 from snrmjax.doctor.priors import BAND, CERTAIN, MODAL_MASS, MORE_DAMPING, OTHER_SCALE
 from snrmjax.identify.test_model.states import TestStates
 from snrmjax.model.structures import Structure
+from snrmjax.numerics.facts import Fact
 
 
 def is_other_scale(scale: Scale, as_modelled: Judged) -> bool:
@@ -31,61 +32,41 @@ def scale_findings(
     response √2. Other factors are two units', a force in volts or a shape of another scale.
     """
     kappa = scale.mass
-    own = f"the states ask for {kappa:.4g} ± {kappa * scale.std:.1g} times the model's modal mass"
-    both = percent(scale.judged.misfit), percent(as_modelled.misfit)
-    size = f"{own} (a state is missed by {both[0]} so, with the model's by {both[1]})"
-    off = float(np.log(kappa))
-    near = float(np.hypot(MODAL_MASS, 3 * scale.std))
+    asked = {"ratio": kappa, "ratio_std": kappa * scale.std}
+    size = Fact(
+        "other_scale",
+        **asked,
+        misfit=scale.judged.misfit,
+        misfit_as_modelled=as_modelled.misfit,
+    )
+    off, near = float(np.log(kappa)), float(np.hypot(MODAL_MASS, 3 * scale.std))
     if abs(abs(off) - 0.5 * np.log(2)) < near:
-        columns, repair = "velocity columns", Repair(response=2**0.5)
-        if off < 0:
-            columns, repair = "`force_n`", Repair(force=2**0.5)
-        return [
-            Finding(
-                *("rms_for_peak", "error", where),
-                f"{size}, {'√2' if off > 0 else '1/√2'}: {'responses' if off > 0 else 'forces'} "
-                "are rms, not peak.",
-                f"multiply the {columns} by √2 = 1.41421.",
-                repairs=(repair,),
-            )
-        ]
-    states, stiffness = scale.judged.states, scale.judged.stiffness
-    bend = _bend(states, stiffness, model)
-    right = bend is not None and abs(np.log(bend)) < OTHER_SCALE * 3
+        column = "response" if off > 0 else "force"
+        evidence, mend = Fact("rms", scale=size, column=column), Fact("mend_rms", column=column)
+        repair = Repair(response=2**0.5) if off > 0 else Repair(force=2**0.5)
+        return [Finding("rms_for_peak", "error", where, evidence, mend, repairs=(repair,))]
+    bend = _bend(scale.judged.states, scale.judged.stiffness, model)
+    agrees = bend is not None and abs(np.log(bend)) < OTHER_SCALE * 3
     units = [one for one in _mixed_units() if abs(off - np.log(one.mass)) < near]
-    units = [one for one in units if not (right and one.column == "response")]
+    units = [one for one in units if not (agrees and one.column == "response")]
     found = []
+    severity: Severity = "error"
     if units:
-        words = [f"the {one.column} in {one.unit}, taken for {one.taken_for}" for one in units]
-        right = ", or ".join(f"{one.column}s in {one.unit}" for one in units)
-        found.append(
-            Finding(
-                *("wrong_unit", "error", where),
-                f"{own}: the factor {units[0].mass:.4g} of {', or '.join(words)}.",
-                f"import again, {right}.",
-                repairs=tuple(one.repair for one in units),
-            )
-        )
-    severity: Severity = "warning" if units else "error"
-    size = "if the units are right" if units else size
-    volts = Finding(
-        "volts_as_force",
-        severity,
-        where,
-        f"{size}: the force column may be a drive voltage of {kappa:.3g} V per N.",
-        "if it is a voltage, call the column `drive_v` and leave its gain to the identification.",
-        repairs=(Repair(force_unit="V"),),
-    )
-    shape = Finding(
-        "shape_not_mass_normalised",
-        severity,
-        where,
-        f"{size}: the shape of the model may not be mass-normalised.",
-        f"if so, divide `shape` and `participation` of the model by {np.sqrt(kappa):.4g} each, or "
-        "find the modes anew, scaled by the sensor at the force.",
-    )
-    of_force, of_shape = _signs(scale.judged, model, bend)
-    return [*found, *[volts] * (of_force >= of_shape), *[shape] * (of_shape >= of_force)]
+        severity, size = "warning", Fact("if_units_are_right")
+        names = tuple(one[:3] for one in units)
+        evidence = Fact("mixed_units", **asked, factor=units[0].mass, units=names)
+        repairs = tuple(one.repair for one in units)
+        mend = Fact("mend_units", units=names)
+        found.append(Finding("wrong_unit", "error", where, evidence, mend, repairs=repairs))
+    of_force, of_shape = _signs(scale.judged, model, bend, agrees=agrees)
+    if of_force >= of_shape:
+        evidence = Fact("voltage_for_force", scale=size, gain=kappa)
+        volts = Finding("volts_as_force", severity, where, evidence, Fact("mend_voltage"))
+        found.append(volts._replace(repairs=(Repair(force_unit="V"),)))
+    if of_shape >= of_force:
+        evidence, mend = Fact("shape_scale", scale=size), Fact("mend_shape", factor=kappa**0.5)
+        found.append(Finding("shape_not_mass_normalised", severity, where, evidence, mend))
+    return found
 
 
 class _MixedUnit(NamedTuple):
@@ -121,14 +102,13 @@ def _mixed_units() -> Iterator[_MixedUnit]:
     yield from (_MixedUnit(of, other, unit, 1 / mass) for of, unit, other, mass in every)
 
 
-def _signs(fit: Judged, model: Structure, bend: float | None) -> tuple[int, int]:
+def _signs(fit: Judged, model: Structure, bend: float | None, *, agrees: bool) -> tuple[int, int]:
     """What else speaks for a force that is none, and for a shape of another scale."""
     modes = model.modes
-    one = modes.mode_of_interest
-    column = np.abs(np.asarray(modes.mode_shape)[:, one])
+    j = modes.mode_of_interest
+    column = np.abs(np.asarray(modes.mode_shape)[:, j])
     plain = abs(column.max() - 1) < 1e-6 or abs(np.linalg.norm(column) - 1) < 1e-6
-    agrees = bend is not None and abs(np.log(bend)) < OTHER_SCALE * 3
-    rate = 2 * float(modes.natural_frequency[one] * modes.damping_ratio[one])
+    rate = 2 * float(modes.natural_frequency[j] * modes.damping_ratio[j])
     damped = rate > 0 and float(np.min(fit.damping)) > (1 + MORE_DAMPING) * rate
     return int(agrees) + int(damped), int(plain) + int(bend is not None and not agrees)
 
@@ -180,14 +160,6 @@ def shaker_damping(fit: Judged, model: Structure, where: str) -> list[Finding]:
     certain = CERTAIN * times.min() * std / ratio
     if excess < max(MORE_DAMPING, certain) or np.ptp(times) > 0.5 * excess or abs(away) > ratio:
         return []
-    return [
-        Finding(
-            *("volts_as_force", "warning", where),
-            f"the damping is {times.min():.3g} times the model's and more at all amplitudes, at "
-            f"the model's natural frequency within {percent(abs(away))}: a shaker damps so where "
-            "its drive is taken for the force.",
-            "measure the force at the structure, or call a voltage `drive_v`; if it is that force, "
-            "repeat the linear test on this assembly.",
-            repairs=(Repair(force_unit="V"),),
-        )
-    ]
+    evidence = Fact("shaker_damping", ratio=float(times.min()), frequency_off=abs(away))
+    volts = Finding("volts_as_force", "warning", where, evidence, Fact("mend_shaker_damping"))
+    return [volts._replace(repairs=(Repair(force_unit="V"),))]

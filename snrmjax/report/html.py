@@ -79,7 +79,7 @@ def report_html(report: Report) -> str:
         lstrip_blocks=True,
     )
     sections = [
-        {**section._asdict(), "figures": [_embedded(one) for one in section.figures]}
+        {**section._asdict(), "figures": [_embedded(figure) for figure in section.figures]}
         for section in report.sections
     ]
     template = environment.get_template("report.html.j2")
@@ -146,12 +146,12 @@ def minus(text: str) -> str:
     return text.replace("-", "−")
 
 
-def _sentence(text: str) -> str:
+def _sentence(text: object) -> str:
     """A note as a sentence: a capital first but for a file's name, a full stop last.
 
     >>> _sentence("two rows are incomplete"), _sentence("run1.mat: two rows are incomplete.")
     ('Two rows are incomplete.', 'run1.mat: two rows are incomplete.')
     """
-    text = text.strip()
+    text = str(text).strip()
     first = text[:1] if _FILE_FIRST.match(text) else text[:1].upper()
     return first + text[1:] + ("" if text.endswith((".", "!", "?")) else ".")

@@ -7,18 +7,21 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from snrmjax.io.units import HERTZ
-from snrmjax.report import diagnosis_figures, figures, joint_figures, simulation_figures
-from snrmjax.report.condense.reduction_figures import scale_figure, static_figure
-from snrmjax.report.modal.modal_figures import decay_figure, modal_responses_figure
-from snrmjax.report.sampling import BAND, sensor_index, span_of
-from snrmjax.report.simulation_figures import (
+from snrmjax.report.figures import diagnosis as diagnosis_figures
+from snrmjax.report.figures import identification as figures
+from snrmjax.report.figures import joint_fit as joint_figures
+from snrmjax.report.figures import simulation as simulation_figures
+from snrmjax.report.figures import uncertainty as uncertainty_figures
+from snrmjax.report.figures.modes import decay_figure, modal_responses_figure
+from snrmjax.report.figures.reduction import scale_figure, static_figure
+from snrmjax.report.figures.simulation import (
     amplitudes_figure,
     motions_figure,
     points_figure,
     simulated_response_figure,
 )
+from snrmjax.report.sampling import BAND, sensor_index, span_of
 from snrmjax.report.style import unit_for
-from snrmjax.report.uncertainty import uncertainty_figures
 
 
 def plot_result(result: object, **settings: Any) -> Figure:
@@ -141,7 +144,6 @@ _FIGURES: dict[str, Callable[..., Figure]] = {
     "NormalModeBranch": simulation_figures.normal_mode_figure,
     "PeriodicMotion": _motions,
     "PredictedResponse": _predicted,
-    "Profile": joint_figures.profile_figure,
     "Propagation": uncertainty_figures.propagation_figure,
     "ResponseBatch": simulation_figures.batch_figure,
     "ResponseCurve": lambda one, **settings: simulated_response_figure([one], **settings),

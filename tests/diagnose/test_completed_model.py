@@ -9,7 +9,8 @@ from truths.balanced_sets import OMEGA, ZETA, balanced, linear_model
 import snrmjax as sj
 from snrmjax.diagnose.diagnosis_result import CompletedStatus, completed_model
 from snrmjax.io.models import read_model
-from snrmjax.report.diagnosis_report import write_diagnosis
+from snrmjax.pipelines.diagnose import diagnose_test
+from snrmjax.report.pages.diagnosis import write
 
 
 def fed(velocity):
@@ -20,13 +21,15 @@ def fed(velocity):
 def test_a_negative_damping_ratio_is_no_reason_to_lose_the_answer(tmp_path):
     """The model is uncertain of its damping ratio; the data put it below zero."""
     model, data = linear_model(damping_std=3.0), balanced(fed)
-    found, _ = write_diagnosis(tmp_path, "fed", model, data, simulate=True)
+    test = diagnose_test(data, model)
+    write(tmp_path, test)
+    found = test.diagnosis
     assert "quadratic_damping" in found.effects
     assert found.completed is None
     assert found.answer.completed_status is CompletedStatus.NOT_PHYSICAL
-    (note,) = (note for note in found.notes if "completed model" in note)
-    assert "damping_ratio" in note
-    ratio = float(note.split("but is ")[1].split(". ")[0])
+    (note,) = (note for note in found.notes if note.kind == "not_physical")
+    assert "damping_ratio" in note["reason"]
+    ratio = float(note["reason"].split("but is ")[1].rstrip("."))
     assert ratio == pytest.approx(-0.2 * ZETA, rel=0.1)
     told = json.loads((tmp_path / "diagnosis.json").read_text())
     assert told["effects"] == list(found.effects)

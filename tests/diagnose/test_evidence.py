@@ -12,7 +12,6 @@ from truths.made_up_misfits import fit_to, misfit_of, noise
 
 import snrmjax as sj
 from snrmjax.diagnose import priors
-from snrmjax.diagnose.diagnosis_result import probability_in_words
 from snrmjax.diagnose.evidence import (
     Marginal,
     Weighed,
@@ -274,8 +273,3 @@ def test_a_law_that_no_effect_follows_leaves_unknown_probable():
     """Damping that rises and falls twice over the levels."""
     found = diagnosed(lambda velocity: 3 + 3 * np.sin(4 * np.log(velocity)))
     assert found.probabilities["unknown"] > 0.95
-
-
-def test_a_probability_is_never_said_to_be_certain():
-    said = [probability_in_words(p) for p in (1.0, 0.999, 0.5, 0.001, 0.0)]
-    assert said == ["above 99 %", "above 99 %", "50 %", "below 1 %", "below 1 %"]

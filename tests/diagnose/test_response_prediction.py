@@ -21,8 +21,7 @@ from snrmjax.diagnose.response_prediction import (
     simulated_resonance,
 )
 from snrmjax.model.effects import EFFECTS, make_effect
-from snrmjax.report.diagnosis.resonance_table import resonance_in_words
-from snrmjax.report.diagnosis_report import _incomplete
+from snrmjax.report.pages.resonance_table import resonance_in_words
 from snrmjax.report.style import unit_for
 
 OMEGA, ZETA, SHAPE = 2 * np.pi * 50.0, 0.01, 2.0
@@ -226,5 +225,3 @@ def test_a_response_that_ends_early_is_said(monkeypatch):
     monkeypatch.setattr(response_prediction, "responses", ended)
     rows = predicted_levels(model, doubled, data, 0).levels
     assert [row.complete for row in rows] == [True, False]
-    (note,) = _incomplete(rows)
-    assert "level 1 were not traced to the end" in note

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import snrmjax as sj
-from snrmjax.doctor.doubts import doubt
+from snrmjax.doctor.column_misreadings import doubt
 from snrmjax.measure import steady_states
 
 OMEGA, ZETA, SHAPE = 2 * np.pi * 137.0, 6e-4, 3.0

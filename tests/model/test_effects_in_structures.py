@@ -8,7 +8,6 @@ import pytest
 
 import snrmjax as sj
 from snrmjax.model.effect_base import AbstractMemoryless, Scalar
-from snrmjax.model.effect_metadata import Parameter, Prior
 from snrmjax.model.effects import EFFECTS, make_effect
 
 
@@ -79,19 +78,10 @@ def test_effects_and_families_print_as_tables():
     assert [line.split()[0] for line in lines] == list(EFFECTS)
     (drag,) = (line for line in lines if line.startswith("quadratic_damping "))
     assert "coefficient (1/(kg^1/2 m)): Drag of the surrounding air" in drag
-    assert sj.model.describe_effects() == repr(EFFECTS)
     assert drag in type(EFFECTS).__doc__
     families = repr(sj.identify.FAMILIES)
     assert [line.split()[0] for line in families.splitlines()] == list(sj.identify.FAMILIES)
     assert "class" not in families
-
-
-def test_rules_and_priors_print_in_words():
-    every = [one for kind in EFFECTS.values() for one in kind.parameters().values()]
-    assert not [repr(one) for one in every if "<function" in repr(one)]
-    assert 'Rule("positive")' in " ".join(map(repr, every))
-    prior = Prior(0.0, 1.2, lambda scales: scales.largest)
-    assert "from 0 to 1.2 times a measured size" in repr(Parameter("m", "gap", prior=prior))
 
 
 @pytest.mark.parametrize("name", ["MeasurementErrors", "Recording", "SweepSimulation"])

@@ -14,10 +14,11 @@ import snrmjax as sj
 from snrmjax.diagnose.search.locating import Located
 from snrmjax.io.units import HERTZ
 from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
-from snrmjax.report import diagnosis_figures as plot
-from snrmjax.report import diagnosis_report as told
+from snrmjax.pipelines.diagnose import simulated_levels
 from snrmjax.report import style as drawing
+from snrmjax.report.figures import diagnosis as plot
 from snrmjax.report.html import report_html
+from snrmjax.report.pages import diagnosis as told
 
 SHAPE, PARTICIPATION, OMEGA, ZETA = 2.0, 3.0, 100.0, 0.01
 LARGEST = 0.6  # m/s
@@ -166,8 +167,10 @@ def drag():
 @pytest.fixture(scope="module")
 def pictures(drag):
     given, _, found = drag
-    predicted, responses = told.with_responses(found, given)
-    return predicted, {**told.diagnosis_figures(found), "responses": responses}
+    simulated = simulated_levels(found, given)
+    responses = told.responses_figure(found, simulated)
+    figures = {**told.diagnosis_figures(found), "responses": responses}
+    return simulated.predicted.levels, figures
 
 
 def html_of(found, pictures, **settings):
@@ -205,7 +208,7 @@ def test_limits_and_losing_candidates_are_folded_away(drag, pictures):
     ],
 )
 def test_each_verdict_is_one_plain_sentence(drag, verdict, words):
-    sentence = told.readable_verdict(dataclasses.replace(drag[2], verdict=verdict))
+    sentence = dataclasses.replace(drag[2], verdict=verdict).verdict_sentence
     assert words in sentence
     assert sentence.endswith(".")
     assert "_" not in sentence
@@ -216,7 +219,7 @@ def test_rivals_are_told_where_there_are_some(drag):
     unclear = dataclasses.replace(
         drag[2], verdict="ambiguous", answer=drag[2].answer._replace(candidates=rivals)
     )
-    assert told.readable_verdict(unclear).startswith(
+    assert unclear.verdict_sentence.startswith(
         "The model lacks quadratic damping, cubic damping or Jenkins slider, and these data cannot "
         "tell which"
     )

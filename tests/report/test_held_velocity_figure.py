@@ -8,7 +8,7 @@ from truths.balanced_sets import OMEGA, PARTICIPATION, SHAPE, ZETA, linear_model
 import snrmjax as sj
 from snrmjax.diagnose.response_prediction import held_curves
 from snrmjax.io.units import HERTZ
-from snrmjax.report.diagnosis_figures import held_velocity_figure
+from snrmjax.report.figures.diagnosis import held_velocity_figure
 
 HELD = (0.02, 0.05)  # m/s
 

@@ -15,11 +15,12 @@ from matplotlib.figure import Figure
 from scipy.interpolate import CubicSpline
 
 import snrmjax as sj
+from snrmjax.identify.pointwise.prediction_result import Resonance
 from snrmjax.io.units import HERTZ
 from snrmjax.report import html as reports
-from snrmjax.report.figures import backbone_figure, response_figure
+from snrmjax.report.figures.identification import backbone_figure, response_figure
 from snrmjax.report.html import Report, ReportFigure, ReportTable, Section, write_report
-from snrmjax.report.identification_report import (
+from snrmjax.report.pages.identification import (
     ComparedResponses,
     identification_report,
     identification_sentence,
@@ -89,7 +90,7 @@ def identification(data, modes):
 
 
 def resonance(force, velocity, frequency_hz, *, continued=False):
-    return sj.identify.Resonance(force, 1e-3, frequency_hz * HERTZ, 0.019, velocity, continued)
+    return Resonance(force, 1e-3, frequency_hz * HERTZ, 0.019, velocity, continued)
 
 
 def simulated(force, velocities, frequencies_hz, events):

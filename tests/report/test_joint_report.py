@@ -10,13 +10,15 @@ from truths.joint_fits import exact_fit, noisy_fit
 from truths.printed_page import unreadable
 
 import snrmjax as sj
-from snrmjax.identify.inference.contributions import Contribution
+from snrmjax.identify.inference.contributions import Contribution, contributions
+from snrmjax.identify.inference.fitted_response import fitted_response
 from snrmjax.io.joint_results import read_joint_fit, write_joint_fit
 from snrmjax.io.units import DEGREE, HERTZ
-from snrmjax.report import joint_figures as joint_plot
-from snrmjax.report import joint_report
+from snrmjax.pipelines.identify import FitDetails
 from snrmjax.report import sampling as plot_data
+from snrmjax.report.figures import joint_fit as joint_plot
 from snrmjax.report.html import Report, report_html
+from snrmjax.report.pages import joint_fit as joint_report
 
 TRUE = {"backbone": "polynomial:1@displacement", "damping": "viscous_quadratic@velocity"}
 
@@ -29,7 +31,10 @@ def fit():
 
 @pytest.fixture(scope="module")
 def told(fit):
-    return joint_report.reported_fit(fit, sj.next_measurements(fit, 3))
+    advice = sj.next_measurements(fit, 3)
+    forces = sorted({one.force for one in advice})
+    responses = tuple(fitted_response(fit, force)[0] for force in forces)
+    return FitDetails(fit, tuple(contributions(fit)), advice, responses)
 
 
 @pytest.fixture(scope="module")
@@ -210,7 +215,7 @@ def test_advised_states_are_marked_and_listed(told, figures, sections):
     turned = [line.get_ydata() for line in phases.lines if line.get_marker() == "o"]
     np.testing.assert_allclose(np.ravel(turned), [a.phase / DEGREE for a in told.advice])
     rows = sections[2].tables[0].rows
-    assert [row[-1] for row in rows] == [one.reason for one in told.advice]
+    assert [row[-1] for row in rows] == [str(one.reason) for one in told.advice]
     close_to(rows[0][2], told.advice[0].frequency / HERTZ)
 
 

@@ -9,7 +9,7 @@ from truths.beam_forces import FORCES
 from truths.printed_page import unreadable
 
 from snrmjax.io.units import HERTZ
-from snrmjax.report import simulation_figures as plot
+from snrmjax.report.figures import simulation as plot
 
 
 def named(axes, label):

@@ -1,7 +1,7 @@
 """Gains that an answer moves: of the force of single levels, of all forces, of the modal mass."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -9,14 +9,13 @@ import numpy as np
 from jaxtyping import Float
 
 from snrmjax.diagnose import priors
-from snrmjax.diagnose.checks.doubts import Doubt
+from snrmjax.diagnose.checks.alternative_laws import Doubt
 from snrmjax.diagnose.misfit.candidates import parameter_labels
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
 from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
 from snrmjax.diagnose.misfit.weighted_misfit import FREE_LEVEL_FORCE_STD, WeightedMisfit
 from snrmjax.diagnose.search.model_search import FoundEffects
 from snrmjax.identify.checks.instruments import (
-    REMEDY_OF_GAIN,
     Determination,
     force_gain_determined,
     force_gain_undetermined,
@@ -25,6 +24,9 @@ from snrmjax.measure.states import SteadyStates
 from snrmjax.model.effects import EFFECTS
 from snrmjax.model.library.confusions import FORCE_OR_SENSOR_GAIN, SIZE_OF_RESPONSE
 from snrmjax.model.modes import UNSTATED_MODAL_MASS_STD
+from snrmjax.numerics.facts import Fact
+
+_CALIBRATE = Fact("determine_force_gain")
 
 
 class LevelGain(NamedTuple):
@@ -32,11 +34,6 @@ class LevelGain(NamedTuple):
 
     value: float
     std: float  # 1σ
-
-    def __str__(self) -> str:
-        """In words, as sentences say it."""
-        digits = max(0, 1 - int(np.floor(np.log10(max(self.std, 1e-9)))))
-        return f"{self.value:.{digits}f} ± {self.std:.{digits}f}"
 
 
 class LevelForces(NamedTuple):
@@ -53,28 +50,10 @@ class LevelForces(NamedTuple):
         return self.lead > priors.AS_GOOD_BY_CRITERION
 
     @property
-    def names(self) -> str:
-        """The levels in words."""
-        listed = " and ".join(str(level) for level in self.levels)
-        return f"level{'s' if len(self.levels) > 1 else ''} {listed}"
-
-    @property
-    def remedy(self) -> str:
-        """What to measure."""
-        return (
-            f"check the force's range setting and calibration at {self.names}, or measure "
-            f"{self.names} again"
-        )
-
-    @property
     def doubt(self) -> Doubt:
         """That they explain the data as well."""
-        beside = f" beside {' and '.join(self.kinds)}" if self.kinds else ""
-        return Doubt(
-            f"a force of {self.names} that is recorded in a wrong scale{beside} explains these "
-            "data as well.",
-            self.remedy,
-        )
+        reason = Fact("level_forces_alike", levels=self.levels, effects=self.kinds)
+        return Doubt(reason, Fact("check_level_forces", levels=self.levels))
 
 
 def suspected_level_forces(found: FoundEffects, noise: float) -> LevelForces | None:
@@ -92,22 +71,22 @@ def suspected_level_forces(found: FoundEffects, noise: float) -> LevelForces | N
     member = np.asarray(chosen.states.level) == np.arange(chosen.n_levels)[:, None]
     of_forces = member[:, :, None] * misfit.passed_on.by_error[None, :, :, 0]
     arms = misfit.noise.decorrelated(misfit.noise.noise_units(of_forces)).T
-    own, cost = found.fit.criterion(misfit.n_rows), float(np.log(misfit.n_rows))
+    as_recorded, cost = found.fit.criterion(misfit.n_rows), float(np.log(misfit.n_rows))
     fits: dict[frozenset[str], EffectFit] = {}
     for fit in (found.baseline, found.fit, *found.considered):
         known = fits.get(frozenset(fit.kinds))
         if np.isfinite(fit.chi_square) and (known is None or fit.chi_square < known.chi_square):
             fits[frozenset(fit.kinds)] = fit
-    best, lead = None, -priors.AS_GOOD_BY_CRITERION
+    best, lead, chance = None, -priors.AS_GOOD_BY_CRITERION, 0.0
     for fit in fits.values():
         places, square = _beside(misfit, fit, arms)
         n = len(fit.values) + len(places)
-        ahead = own - (square + n * cost)
+        ahead = as_recorded - (square + n * cost)
         if places and ahead >= lead:
             levels = tuple(int(misfit.level_numbers[place]) for place in places)
             best, lead = LevelForces(places, levels, fit.kinds, ahead), ahead
             chance = chi_square_p_value(square / noise, misfit.n_rows - n)
-    return None if best is None or chance < priors.REJECTED else best
+    return None if chance < priors.REJECTED else best
 
 
 def _beside(
@@ -115,10 +94,10 @@ def _beside(
 ) -> tuple[tuple[int, ...], float]:
     """The levels whose gains a fit needs beside it, and χ² with them."""
     left = misfit.noise.decorrelated(fit.rows)
-    own = misfit.noise.decorrelated(fit.slopes.T).T
+    by_parameter = misfit.noise.decorrelated(fit.slopes.T).T
 
     def square(places: tuple[int, ...]) -> float:
-        columns = np.concatenate([own, arms[:, list(places)]], axis=1)
+        columns = np.concatenate([by_parameter, arms[:, list(places)]], axis=1)
         size = np.linalg.norm(columns, axis=0)
         scaled = columns / np.where(size > 0, size, 1.0)
         steps = np.linalg.lstsq(scaled, left, rcond=1e-10)[0]
@@ -148,40 +127,12 @@ def level_gains(misfit: WeightedMisfit, fit: EffectFit) -> dict[int, LevelGain]:
     return gains
 
 
-def notes_on_level_forces(
-    gains: Mapping[int, LevelGain], rival: LevelForces | None, as_recorded: FoundEffects
-) -> list[str]:
-    """Which effects would stand for the forces of levels, were they taken as recorded."""
-    if not gains or rival is None:
-        return []
-    others = " with ".join(as_recorded.fit.kinds) or "none"
-    return [
-        f"with the forces as recorded the best answer is {others}, and it fits worse than a gain "
-        f"of the force of {rival.names} (Schwarz's criterion: by {rival.lead:.0f})."
-    ]
-
-
-def level_forces_sentence(gains: Mapping[int, LevelGain]) -> str:
-    """What a diagnosis says first where the forces of levels were recorded in a wrong scale.
-
-    >>> level_forces_sentence({3: LevelGain(0.9712, 0.0011)})
-    'The force at level 3 was 0.9712 ± 0.0011 times the recorded one.'
-    """
-    return " ".join(
-        f"The force at level {level} was {gain} times the recorded one."
-        for level, gain in gains.items()
-    )
-
-
 def with_forces_that_acted(data: SteadyStates, gains: Mapping[int, LevelGain]) -> SteadyStates:
     """The states with the forces that acted, where those of some levels were found."""
     if not gains:
         return data
     gain = [gains[k].value if k in gains else 1.0 for k in np.asarray(data.level).tolist()]
     return dataclasses.replace(data, force=data.force * jnp.asarray(gain))
-
-
-_REMEDY = f"{REMEDY_OF_GAIN[0].lower()}{REMEDY_OF_GAIN[1:]}"
 
 
 class GainFound(NamedTuple):
@@ -216,36 +167,39 @@ class ModalMassFound(NamedTuple):
 
 def modal_mass_found(misfit: WeightedMisfit, fit: EffectFit) -> ModalMassFound | None:
     """The modal mass as seen from force and sensor; None where the model states no error of it."""
-    modes, sensor = misfit.model.modes, misfit.predictions.chosen.sensors[0]
-    j = modes.mode_of_interest
-    name = f"mode_{j + 1}.participation"
+    name = f"mode_{misfit.model.modes.mode_of_interest + 1}.participation"
     if name not in misfit.predictions.stated:
         return None
     place = list(misfit.predictions.stated).index(name)
-    own, prior = misfit.predictions.stated[name]
-    step = float(misfit.noise.shared_errors(fit.rows)[place])
-    model = 1 / abs(float(modes.mode_shape[sensor, j]) * own)
-    mass = model * own / (own + prior * step)
-    relative = prior / abs(own)
-    return ModalMassFound(
-        mass, mass * relative * misfit.noise.shared_std(fit.slopes, place), model, relative
-    )
+    stated, prior = misfit.predictions.stated[name]
+    step, model = float(misfit.noise.shared_errors(fit.rows)[place]), _modal_mass(misfit)
+    mass, relative = model * stated / (stated + prior * step), prior / abs(stated)
+    std = mass * relative * misfit.noise.shared_std(fit.slopes, place)
+    return ModalMassFound(mass, std, model, relative)
 
 
-def notes_on_found_mass(misfit: WeightedMisfit, fit: EffectFit) -> tuple[str, ...]:
-    """That the data ask for another modal mass than the model's, inside its stated error."""
-    found = modal_mass_found(misfit, fit)
-    if found is None or abs(found.value - found.model) <= priors.PULLED * found.std:
-        return ()
-    beyond = ""
-    if abs(found.value / found.model - 1) > priors.PULLED * found.stated_std:
-        beyond = ", which is farther than that: check the linear test"
-    return (
-        f"the data say that the modal mass is {found.value:.4g} ± {found.std:.2g} kg; the model "
-        f"has {found.model:.4g} kg (1σ stated: {100 * found.stated_std:.2g} %){beyond}. A gain of "
-        "the force or of the sensor does the same, so that none of that size can be told from it: "
-        "calibrate both statically, or repeat a level with a known added mass.",
+def _modal_mass(misfit: WeightedMisfit) -> float:
+    """The model's, as seen from force and reference sensor, kg."""
+    modes, sensor = misfit.model.modes, misfit.predictions.chosen.sensors[0]
+    j = modes.mode_of_interest
+    return 1 / abs(float(modes.mode_shape[sensor, j] * modes.participation[j]))
+
+
+def notes_on_gains(misfit: WeightedMisfit, fit: EffectFit) -> Iterator[Fact]:
+    """Stated parameters that an answer moves beyond their errors, and another modal mass."""
+    moved = misfit.noise.shared_errors(fit.rows)
+    pulled = tuple(
+        (name, float(step), std)
+        for (name, (_, std)), step in zip(misfit.predictions.stated.items(), moved, strict=False)
+        if abs(step) > priors.PULLED
+        and not name.endswith(".participation")  # said of the modal mass
     )
+    if pulled:
+        yield Fact("stated_parameters_moved", parameters=pulled)
+    mass = modal_mass_found(misfit, fit)
+    if mass is not None and abs(mass.value - mass.model) > priors.PULLED * mass.std:
+        beyond = abs(mass.value / mass.model - 1) > priors.PULLED * mass.stated_std
+        yield Fact("other_modal_mass", **mass._asdict(), beyond=bool(beyond))
 
 
 def doubts_on_gains(
@@ -262,29 +216,16 @@ def doubts_on_gains(
     found = [] if of_gain is None else [of_gain]
     strengths = {kind: fit.of_kind(kind)[0] for kind in fit.kinds}
     for kind, strength in strengths.items():
-        own = std[parameter_labels(kind)[0]]
-        if own > abs(strength):
-            found.append(
-                Doubt(
-                    f"these data do not determine {kind}: its strength is {abs(strength):.2g} with "
-                    f"a 1σ of {own:.2g}, larger than itself.",
-                    "measure at more amplitudes and frequencies",
-                )
-            )
-    modes, sensor = misfit.model.modes, misfit.predictions.chosen.sensors[0]
-    j = modes.mode_of_interest
-    mass = 1 / abs(float(modes.mode_shape[sensor, j] * modes.participation[j]))
-    for kind, gain in strengths.items() if modes.modal_mass_std is None else ():
-        far = priors.FAR_MASS * UNSTATED_MODAL_MASS_STD
+        error = std[parameter_labels(kind)[0]]
+        if error > abs(strength):
+            reason = Fact("strength_unknown", effect=kind, strength=abs(strength), std=error)
+            found.append(Doubt(reason, Fact("measure_more")))
+    mass, far = _modal_mass(misfit), priors.FAR_MASS * UNSTATED_MODAL_MASS_STD
+    for kind, gain in strengths.items() if misfit.model.modes.modal_mass_std is None else ():
         if FORCE_OR_SENSOR_GAIN in EFFECTS[kind].confusions and abs(np.log1p(gain)) <= far:
-            found.append(
-                Doubt(
-                    f"{kind} of {gain:+.2g} may be the modal mass: with {mass / (1 + gain):.4g} kg "
-                    f"in place of the model's {mass:.4g} kg, of which no error is stated "
-                    "(`modal_mass_std`), the model needs no such effect.",
-                    SIZE_OF_RESPONSE.separated_by,
-                )
-            )
+            masses = {"mass": mass / (1 + gain), "mass_of_model": mass}
+            reason = Fact("gain_or_modal_mass", effect=kind, gain=gain, **masses)
+            found.append(Doubt(reason, SIZE_OF_RESPONSE.separated_by))
     return found
 
 
@@ -294,40 +235,12 @@ def _on_gain(misfit: WeightedMisfit, fit: EffectFit) -> Doubt | None:
     if gain is None:
         return None
     if not 1 / priors.FAR_GAIN < gain.value < priors.FAR_GAIN:
-        reason = (
-            f"the answer needs {gain.value:.2g} times the force that smooth curves need: with a "
-            "force of any size almost any law fits, so the force gain cannot be determined beside "
-            "it."
-        )
-        return Doubt(reason, _REMEDY, refutes=True)
-    said = force_gain_undetermined(gain.std, gain.farthest)
-    if not said and abs(np.log(gain.value)) > priors.MOVED_GAIN:
-        reason = (
-            f"the answer moves the force gain by {100 * (gain.value - 1):+.2g} %: smooth curves of "
-            "amplitude need the former one, and beside a free gain these data hardly determine the "
-            "law."
-        )
-        return Doubt(reason, _REMEDY)
-    if not said:
-        return None
-    if force_gain_determined(gain.std) is Determination.NOT_AT_ALL:
-        return Doubt(said, _REMEDY, refutes=True)
-    reason = "the force gain, which these data hardly determine, may be a part of the answer."
-    return Doubt(reason, _REMEDY)
-
-
-def notes_on_stated_parameters(misfit: WeightedMisfit, fit: EffectFit) -> tuple[str, ...]:
-    """Parameters of the model as given that an answer moves beyond their stated errors."""
-    moved = misfit.noise.shared_errors(fit.rows)
-    pulled = [
-        f"`{name}` by {step:+.2g} times its 1σ of {std:.2g}"
-        for (name, (_, std)), step in zip(misfit.predictions.stated.items(), moved, strict=False)
-        if abs(step) > priors.PULLED
-        and not name.endswith(".participation")  # said of the modal mass
-    ]
-    if not pulled:
-        return ()
-    return (
-        f"the answer moves {', '.join(pulled)}, as the model states it: check the linear test, or "
-        "whether it was of another assembly.",
-    )
+        return Doubt(Fact("force_gain_far", gain=gain.value), _CALIBRATE, refutes=True)
+    undetermined = force_gain_undetermined(gain.std, gain.farthest)
+    if undetermined:
+        if force_gain_determined(gain.std) is Determination.NOT_AT_ALL:
+            return Doubt(undetermined, _CALIBRATE, refutes=True)
+        return Doubt(Fact("force_gain_in_answer"), _CALIBRATE)
+    if abs(np.log(gain.value)) > priors.MOVED_GAIN:
+        return Doubt(Fact("force_gain_moved", change=gain.value - 1), _CALIBRATE)
+    return None

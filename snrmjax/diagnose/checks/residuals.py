@@ -8,12 +8,13 @@ from jaxtyping import Bool, Float, Int
 from scipy.special import fdtrc, ndtr
 
 from snrmjax.diagnose import priors
-from snrmjax.diagnose.checks.doubts import Doubt
+from snrmjax.diagnose.checks.alternative_laws import Doubt
 from snrmjax.diagnose.evidence import hat_functions
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
 from snrmjax.diagnose.misfit.noise_model import chi_square_p_value, shared_covariance
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
 from snrmjax.diagnose.search.model_search import FoundEffects
+from snrmjax.numerics.facts import Fact
 
 
 class HeldOut(NamedTuple):
@@ -89,10 +90,8 @@ def held_out_levels(
     misfit: WeightedMisfit, baseline: EffectFit, fit: EffectFit, noise: float = 1.0
 ) -> HeldOutLevels | None:
     """Cross-validation on the level in the middle and the top one; None below three levels."""
-    places = held_out_places(misfit)
-    if not places:
-        return None
-    return HeldOutLevels(*(held_out(misfit, baseline, fit, place, noise) for place in places))
+    found = [held_out(misfit, baseline, fit, k, noise) for k in held_out_places(misfit)]
+    return HeldOutLevels(*found) if found else None
 
 
 def without_level(
@@ -168,49 +167,33 @@ def missed_levels(
     inner, outer = levels
     unclear = any(len(group) > 1 for group in found.classes)
     parts_missing = bool(found.misfit.predictions.chosen.phase_unknown[:, 0].any())
-    for held in levels:
-        if held.uncertain_p_value < priors.REJECTED / 2:
-            return [_refuting(held.level, held.after)]
+    refuting = [held for held in levels if held.uncertain_p_value < priors.REJECTED / 2][:1]
     chance = inner.uncertain_p_value if parts_missing else inner.p_value
     worse = inner.after > inner.before and chance < priors.REJECTED
     alike = doubted and (inner.p_value < priors.MISSED or inner.after > priors.AS_NOISE)
     if worse or alike or (unclear and inner.uncertain_p_value < priors.MISSED_BY_ONE):
-        return [_refuting(inner.level, inner.after)]
+        refuting.append(inner)
+    if refuting:
+        level = refuting[0].level
+        reason = Fact("level_missed", level=level, misfit=refuting[0].after)
+        return [Doubt(reason, Fact("measure_level_again", level=level), refutes=True)]
     if outer.after < priors.FAR_MISSED or outer.p_value >= priors.REJECTED:
         return []
-    return [
-        Doubt(
-            f"level {outer.level}, left out of the fit, is missed by {outer.after:.2g} times the "
-            "noise, within the uncertainty of the parameters: nothing proves the law there.",
-            f"measure levels between level {outer.level} and the one below it, or above it",
-            identical=True,
-        )
-    ]
+    reason = Fact("top_level_missed", level=outer.level, misfit=outer.after)
+    return [Doubt(reason, Fact("measure_beside_level", level=outer.level), identical=True)]
 
 
-def _refuting(level: int, missed: float) -> Doubt:
-    return Doubt(
-        f"level {level}, left out of the fit, is missed by {missed:.2g} times the noise: the law "
-        "is not the true one.",
-        f"measure level {level} again, and further levels around it",
-        refutes=True,
-    )
-
-
-def pattern(misfit: WeightedMisfit, fit: EffectFit) -> str | None:
+def pattern(misfit: WeightedMisfit, fit: EffectFit) -> Fact | None:
     """Why the misfit that is left cannot be noise of any one size; None where it can."""
     left = misfit.noise.without_shared(fit.rows)
-    for reason in (
-        _by_level(misfit, left),
-        _by_direction(misfit, left),
-        _of_neighbours(misfit, left),
-    ):
+    for search in (_by_level, _by_direction, _of_neighbours):
+        reason = search(misfit, left)
         if reason is not None:
             return reason
     return left_curve(misfit, fit)
 
 
-def left_curve(misfit: WeightedMisfit, fit: EffectFit) -> str | None:
+def left_curve(misfit: WeightedMisfit, fit: EffectFit) -> Fact | None:
     """Which free curve still explains a part of the misfit beside an answer; None if none does.
 
     Stiffness and damping are free functions of amplitude, and the stiffness one of the order of
@@ -221,59 +204,46 @@ def left_curve(misfit: WeightedMisfit, fit: EffectFit) -> str | None:
     chosen, noise = misfit.predictions.chosen, misfit.noise
     if chosen.phase_unknown.any():
         return None  # sizes are not linear in a curve
-    speed = np.abs(np.asarray(chosen.states.velocity)[:, 0])
-    amplitude = hat_functions(np.log(speed), 6)
-    order = np.argsort(np.argsort(chosen.rows)).astype(float)
-    of_test = hat_functions(order, 8)
-    curves = (
-        ("the stiffness as a free function of the amplitude", 0, amplitude),
-        ("the damping as a free function of the amplitude", 1, amplitude),
-        ("a natural frequency that moves freely in the order of the test", 0, of_test),
-    )
+    amplitude = hat_functions(np.log(np.abs(np.asarray(chosen.states.velocity)[:, 0])), 6)
+    of_test = hat_functions(np.argsort(np.argsort(chosen.rows)).astype(float), 8)
+    curves = (("stiffness", 0, amplitude), ("damping", 1, amplitude), ("order", 0, of_test))
     left = noise.decorrelated(fit.rows)
-    own = _basis(noise.decorrelated(fit.slopes.T).T)
+    answer = _basis(noise.decorrelated(fit.slopes.T).T)
     found = []
     for name, part, hats in curves:
         arms = noise.decorrelated((misfit.by_linear[:, [part]] * hats[noise.state]).T).T
-        basis = _basis(np.concatenate([own, arms], axis=1))
-        n_free = misfit.n_rows - basis.shape[1]
-        n_own = basis.shape[1] - own.shape[1]
-        rest = float(left @ left - np.sum((left @ basis) ** 2))
-        gain = float(np.sum((left @ basis) ** 2) - np.sum((left @ own) ** 2))
-        if n_own > 0 and n_free > 0:
-            ratio = max(gain, 0.0) / n_own / (rest / n_free)
-            found.append((float(fdtrc(n_own, n_free, ratio)), name))
+        basis = _basis(np.concatenate([answer, arms], axis=1))
+        n_free, n_curve = misfit.n_rows - basis.shape[1], basis.shape[1] - answer.shape[1]
+        explained = float(np.sum((left @ basis) ** 2))
+        gain = max(explained - float(np.sum((left @ answer) ** 2)), 0.0)
+        if n_curve > 0 and n_free > 0:
+            ratio = gain / n_curve / ((float(left @ left) - explained) / n_free)
+            found.append((float(fdtrc(n_curve, n_free, ratio)), name))
     chance, name = min(found, default=(1.0, ""))
     if chance * len(curves) >= priors.REJECTED:
         return None
-    return (
-        f"{name} still explains a part of the misfit that is left (probability by chance "
-        f"{chance:.0e}): the law is not the true one."
-    )
+    return Fact("curve_left", curve=name, chance=chance)
 
 
-def _by_level(misfit: WeightedMisfit, left: Float[np.ndarray, " row"]) -> str | None:
+def _by_level(misfit: WeightedMisfit, left: Float[np.ndarray, " row"]) -> Fact | None:
     """Misfits of one level, of the force or the harmonics, that are larger than elsewhere."""
     level = np.asarray(misfit.predictions.chosen.states.level)[misfit.noise.state]
     of_force = misfit.noise.column < 2
     groups = [
-        (level == k) & (of_force == force) for k in np.unique(level) for force in (True, False)
+        (k, force, (level == k) & (of_force == force))
+        for k in np.unique(level)
+        for force in (True, False)
     ]
-    groups = [mine for mine in groups if mine.any() and not mine.all()]
-    for mine in groups:
-        ratio = np.mean(left[mine] ** 2) / np.mean(left[~mine] ** 2)
-        if fdtrc(mine.sum(), (~mine).sum(), ratio) < priors.REJECTED / len(groups):
-            name = misfit.level_numbers[int(level[mine][0])]
-            force = bool(of_force[mine][0])
-            what = f"level {name} is" if force else f"the harmonics of level {name} are"
-            return (
-                f"{what} fitted {np.sqrt(ratio):.2g} times worse than the others: something is "
-                "missing there."
-            )
+    groups = [group for group in groups if group[2].any() and not group[2].all()]
+    for k, force, rows in groups:
+        ratio = np.mean(left[rows] ** 2) / np.mean(left[~rows] ** 2)
+        if fdtrc(rows.sum(), (~rows).sum(), ratio) < priors.REJECTED / len(groups):
+            number = int(misfit.level_numbers[int(k)])
+            return Fact("level_worse", level=number, of_force=force, ratio=float(np.sqrt(ratio)))
     return None
 
 
-def _by_direction(misfit: WeightedMisfit, left: Float[np.ndarray, " row"]) -> str | None:
+def _by_direction(misfit: WeightedMisfit, left: Float[np.ndarray, " row"]) -> Fact | None:
     """Misfits of the force in the direction of a frequency change, larger than those across it.
 
     Noise of one size is the same in every direction of whitened parts; a natural frequency that
@@ -282,9 +252,9 @@ def _by_direction(misfit: WeightedMisfit, left: Float[np.ndarray, " row"]) -> st
     noise = misfit.noise
     force = np.full((len(noise.known), 2), np.nan)
     unit = np.full_like(force, np.nan)
-    mine = noise.column < 2
-    force[noise.state[mine], noise.column[mine]] = left[mine]
-    unit[noise.state[mine], noise.column[mine]] = misfit.by_linear[mine, 0]
+    rows = noise.column < 2
+    force[noise.state[rows], noise.column[rows]] = left[rows]
+    unit[noise.state[rows], noise.column[rows]] = misfit.by_linear[rows, 0]
     size = np.linalg.norm(unit, axis=1)
     whole = np.isfinite(force).all(axis=1) & (size > 0)
     if not whole.any() or misfit.predictions.chosen.phase_unknown.any():
@@ -295,14 +265,10 @@ def _by_direction(misfit: WeightedMisfit, left: Float[np.ndarray, " row"]) -> st
     ratio = float(np.sum(with_it**2) / np.sum(across**2))
     if not fdtrc(len(with_it), len(with_it), ratio) < priors.REJECTED:
         return None
-    return (
-        f"the misfit that is left is {np.sqrt(ratio):.2g} times as large in the direction of a "
-        "change of the natural frequency as across it, which noise is not: were the states of a "
-        "level measured at different temperatures?"
-    )
+    return Fact("states_wander", ratio=float(np.sqrt(ratio)))
 
 
-def _of_neighbours(misfit: WeightedMisfit, left: Float[np.ndarray, " row"]) -> str | None:
+def _of_neighbours(misfit: WeightedMisfit, left: Float[np.ndarray, " row"]) -> Fact | None:
     """Misfits that are correlated between neighbouring states of a level."""
     for of_test in (True, False):
         parts = list(along(misfit, left, of_test=of_test))
@@ -312,11 +278,7 @@ def _of_neighbours(misfit: WeightedMisfit, left: Float[np.ndarray, " row"]) -> s
         square = np.mean(np.concatenate(parts) ** 2)
         common = sum(float(some[:-1] @ some[1:]) for some in parts) / number / square
         if ndtr(-common * np.sqrt(number)) < priors.REJECTED / 2:
-            order = "in the order of the test" if of_test else "along the resonance"
-            return (
-                f"the misfits of neighbouring states {order} are correlated ({common:.2f}): those "
-                "of noise are not."
-            )
+            return Fact("neighbours_alike", correlation=float(common), of_test=of_test)
     return None
 
 

@@ -1,4 +1,4 @@
-"""Which further test is expected to separate competing models (optimal design), in words."""
+"""Which further test is expected to separate competing models (optimal design)."""
 
 from collections.abc import Iterator, Sequence
 from functools import cached_property
@@ -25,11 +25,10 @@ from snrmjax.diagnose.misfit.predictions import Predicted
 from snrmjax.diagnose.misfit.programs import COMPARED
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
 from snrmjax.diagnose.search.model_search import FoundEffects
+from snrmjax.numerics.facts import Fact
 
 STATES = 12
 """Of a level, or off resonance, in a further test."""
-
-_CERTAIN = 1.64  # 1σ below the expected gain: noise leaves 95 % of tests with more
 
 
 class ProposedLevel(NamedTuple):
@@ -56,7 +55,7 @@ class DiscriminatingTest(NamedTuple):
     """
 
     kind: str  # "harmonics", "off_resonance", "lower_level", "higher_level", "calibration"
-    sentence: str
+    measurement: Fact | None = None  # where to measure what, and how the models differ there
     quantity: str | None = None  # in which the models differ most: "harmonic 2", "velocity", …
     place: ProposedLevel | None = None
     states: int | None = None
@@ -253,61 +252,48 @@ class _Hypothesis:
             # A gain G of χ² scatters by 2√G.
             ahead = fit.criterion(n) - self.truth.criterion(n)
             least = max(priors.AS_GOOD_BY_CRITERION - ahead, 0.0)
-            needed = float((_CERTAIN + np.sqrt(_CERTAIN**2 + least)) ** 2)
-            said = _difference(test, (self.truth, exact), (fit, its), option)
-            found.append((gain, needed, *said))
+            needed = float((priors.ONE_SIDED + np.sqrt(priors.ONE_SIDED**2 + least)) ** 2)
+            found.append(
+                (gain, needed, *_difference(test, (self.truth, exact), (fit, its), option))
+            )
         if not found:
             return None
-        gain, needed, quantity, words = min(found, key=lambda one: one[0] / one[1])
-        one, mine = self.points[option.place], test.members[option.place]
+        gain, needed, quantity, difference = min(found, key=lambda one: one[0] / one[1])
+        points, rows = self.points[option.place], test.members[option.place]
         states = test.misfit.predictions.chosen.states
         columns = (states.frequency, states.force, np.abs(states.velocity[:, 0]))
-        size = np.degrees(np.abs(one.phase))
+        planned = PlannedStates(*(np.asarray(column)[rows] for column in columns))
         place = ProposedLevel(
-            level=int(self.misfit.level_numbers[one.level]),
+            level=int(self.misfit.level_numbers[points.level]),
             force=test.force[option.place],
             frequency=test.frequency[option.place] / (2 * np.pi),
         )
+        harmonics = option.orders if option.floor is not None else ()
+        size = np.degrees(np.abs(points.phase))
+        measurement = Fact(
+            "measure_test",
+            kind=option.kind,
+            **place._asdict(),
+            scale=points.scale,
+            states=STATES,
+            harmonics=harmonics,
+            harmonic_std=option.floor,
+            largest=float(np.max(planned.velocity, initial=0.0)),
+            difference=difference,
+        )
         return DiscriminatingTest(
             kind=option.kind,
-            sentence=f"{_what_to_measure(place, one.scale, test, option)}: {words}.",
+            measurement=measurement,
             quantity=quantity,
             place=place,
-            states=len(one.phase),
+            states=len(points.phase),
             phase=(float(size.min()), float(size.max())),
-            harmonics=option.orders if option.floor is not None else (),
+            harmonics=harmonics,
             harmonic_std=option.floor,
             expected_gain=float(gain),
             needed_gain=needed,
-            planned=PlannedStates(*(np.asarray(column)[mine] for column in columns)),
+            planned=planned,
         )
-
-
-def _what_to_measure(
-    place: ProposedLevel, scale: float, test: PredictedTest, option: _Option
-) -> str:
-    """Where and what to measure, in words."""
-    at = f"near {place.frequency:.4g} Hz"
-    level = f"level {place.level} ({place.force:.3g} N)"
-    closely = ""
-    if option.floor is not None:
-        velocity = np.asarray(test.misfit.predictions.chosen.states.velocity)[:, 0]
-        largest = np.abs(velocity[test.members[option.place]]).max()
-        names = " and ".join(str(h) for h in option.orders)
-        plural = "s" if len(option.orders) > 1 else ""
-        closely = (
-            f"harmonic{plural} {names} to better than {100 * option.floor / largest:.2g} % of the "
-            f"fundamental ({option.floor:.2g} m/s)"
-        )
-    if option.kind == "harmonics":
-        return f"Measure {closely} at {level} {at}"
-    if option.kind == "off_resonance":
-        return f"Measure {STATES} states 30° to 60° off resonance, on both sides, at {level} {at}"
-    beside = f", with {closely}" if closely else ""
-    return (
-        f"Add a level of {place.force:.3g} N, {scale:g} times the velocities of level "
-        f"{place.level}, with {STATES} states within 55° of resonance {at}{beside}"
-    )
 
 
 def _rows(test: PredictedTest, option: _Option) -> Bool[np.ndarray, " row"]:
@@ -326,51 +312,45 @@ def _difference(
     truth: tuple[EffectFit, Predicted],
     rival: tuple[EffectFit, Predicted],
     option: _Option,
-) -> tuple[str, str]:
-    """In what two models differ most under an option, and by how much, in words."""
+) -> tuple[str, Fact]:
+    """In what two models differ most under an option, and by how much."""
     states = test.misfit.predictions.chosen.states
     velocity, omega = np.asarray(states.velocity)[:, 0], np.asarray(states.frequency)
     columns = rival[1].columns[0] - truth[1].columns[0]
     apart = columns[:, 0::2] + 1j * columns[:, 1::2]
-    mine = np.flatnonzero(test.members[option.place])
-    mine = mine[np.isfinite(apart[mine]).all(axis=1)]
+    rows = np.flatnonzero(test.members[option.place])
+    rows = rows[np.isfinite(apart[rows]).all(axis=1)]
     kinds = truth[0].kinds, rival[0].kinds
-    one, other = (
-        " and ".join(kind for kind in own if kind not in its) for own, its in (kinds, kinds[::-1])
-    )
-    if not mine.size:
-        return "velocity", f"with {one} there is such a motion, with {other} there is none"
-    at = mine[np.argmin(np.abs(np.angle(velocity[mine])))]
+    models = tuple(tuple(kind for kind in kinds[k] if kind not in kinds[1 - k]) for k in range(2))
+    if not rows.size:
+        return "velocity", Fact("motion_of_one", models=models)
+    at = rows[np.argmin(np.abs(np.angle(velocity[rows])))]
     if option.floor is not None:
         places = [COMPARED.index(h) for h in option.orders]
         own = np.asarray(states.harmonics)[at, 0, places] / np.abs(velocity[at])
         its = own + apart[at, [len(test.misfit.predictions.chosen.sensors) + k for k in places]]
         most = int(np.argmax(np.abs(own - its)))
-        name = f"harmonic {option.orders[most]}"
-        sizes = [f"{round(100 * abs(h[most]), 6):.2g} %" for h in (own, its)]
-        both = np.abs([own[most], its[most]])
-        turned = abs(np.degrees(np.angle(its[most] / own[most]))) if both.min() > 0 else 0.0
-        seen = both.min() > 0.1 * both.max() and turned > 1.0
-        turn = f", turned by {turned:.0f}°" if seen else ""
-        words = f"{sizes[0]} of the fundamental with {one}, {sizes[1]}{turn} with {other}"
-        return name, f"{name} is {words}"
+        sizes = np.abs([own[most], its[most]])
+        turned = abs(np.degrees(np.angle(its[most] / own[most]))) if sizes.min() > 0 else 0.0
+        seen = sizes.min() > 0.1 * sizes.max() and turned > 1.0
+        harmonic = {"harmonic": option.orders[most], "shares": tuple(sizes.tolist())}
+        turn = {"turned_deg": float(turned) if seen else None}
+        difference = Fact("harmonics_apart", models=models, **harmonic, **turn)
+        return f"harmonic {option.orders[most]}", difference
     if option.kind == "off_resonance":
-        share = 100 * float(np.abs(apart[mine, 0]).max())
-        return "velocity", f"with {one} and {other} velocities differ by up to {share:.2g} %"
+        share = float(np.abs(apart[rows, 0]).max())
+        return "velocity", Fact("velocities_apart", models=models, share=share)
     # The force goes with iΩδ + Δω̃² there: more of it is less velocity, or a higher frequency.
     modes, j = test.misfit.model.modes, test.misfit.model.modes.mode_of_interest
     slower = float(apart[at, 0].real)
     shift = -float(apart[at, 0].imag * modes.damping_ratio[j])
     if abs(slower) > 50 * abs(shift):  # a careful test resolves 1 % of one, 0.02 % of the other
-        speed = float(np.abs(velocity[at]))
-        values, unit, name = (speed, speed / max(1 + slower, 0.1)), "m/s", "velocity"
+        quantity, size = "velocity", float(np.abs(velocity[at]))
+        values = size, size / max(1 + slower, 0.1)
     else:
-        hertz = float(omega[at]) / (2 * np.pi)
-        values, unit, name = (hertz, hertz * (1 + shift)), "Hz", "frequency"
-    return (
-        name,
-        f"{name} at resonance {values[0]:.4g} {unit} with {one}, {values[1]:.4g} with {other}",
-    )
+        quantity, size = "frequency", float(omega[at]) / (2 * np.pi)
+        values = size, size * (1 + shift)
+    return quantity, Fact("resonances_apart", models=models, quantity=quantity, values=values)
 
 
 def recommended_test(found: FoundEffects) -> DiscriminatingTest | None:
@@ -378,54 +358,41 @@ def recommended_test(found: FoundEffects) -> DiscriminatingTest | None:
 
     A calibration where nothing else separates them; None where nothing is open.
     """
-    open_places = [k for k, group in enumerate(found.classes) if len(group) > 1]
+    static = [only_by_calibration(group) for group in found.classes]
     places = tuple(
-        k for k in open_places if set(found.classes[k]) - only_by_calibration(found.classes[k])
+        k
+        for k, (group, own) in enumerate(zip(found.classes, static, strict=True))
+        if len(group) > 1 and set(group) - own
     )
-    if not open_places:
-        return None
-    unclear = {kind for k in open_places for kind in found.classes[k]}
-    too = any(only_by_calibration(found.classes[k]) for k in open_places)
     test = discriminating_test(found, places) if places else None
     if test is not None:
-        return test._replace(calibration_too=too)
-    return DiscriminatingTest("calibration", decide_by(unclear, harmonics=True)) if too else None
+        return test._replace(calibration_too=any(static))
+    return DiscriminatingTest("calibration") if any(static) else None
 
 
 def recommendation(
     found: FoundEffects,
     test: DiscriminatingTest | None,
-    open_questions: Sequence[str],
+    open_questions: Sequence[Fact | str],
     *,
     phases: bool,
-) -> str | None:
-    """What would decide, each measurement in one sentence and said once; None if nothing is open.
+) -> Fact | None:
+    """What would decide, each measurement once; None if nothing is open.
 
     Arguments: `open_questions` are the measurements that would resolve doubts; `phases` says
     whether any phase of the velocity is known.
     """
     groups = [set(group) for group in found.classes if len(group) > 1]
-    harmonics = bool(found.misfit.predictions.chosen.orders)
-    sentences = []
+    asked: list[Fact | str] = []
     if groups and not phases:
-        sentences.append("Record the phase of the velocity relative to the force.")
-    if test is None or test.kind == "calibration":
-        sentences += [decide_by(set().union(*groups), harmonics=harmonics)] if groups else []
+        asked.append(Fact("record_phase"))
+    if test is None or test.measurement is None:
+        harmonics = bool(found.misfit.predictions.chosen.orders)
+        asked += decide_by(set().union(*groups), harmonics=harmonics) if groups else []
     else:
-        static = [only_by_calibration(group) for group in groups]
-        sentences += [decide_by(group, harmonics=True) for group in static if group]
-        if not test.settles:
-            sentences.append(
-                "No single test that was compared is expected to decide; the most informative one:"
-            )
-        sentences.append(test.sentence)
-    sentences += [f"{text[0].upper()}{text[1:]}." for text in open_questions]
-    # Every measurement once: the most specific sentence of those that begin alike.
-    every = list(dict.fromkeys(sentences))
-    asked = [one.rstrip(".").lower() for one in every]
-    said = [
-        one
-        for k, one in enumerate(every)
-        if not any(asked[k] in other for j, other in enumerate(asked) if j != k)
-    ]
-    return " ".join(said) or None
+        for static in map(only_by_calibration, groups):
+            asked += decide_by(static, harmonics=True) if static else []
+        asked += [] if test.settles else [Fact("no_test_settles")]
+        asked.append(test.measurement)
+    asked = list(dict.fromkeys([*asked, *open_questions]))
+    return Fact("recommendation", measurements=tuple(asked)) if asked else None

@@ -1,6 +1,7 @@
 """Where no effect of the library explains the data, an answer by a law that is drawn from them."""
 
 import dataclasses
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -17,10 +18,9 @@ from snrmjax.diagnose.checks.residuals import (
     rows_of_level,
     tolerated,
 )
-from snrmjax.diagnose.laws.law_prior import posterior
+from snrmjax.diagnose.laws.law_prior import PARTS, posterior
 from snrmjax.diagnose.laws.law_search import (
     LAW_KINDS,
-    SURE,
     DrawnLaw,
     LawFit,
     drawn_tables,
@@ -39,6 +39,7 @@ from snrmjax.model.effect_shape import shape_of
 from snrmjax.model.effects import EFFECTS
 from snrmjax.model.parameters import with_parameters
 from snrmjax.model.structures import Structure
+from snrmjax.numerics.facts import Fact
 
 
 class LawAnswer(NamedTuple):
@@ -55,8 +56,8 @@ class LawAnswer(NamedTuple):
     levels: HeldOutLevels | None
     completed: Structure
     completed_without: dict[int, Structure]
-    notes: tuple[str, ...]
-    decide_by: str | None
+    notes: tuple[Fact, ...]
+    decide_by: Fact | None
 
 
 def law_answer(found: FoundEffects, model: Structure) -> LawAnswer | None:
@@ -152,71 +153,55 @@ def _notes(
     laws: tuple[DrawnLaw, ...],
     levels: HeldOutLevels | None,
     found: FoundEffects,
-) -> list[str]:
+) -> Iterator[Fact]:
     first = laws[0]
-    unit = "m/s" if first.argument is Argument.VELOCITY else "m"
-    notes = [
-        f"no effect of the library explains the data; the law is drawn from them with "
-        f"{fit.posterior.freedom:.1f} effective parameters. It was measured up to "
-        f"{first.largest:.3g} {unit}: beyond, it goes on straight, which nothing proves."
-    ]
+    yield Fact(
+        "law_is_drawn",
+        freedom=fit.posterior.freedom,
+        largest=first.largest,
+        argument=first.argument.value,
+    )
     if levels is not None:
-        inner, outer = levels
-        notes.append(
-            f"level {inner.level}, left out, is predicted by interpolation: {inner.after:.2g} "
-            f"times the noise ({inner.before:.2g} before); the top level {outer.level} by "
-            f"extrapolation: {outer.after:.2g} ({outer.before:.2g} before)."
-        )
+        inner, outer = ((held.level, held.before, held.after) for held in levels)
+        yield Fact("law_left_out", inner=inner, outer=outer)
     if _odd_alone(fit):
-        notes.append("without harmonics the odd part of the force alone is seen.")
+        yield Fact("odd_part_alone")
     if fit.rivals:
-        rivals = [LAW_KINDS[part] for part in fit.rivals]
-        notes.append(f"{' or '.join(rivals)} would do about as well.")
-    return notes + _closest(fit, first, found)
+        yield Fact("laws_as_good", effects=tuple(LAW_KINDS[part] for part in fit.rivals))
+    yield from _closest(fit, first, found)
 
 
 def _odd_alone(fit: LawFit) -> bool:
-    return not fit.misfit.predictions.chosen.orders and fit.posterior.parts[0].startswith("odd")
+    odd = PARTS[fit.posterior.parts[0]].symmetry == "odd"
+    return odd and not fit.misfit.predictions.chosen.orders
 
 
-def _decide_by(fit: LawFit) -> str | None:
+def _decide_by(fit: LawFit) -> Fact | None:
     """The measurement that would settle what kind of law it is."""
-    if fit.rivals:
-        return (
-            "Record harmonics 2 and 3 of the velocity (with their noise floor) at the largest "
-            "level: their sign and size tell a force of the velocity from one of the displacement."
-        )
-    if _odd_alone(fit):
-        return (
-            "Record harmonic 2 of the velocity (with its noise floor) at the largest level: it "
-            "shows whether the force is the same in both directions."
-        )
-    return None
+    if not (fit.rivals or _odd_alone(fit)):
+        return None
+    return Fact("record_harmonics_of_law", kind_is_open=bool(fit.rivals))
 
 
-def _closest(fit: LawFit, law: DrawnLaw, found: FoundEffects) -> list[str]:
-    """Where the laws of the library that fit best alone leave the band."""
+def _closest(fit: LawFit, law: DrawnLaw, found: FoundEffects) -> Iterator[Fact]:
+    """Where the two laws of the library that fit best alone leave the band."""
     modes = fit.misfit.model.modes
     j = modes.mode_of_interest
     size = abs(float(modes.mode_shape[fit.misfit.predictions.chosen.sensors[0], j]))
-    notes: list[str] = []
+    alike = []
     for row in found.table[0] if found.table else ():
         effect = EFFECTS[row.kind]
         shape = shape_of(effect)
         if not issubclass(effect, AbstractMemoryless) or shape is None:
             continue
-        if shape.argument is not law.argument or not np.isfinite(row.gain):
-            continue
-        own = effect(*(jnp.asarray(value) for value in row.parameters.values()))
+        if shape.argument is law.argument and np.isfinite(row.gain):
+            alike.append((effect, row.parameters.values()))
+    for effect, parameters in alike[:2]:
         at = jnp.asarray(law.at / size)
         zero = jnp.zeros_like(at)
         pair = (zero, at) if law.argument is Argument.VELOCITY else (at, zero)
-        force = np.asarray(own.cycle_force(*pair)) / size
-        beyond = np.abs(force - law.force) > SURE * law.force_std + 1e-12 * np.abs(law.force).max()
-        unit = "m/s" if law.argument is Argument.VELOCITY else "m"
-        said = "stays within the 95 % band of the law."
-        if beyond.any():
-            ends = f"{law.at[beyond].min():.3g} and {law.at[beyond].max():.3g} {unit}"
-            said = f"leaves the 95 % band of the law between {ends}."
-        notes.append(f"{row.kind}, fitted alone, {said}")
-    return notes[:2]
+        force = effect(*map(jnp.asarray, parameters)).cycle_force(*pair)
+        off = np.abs(np.asarray(force) / size - law.force)
+        beyond = law.at[off > priors.BAND * law.force_std + 1e-12 * np.abs(law.force).max()]
+        ends = (float(beyond.min()), float(beyond.max())) if beyond.size else None
+        yield Fact("law_of_library", effect=effect.kind, beyond=ends, argument=law.argument.value)

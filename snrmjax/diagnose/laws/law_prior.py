@@ -29,17 +29,19 @@ SIZES = 2.0 ** np.arange(-7.0, 9.0)
 class LawPart(NamedTuple):
     """A part of a law: a table of secants, or two with one sign or opposite ones."""
 
+    law: str
     tables: tuple[int, ...]
     signs: tuple[float, ...]
+    symmetry: str = ""
     not_negative: bool = False
 
 
 PARTS = {
-    "odd spring": LawPart((0, 1), (1.0, 1.0)),
-    "even spring": LawPart((0, 1), (1.0, -1.0)),
-    "odd damper": LawPart((2,), (1.0,)),
-    "film": LawPart((3,), (1.0,)),
-    "slip": LawPart((4,), (1.0,), not_negative=True),
+    "odd_spring": LawPart("spring", (0, 1), (1.0, 1.0), "odd"),
+    "even_spring": LawPart("spring", (0, 1), (1.0, -1.0), "even"),
+    "odd_damper": LawPart("damper", (2,), (1.0,), "odd"),
+    "displacement_damping": LawPart("displacement_damping", (3,), (1.0,)),
+    "slip": LawPart("slip", (4,), (1.0,), not_negative=True),
 }
 """Parts of laws, by what they are called here; tables are those of `LawColumns`.
 

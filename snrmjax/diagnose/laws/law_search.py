@@ -27,6 +27,7 @@ from snrmjax.model.library.free_laws import (
     StiffnessLaw,
     UnevenStiffnessLaw,
 )
+from snrmjax.numerics.facts import Fact
 
 _KNOTS = 24
 
@@ -58,10 +59,10 @@ class LawFit(NamedTuple):
         """The probability of its class among laws of one quantity, all as likely before."""
         own = self.posterior.cost
         alone: dict[str, float] = {}
-        for part in PARTS:
-            cost = best_processes(self.problem, (part,))[1]
-            alone[_class_of(part)] = min(cost, alone.get(_class_of(part), np.inf))
-        alone.pop(_class_of(self.posterior.parts[0]))
+        for name, part in PARTS.items():
+            cost = best_processes(self.problem, (name,))[1]
+            alone[part.law] = min(cost, alone.get(part.law, np.inf))
+        alone.pop(PARTS[self.posterior.parts[0]].law)
         return 1 / (1 + float(np.sum(np.exp(-0.5 * (np.array(list(alone.values())) - own)))))
 
     @property
@@ -132,13 +133,8 @@ def fit_laws(misfit: WeightedMisfit) -> LawFit | None:
 
 
 def _is_one(parts: Sequence[str]) -> bool:
-    """Whether parts are those of one law: a spring, a damper, a film or slip."""
-    return len({_class_of(part) for part in parts}) == 1
-
-
-def _class_of(part: str) -> str:
-    """Of a part, what it is a function of: "odd spring" and "even spring" are of one law."""
-    return part.split()[-1]
+    """Whether parts are those of one law: a spring, a damper, one by displacement or slip."""
+    return len({PARTS[part].law for part in parts}) == 1
 
 
 def law_problem(
@@ -206,16 +202,21 @@ def _parts(problem: LawProblem, most: int) -> tuple[tuple[str, ...], tuple[str, 
     return best, rivals if len(best) == 1 else ()
 
 
-SURE = 1.96
-"""1σ of a 95 % band."""
-
 LAW_KINDS = {
-    "odd spring": StiffnessLaw.kind,
-    "even spring": UnevenStiffnessLaw.kind,
-    "odd damper": DampingLaw.kind,
-    "film": DisplacementDampingLaw.kind,
+    "odd_spring": StiffnessLaw.kind,
+    "even_spring": UnevenStiffnessLaw.kind,
+    "odd_damper": DampingLaw.kind,
+    "displacement_damping": DisplacementDampingLaw.kind,
     "slip": SlipLaw.kind,
 }
+
+
+class LawOnset(NamedTuple):
+    """From where on a force is seen, or changes its sign."""
+
+    at: float  # m or m/s
+    side: int  # 1 or −1 of a law that differs between positive and negative values, else 0
+    adds: bool  # to stiffness or damping
 
 
 class DrawnLaw(NamedTuple):
@@ -228,7 +229,9 @@ class DrawnLaw(NamedTuple):
     stiffness; of a damping that depends on the displacement the force at the velocity `passing`.
     """
 
-    name: str  # its class in words
+    law: str  # "spring", "damper", "displacement_damping" or "slip"
+    symmetries: tuple[str, ...]  # "odd", "even", where a law has them
+    onsets: tuple[LawOnset, ...]
     argument: Argument  # displacement or velocity
     at: Float[np.ndarray, " knot"]
     force: Float[np.ndarray, " knot"]
@@ -236,23 +239,34 @@ class DrawnLaw(NamedTuple):
     largest: float  # of `at`, that was measured: what is beyond is extrapolated
     passing: float | None = None  # m/s
 
+    @property
+    def title(self) -> str:
+        """Its class in words."""
+        return str(Fact("law_class", law=self.law, symmetries=self.symmetries, onsets=()))
+
+    @property
+    def name(self) -> str:
+        """Its class in words, and from where on it acts which way."""
+        return str(Fact("law_class", law=self.law, symmetries=self.symmetries, onsets=self.onsets))
+
 
 def law_effects(fit: LawFit, secants: Float[np.ndarray, "table knot"]) -> list[AbstractEffect]:
     """Effects of the model, one for the springs, one for the dampers and so on, by importance."""
     found: list[AbstractEffect] = []
-    x, v, s = (jnp.asarray(knots) for knots in fit.knots)
+    x, v, slip = (jnp.asarray(knots) for knots in fit.knots)
     w = jnp.asarray(secants)
     for group in _grouped(fit.posterior.parts):
-        two_sided = "even spring" in group
-        if group[0].endswith("spring"):
-            own = UnevenStiffnessLaw(x, w[0] * x, w[1] * x) if two_sided else None
-            found.append(own or StiffnessLaw(x, w[0] * x))
-        elif group[0].endswith("damper"):
-            found.append(DampingLaw(v, w[2] * v))
-        elif group[0] == "film":
-            found.append(DisplacementDampingLaw(x, w[3]))
-        else:
-            found.append(SlipLaw(s, jnp.maximum(w[4], 0.0)))
+        match PARTS[group[0]].law:
+            case "spring" if "even_spring" in group:
+                found.append(UnevenStiffnessLaw(x, w[0] * x, w[1] * x))
+            case "spring":
+                found.append(StiffnessLaw(x, w[0] * x))
+            case "damper":
+                found.append(DampingLaw(v, w[2] * v))
+            case "displacement_damping":
+                found.append(DisplacementDampingLaw(x, w[3]))
+            case _:
+                found.append(SlipLaw(slip, jnp.maximum(w[4], 0.0)))
     return found
 
 
@@ -266,15 +280,16 @@ def drawn_tables(fit: LawFit) -> list[DrawnLaw]:
     size = abs(shape)
     tables = []
     for group in _grouped(fit.posterior.parts):
-        passing = float(speed.max()) if group == ("film",) else None
+        law, symmetries = PARTS[group[0]].law, (PARTS[part].symmetry for part in group)
+        passing = float(speed.max()) if law == "displacement_damping" else None
         at, force, std, side = _modal_table(fit, group, (passing or 0.0) / size)
         if side and shape < 0:
             at, force, std = -at[::-1], -force[::-1], std[::-1]
-        is_velocity = group[0].endswith("damper")
+        is_velocity = law == "damper"
         measured = speed if is_velocity else speed / np.asarray(states.frequency)
         tables.append(
             DrawnLaw(
-                _words(group, at * size, force, std),
+                *(law, tuple(filter(None, symmetries)), _onsets(at * size, force, std)),
                 Argument.VELOCITY if is_velocity else Argument.DISPLACEMENT,
                 at * size,
                 force / size,
@@ -302,15 +317,15 @@ def _modal_table(
     n = len(knots.slip)
     eye = np.eye(len(post.parts) * n)
     tables = secants_of(post.parts, eye, fit.units)  # secant, table, knot
-    two_sided = "even spring" in group
-    if group == ("slip",):
+    law, two_sided = PARTS[group[0]].law, "even_spring" in group
+    if law == "slip":
         at = knots.displacement
         force = -np.einsum("ek,kx->ex", tables[:, 4], np.maximum(at - knots.slip[:, None], 0.0))
-    elif group == ("film",):
+    elif law == "displacement_damping":
         at, force = knots.displacement, passing * tables[:, 3]
     else:
         first = PARTS[group[0]].tables[0]
-        at = knots.velocity if group[0].endswith("damper") else knots.displacement
+        at = knots.velocity if law == "damper" else knots.displacement
         force = tables[:, first] * at
         if two_sided:
             force = np.concatenate([-(tables[:, first + 1] * at)[:, ::-1], force], axis=1)
@@ -322,32 +337,16 @@ def _modal_table(
     return at, mean, std, two_sided
 
 
-def _words(group: tuple[str, ...], at: np.ndarray, force: np.ndarray, std: np.ndarray) -> str:
-    """The class of a law: what it is, and from where it grows which way."""
-    names = {
-        "spring": ("stiffness", "hardening", "softening"),
-        "damper": ("damping", "more damping", "less damping"),
-        "film": ("damping that depends on the displacement", "more damping", "less damping"),
-        "slip": ("friction with a memory", "gaining stiffness", "losing stiffness"),
-    }
-    word = group[0].split()[-1]
-    name, more, less = names[word]
-    symmetry = [part.split()[0] for part in group if " " in part]
-    unit = "m/s" if word == "damper" else "m"
-    text = f"{' and '.join(symmetry)} {name}".strip()
-    sides = [("", at > 0, force)]
-    if at[0] < 0:
-        sides = [(" for positive values", at > 0, force), (" for negative values", at < 0, -force)]
-    for side, there, signed in sides:
+def _onsets(at: np.ndarray, force: np.ndarray, std: np.ndarray) -> tuple[LawOnset, ...]:
+    """Where a force that is sure begins, or changes its sign, from rest to either side."""
+    found = []
+    for side in (1, -1) if at[0] < 0 else (0,):
+        there = at < 0 if side < 0 else at > 0
         order = np.argsort(np.abs(at[there]))
-        x, f = np.abs(at[there])[order], signed[there][order]
-        seen = np.abs(f) > SURE * std[there][order]
+        x, f = np.abs(at[there])[order], (force[there] * (side or 1))[order]
         last = 0.0
-        for k in np.flatnonzero(seen):  # where a force that is sure begins, or changes its sign
+        for k in np.flatnonzero(np.abs(f) > priors.BAND * std[there][order]):
             if np.sign(f[k]) != last:
                 last = np.sign(f[k])
-                prefixes = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"))
-                size, prefix = next((pair for pair in prefixes if x[k] >= pair[0]), prefixes[-1])
-                from_there = f"from {x[k] / size:.2g} {prefix}{unit}{side}"
-                text += f", {more if last > 0 else less} {from_there}"
-    return text
+                found.append(LawOnset(float(x[k]), side, bool(last > 0)))
+    return tuple(found)

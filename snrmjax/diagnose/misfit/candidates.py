@@ -13,6 +13,7 @@ from snrmjax.model.effects import EFFECTS, effect_parameters
 from snrmjax.model.library.confusions import CONFUSIONS
 from snrmjax.model.modes import LinearModes
 from snrmjax.model.structures import Structure
+from snrmjax.numerics.facts import Fact
 
 
 class EffectCandidate(NamedTuple):
@@ -48,22 +49,16 @@ def only_by_calibration(kinds: Iterable[str]) -> set[str]:
     return set().union(*(group for group in found if len(group) > 1))
 
 
-def decide_by(kinds: set[str], *, harmonics: bool) -> str:
-    """A sentence: the measurement that would settle which of several kinds it is."""
-    fitting = [
+def decide_by(kinds: set[str], *, harmonics: bool) -> list[Fact | str]:
+    """The measurements that would settle which of several kinds it is, two at most."""
+    fitting: list[Fact | str] = [
         one.separated_by
         for one in _confusions(kinds)
         if len(_confused(one, kinds)) > 1 or one.by_itself
     ]
-    if not fitting and not harmonics:
-        fitting.append(
-            "record the second and third harmonics of the velocity (with their noise floor) at the "
-            "largest level"
-        )
-    if not fitting:
-        fitting.append("widen the range of levels and measure farther off resonance on both sides")
-    text = "; ".join(list(dict.fromkeys(fitting))[:2])
-    return f"{text[0].upper()}{text[1:]}."
+    if fitting:
+        return list(dict.fromkeys(fitting))[:2]
+    return [Fact("widen_range") if harmonics else Fact("record_harmonics")]
 
 
 def _confusions(kinds: Iterable[str]) -> list[Confusion]:

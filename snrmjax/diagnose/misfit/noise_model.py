@@ -7,6 +7,7 @@ the model. One equation is left of two for a state. Every candidate has phases o
 assumed, and nothing is iterated.
 """
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +15,7 @@ from jaxtyping import Bool, Complex, Float, Int
 from scipy.special import chdtrc, ive
 
 from snrmjax.identify.calibrate.calibration_states import CalibrationStates, ComparedColumns
+from snrmjax.numerics.facts import Fact
 
 
 class SharedCovariance(NamedTuple):
@@ -257,46 +259,34 @@ def sizes_of(chosen: ComparedColumns) -> Sizes:
 
 
 def notes_without_phases(
-    chosen: ComparedColumns, phase: Float[np.ndarray, " state"], levels: np.ndarray
-) -> list[str]:
-    """Notes on what a diagnosis cannot find without phases.
+    chosen: ComparedColumns,
+    phase: Float[np.ndarray, " state"],
+    levels: Int[np.ndarray, " level"],
+) -> Iterator[Fact]:
+    """What a diagnosis cannot find without phases.
 
     Arguments: `phase` is that of the velocities as the model has it, rad; `levels` are the
     numbers of the levels.
     """
     unknown = chosen.phase_unknown[:, 0]
-    if not chosen.phase_unknown.any():
-        return []
     if not unknown.any():
-        return ["the phases of some sensors are unknown: their amplitudes alone are compared."]
-    notes = [
-        f"the phases of {int(unknown.sum())} of {len(unknown)} states are unknown: for these only "
-        "the size of the force is compared, one number in place of two, and the phases are those "
-        "of the model. This hardly separates stiffness from damping: at resonance an amplitude "
-        "shows the damping alone, off resonance hardly any of it."
-    ]
+        if chosen.phase_unknown.any():
+            yield Fact("phases_of_sensors_unknown")
+        return
+    yield Fact("phases_unknown", n_states=int(unknown.sum()), of_states=len(unknown))
     if unknown.all():
-        notes.append(
-            "an error of the sensor's phase cannot be detected: it is not among the candidates."
-        )
+        yield Fact("sensor_phase_unseen")
     if chosen.orders:
-        notes.append(
-            "of harmonics the sizes alone are compared: their signs, which separate cubic from van "
-            "der Pol damping, are lost."
+        yield Fact("harmonics_without_phase")
+    level, off = np.asarray(chosen.states.level), np.abs(phase) > np.radians(30.0)
+    for near in (True, False):
+        lacking = tuple(
+            int(number)
+            for place, number in enumerate(levels)
+            if (states := (level == place) & unknown).any() and np.all(off[states] == near)
         )
-    level, off = np.asarray(chosen.states.level), np.radians(30.0)
-    for near, what in (("within", "damping"), ("beyond", "stiffness")):
-        lacking = []
-        for number, name in enumerate(levels):
-            size = np.abs(phase[(level == number) & unknown])
-            if size.size and np.all(size > off if near == "within" else size < off):
-                lacking.append(str(name))
         if lacking:
-            notes.append(
-                f"no state {near} 30° of resonance at level {', '.join(lacking)} (by the model): "
-                f"its {what} is hardly determined."
-            )
-    return notes
+            yield Fact("no_state_there", near=near, levels=lacking)
 
 
 def _complex(columns: np.ndarray, axis: int) -> np.ndarray:

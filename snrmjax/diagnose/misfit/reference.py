@@ -25,6 +25,7 @@ from snrmjax.measure.states import SteadyStates
 from snrmjax.model.modes import residual_velocity
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import padded
+from snrmjax.numerics.facts import Fact
 
 _FEWEST = 6  # states with a phase
 
@@ -164,7 +165,7 @@ def driven_by_voltage(data: SteadyStates) -> bool:
 
 def with_first_gain(
     model: Structure, data: SteadyStates
-) -> tuple[SteadyStates, float, tuple[str, ...]]:
+) -> tuple[SteadyStates, float, tuple[Fact | str, ...]]:
     """The states with a force by a first value (N/V) of the unknown gain, and notes on it.
 
     The gain must stay free. It is the median, over the states, of the force that the model needs
@@ -186,18 +187,14 @@ def with_first_gain(
     gains = np.abs(needed if unknown.any() else part)
     if not np.any(np.isfinite(gains)):
         raise ValueError("the model has no motion of the measured amplitude for any state.")
-    gain, by = float(np.median(gains[np.isfinite(gains)])), "the model as given"
-    doubt = ""
+    gain, doubt, from_curves = float(np.median(gains[np.isfinite(gains)])), None, False
     # Twice: the first curves' prior lies about what the model as given needs.
     for _ in range(0 if unknown.any() else 2):
         reference = reference_of(predictions_of(model, driven(gain), FREE_GAIN_STD))
         if reference is None:
             break
         mass, std = reference.posterior.modal_mass
-        gain, by = gain / mass, "smooth curves of amplitude"
+        gain, from_curves = gain / mass, True
         doubt = force_gain_undetermined(std / mass, float(np.max(np.abs(phase))))
-    note = (
-        f"the force is known as a drive voltage only: about {gain:.4g} N/V by {by}. The gain "
-        "is fitted too: a 1 % error of the gain looks like 1 % of damping."
-    )
+    note = Fact("gain_of_drive", gain=gain, from_curves=from_curves)
     return driven(gain), gain, (note, doubt) if doubt else (note,)

@@ -16,6 +16,7 @@ from snrmjax.condense.scale_study import SCALES
 from snrmjax.io.files import FilePath
 from snrmjax.io.tables import write_table
 from snrmjax.model.structures import Structure
+from snrmjax.numerics.facts import Fact
 
 ASSUMED_DAMPING = 0.01
 """Damping ratio of a mode of which nobody stated one: no finite-element model has it."""
@@ -49,7 +50,7 @@ class ReductionSource(NamedTuple):
     degree: int = 3
     scales: tuple[float, ...] = SCALES  # of the study over load scale
     lines: ShapeLines | None = None
-    notes: tuple[str, ...] = ()
+    notes: tuple[Fact, ...] = ()
 
     def structure(self, found: Condensation) -> Structure:
         """The reduced model as a structure that a model file can hold."""

@@ -18,13 +18,13 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from snrmjax.identify.pointwise.snrm import reference_sensor
 from snrmjax.measure.recordings.ring_down import find_ring_downs
 from snrmjax.measure.recordings.steps import moves_within_steps, recognise_steps
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.recordings.tone_track import ToneTrack, track_tone, unwrapped_phase
 from snrmjax.measure.sweeps.sweep_runs import sweep_runs
-from snrmjax.model.modes import LinearModes
+from snrmjax.model.modes import LinearModes, reference_sensor
+from snrmjax.numerics.facts import Fact
 
 _MOTIONS = ("velocity", "acceleration", "displacement")
 _HERTZ = 2 * np.pi
@@ -68,7 +68,7 @@ class RecordedTest(NamedTuple):
     recording: TimeRecording
     channels: RecordChannels
     kind: RecordKind
-    why: str
+    why: Fact  # by which rule
     free: tuple[tuple[int, int], ...] = ()  # samples of free decays, start and stop
     frequency: float = np.nan  # rad/s, strongest of the motion
 
@@ -103,7 +103,7 @@ def recorded_test(recording: TimeRecording, modes: LinearModes) -> RecordedTest:
     free = _free_stretches(recording, guide, channels.reference)
     if sum(stop - start for start, stop in free) >= _FREE * recording.n_samples:
         _near_the_mode(recording, frequency, frequency, rest)
-        why = f"{guide} stops for {len(free)} stretch{'es' if len(free) > 1 else ''} of 12 cycles"
+        why = Fact("drive_stops", channel=guide, n=len(free))
         return RecordedTest(recording, channels, RecordKind.FREE_DECAY, why, free, frequency)
     track = _tone(recording, guide)
     if track is not None:
@@ -112,13 +112,13 @@ def recorded_test(recording: TimeRecording, modes: LinearModes) -> RecordedTest:
         kind, why = _of_tone(recording, guide, track)
         return RecordedTest(recording, channels, kind, why, (), frequency)
     if fall.decays:
-        why = f"the motion decays, and {guide} is noise"
+        why = Fact("motion_decays_under_noise", channel=guide)
         parts = ((fall.start, len(motion)),)
         frequency = _of_fall(motion, fall, recording.sampling_rate)
         return RecordedTest(recording, channels, RecordKind.FREE_DECAY, why, parts, frequency)
     low, high = _band(recording.values([guide], 0, _LOOKED_AT)[0], recording.sampling_rate)
     _near_the_mode(recording, low, high, rest)
-    why = f"{guide} is no tone: it holds {low / _HERTZ:.4g} to {high / _HERTZ:.4g} Hz"
+    why = Fact("drive_is_no_tone", channel=guide, low_hz=low / _HERTZ, high_hz=high / _HERTZ)
     return RecordedTest(recording, channels, RecordKind.BROADBAND, why, (), frequency)
 
 
@@ -193,7 +193,7 @@ def _undriven(
             "decay nor a forced test."
         )
     _near_the_mode(recording, frequency, frequency, rest)
-    why = "no force or drive acts, and the motion falls"
+    why = Fact("motion_falls_undriven")
     free = ((fall.start, recording.n_samples if count < _LOOKED_AT else count),)
     return RecordedTest(recording, channels, RecordKind.FREE_DECAY, why, free, frequency)
 
@@ -225,7 +225,7 @@ def _tone(recording: TimeRecording, guide: str) -> ToneTrack | None:
     return track if amplitude < _TONE_AMPLITUDE and frequency < _TONE_FREQUENCY else None
 
 
-def _of_tone(recording: TimeRecording, guide: str, track: ToneTrack) -> tuple[RecordKind, str]:
+def _of_tone(recording: TimeRecording, guide: str, track: ToneTrack) -> tuple[RecordKind, Fact]:
     rate = recording.sampling_rate
     steps = [
         one
@@ -235,10 +235,10 @@ def _of_tone(recording: TimeRecording, guide: str, track: ToneTrack) -> tuple[Re
     covered = sum(one.stop - one.start for one in steps) / max(float(np.ptp(track.middle)), 1.0)
     stays = moves_within_steps(steps, track, rate) < _MOVES
     if len(steps) > 1 and covered >= _STEPS_COVER and stays:
-        return RecordKind.STEPPED_SINE, f"{guide} is a tone of {len(steps)} steps"
+        return RecordKind.STEPPED_SINE, Fact("tone_in_steps", channel=guide, n=len(steps))
     runs = sweep_runs(track, unwrapped_phase(track))
     if runs:
-        return RecordKind.SLOW_SWEEP, f"{guide} is a tone whose frequency moves, {len(runs)} times"
+        return RecordKind.SLOW_SWEEP, Fact("tone_that_moves", channel=guide, n=len(runs))
     raise ValueError(
         f"{recording.name}: {guide} is a single tone of "
         f"{np.median(track.frequency) * rate / _HERTZ:.5g} Hz, of which no method makes a backbone."

@@ -9,6 +9,7 @@ from snrmjax.measure.recordings.channels import channel_number
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.methods.records.resonant_decay import even_record
 from snrmjax.methods.records.ring_down_decays import above_noise, white_noise
+from snrmjax.numerics.facts import Fact
 
 _HERTZ = 2 * np.pi
 _ABOVE_NOISE = 4.0  # standard deviations of noise down to which a motion is read
@@ -25,7 +26,7 @@ class RecordedVelocity(NamedTuple):
     velocity: Float[np.ndarray, " sample"]  # m/s
     start: int  # sample of the record at which it begins
     floor: float  # m/s: smaller amplitudes are noise
-    notes: tuple[str, ...] = ()
+    notes: tuple[Fact, ...] = ()
 
 
 def recorded_velocity(
@@ -49,10 +50,8 @@ def recorded_velocity(
     quantity = recording.channels[channel_number(recording.channels, name)].quantity
     start, stop = part
     values = recording.values([name], start, stop)[0]
-    time, signal = even_record(
-        recording.time(start, stop), values - values.mean(), f"channel {name}"
-    )
-    notes: tuple[str, ...] = ()
+    time, signal = even_record(recording.time(start, stop), values - values.mean())
+    notes: tuple[Fact, ...] = ()
     cycle = max(1, int(np.ceil(_HERTZ * recording.sampling_rate / frequency)))
     if quantity != "velocity":
         from scipy.interpolate import make_interp_spline
@@ -60,7 +59,7 @@ def recorded_velocity(
         curve = make_interp_spline(time, signal, k=_SPLINE)
         change = curve.derivative() if quantity == "displacement" else curve.antiderivative()
         signal = np.asarray(change(time))
-        notes = (f"velocity of {quantity} by a spline",)
+        notes = (Fact("velocity_by_spline", quantity=quantity),)
     if quantity == "acceleration":
         from scipy.signal import butter, sosfiltfilt
 

@@ -14,7 +14,7 @@ from snrmjax.measure.recordings.channels import channel_number
 from snrmjax.measure.recordings.ring_down import find_ring_downs
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.methods.records.resonant_decay import Reading, resonant_decay
-from snrmjax.methods.result import MethodPoint, MethodResult, MethodStatus, method_result
+from snrmjax.methods.result import MethodResult, method_result
 from snrmjax.numerics.facts import Fact
 
 _HERTZ = 2 * np.pi
@@ -138,15 +138,9 @@ def _as_velocity(found: MethodResult, power: int, notes: Sequence[Fact]) -> Meth
         # d ln v/dt = d ln x/dt ± d ln ω/dt, and ω is a function of the amplitude.
         bend[good] = np.gradient(np.log(omega[good]), np.log(size[good]))
     points = [
-        MethodPoint(
-            MethodStatus(int(status)),
-            -1,
-            float(size[k] * omega[k] ** power),
-            float(omega[k]),
-            float(found.natural_frequency_std[k]),
-            float(found.damping_ratio[k] * (1 + power * bend[k])),
-            float(found.damping_ratio_std[k]),
+        point._replace(
+            velocity=float(speed), damping_ratio=float(point.damping_ratio * (1 + power * turn))
         )
-        for k, status in enumerate(np.asarray(found.status))
+        for point, speed, turn in zip(found.points(), size * omega**power, bend, strict=True)
     ]
     return method_result("resonant_decay", points, 0, notes)

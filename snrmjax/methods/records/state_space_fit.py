@@ -114,7 +114,7 @@ def fit_state_space(
     channel = choose_channels(records[0], force, [motion]).responses[0]
     for one in records:
         if one.n_samples <= _MOST_RECORDED:
-            even_record(one.time(), one.values([motion])[0], "pnlss")
+            even_record(one.time(), one.values([motion])[0])
     linear = _of_velocity(
         multisine_responses(records, force, [motion], period=period, skip=skip), channel
     )
@@ -139,7 +139,7 @@ def fit_state_space(
     misfit = _relative(simulated, fitted.velocity)
     if not misfit < _MUCH:
         raise ValueError(
-            f"pnlss: the best model of degree {max(degrees)} that was found leaves "
+            f"the best model of degree {max(degrees)} that was found leaves "
             f"{100 * misfit:.3g} % of the velocity, more than {100 * _MUCH:g} %: a lower level, "
             "longer periods, more states or other degrees may help."
         )
@@ -181,7 +181,7 @@ def _mode_frequency(linear: MultisineResponses, modes: LinearModes | None) -> fl
     natural = float(modes.natural_frequency[modes.mode_of_interest])
     if not frequency[0] <= natural <= frequency[-1]:
         raise ValueError(
-            f"pnlss needs lines around the mode at {natural / (2 * np.pi):.4g} Hz, but the records "
+            f"lines around the mode at {natural / (2 * np.pi):.4g} Hz are needed, but the records "
             f"have them from {frequency[0] / (2 * np.pi):.4g} to "
             f"{frequency[-1] / (2 * np.pi):.4g} Hz."
         )
@@ -209,9 +209,8 @@ def _mean_periods(
     samples = round(linear.period * rate)
     if rate < _FEWEST_SAMPLES * natural / (2 * np.pi):
         raise ValueError(
-            f"pnlss needs {_FEWEST_SAMPLES:g} samples a cycle of the mode at "
-            f"{natural / (2 * np.pi):.4g} Hz, but the records have {rate:g} Hz: the sampling rate "
-            "is too low."
+            f"{_FEWEST_SAMPLES:g} samples a cycle of the mode at {natural / (2 * np.pi):.4g} Hz "
+            f"are needed, but the records have {rate:g} Hz: the sampling rate is too low."
         )
     # A number that a power of two of stretches divides.
     cycles = linear.period * natural / (2 * np.pi)
@@ -219,7 +218,7 @@ def _mean_periods(
     most = _MOST_SAMPLES // wanted
     if most < 1:
         raise ValueError(
-            f"pnlss fits {_MOST_SAMPLES} samples at most, but a period has {wanted} at "
+            f"{_MOST_SAMPLES} samples are fitted at most, but a period has {wanted} at "
             f"{_PER_CYCLE:g} a cycle: record shorter periods."
         )
     names = (channels[0], channels[1].name)

@@ -81,7 +81,7 @@ def linear_model(
     oscillating = np.sort_complex(multipliers[multipliers.imag > 1e-6])[::-1]
     if len(oscillating) != order // 2:
         raise ValueError(
-            f"pnlss: the best linear approximation does not have {order // 2} oscillating modes: "
+            f"the best linear approximation does not have {order // 2} oscillating modes: "
             "excite a band around them, or take another `order`."
         )
     oscillating *= np.minimum(1.0, (1 - 1e-6) / np.abs(oscillating))

@@ -10,11 +10,10 @@ Reference: Ö. Arslan, M. Aykan & H. N. Özgüven, Mech. Syst. Signal Process. 2
 import numpy as np
 from jaxtyping import Complex
 
-from snrmjax.identify.pointwise.snrm import reference_sensor
 from snrmjax.measure.states import SteadyStates
-from snrmjax.methods.one_sensor import SensorStates, sensor_states
+from snrmjax.methods.one_sensor import SensorStates, sensor_states, signed_drive_point
 from snrmjax.methods.result import MethodPoint, MethodResult, MethodStatus, method_result
-from snrmjax.model.modes import LinearModes
+from snrmjax.model.modes import LinearModes, reference_sensor
 
 
 def arslan_ozguven(data: SteadyStates, modes: LinearModes) -> MethodResult:
@@ -30,16 +29,15 @@ def arslan_ozguven(data: SteadyStates, modes: LinearModes) -> MethodResult:
     Raises `ValueError` where the data have no forces or no phases.
     Validity: the element stands at the reference sensor; errors of the linear model enter in full.
     """
-    states = sensor_states(data, modes, "arslan_ozguven")
+    states = sensor_states(data, modes)
     points = [_point(states, k, modes) for k in range(len(states.level))]
     return method_result("arslan_ozguven", points, len(states.level))
 
 
 def describing_function(states: SensorStates, modes: LinearModes) -> Complex[np.ndarray, " state"]:
     """v(X) = N/X in N/m at the reference sensor, one number a state."""
-    r = reference_sensor(modes)
+    r, turn = reference_sensor(modes), np.sign(signed_drive_point(modes))
     flexible = np.asarray(modes.mode_shape)[r]
-    turn = np.sign(flexible[modes.mode_of_interest] * modes.participation[modes.mode_of_interest])
     square = states.frequency[:, None] ** 2
     natural, ratio = np.asarray(modes.natural_frequency), np.asarray(modes.damping_ratio)
     damping = 2j * ratio * natural * states.frequency[:, None]

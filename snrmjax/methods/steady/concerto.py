@@ -38,7 +38,7 @@ def concerto(data: SteadyStates, modes: LinearModes) -> MethodResult:
     Validity: one mode, damping that counts as hysteretic (η is constant between the two
     frequencies), no more than one amplitude on each side.
     """
-    states = sensor_states(data, modes, "concerto", any_scale=True)
+    states = sensor_states(data, modes, any_scale=True)
     points = [point for level, one in states.levels() for point in _pairs(level, one)]
     return method_result("concerto", points, len(states.level))
 

@@ -58,13 +58,13 @@ def force_surface(data: SteadyStates, modes: LinearModes) -> ForceSurface:
     sections = _usable(data, modes)
     if len(sections) < _FEWEST_LEVELS:
         raise ValueError(
-            "harmonic_force_surface needs at least two levels of held displacement with three "
-            f"states each, but the data have {len(sections)}."
+            "two levels of held displacement or more with three states each are needed, but the "
+            f"data have {len(sections)}."
         )
     low = max(one.frequency[0] for one in sections)
     high = min(one.frequency[-1] for one in sections)
     if not low < high:
-        raise ValueError("harmonic_force_surface needs levels that share a range of frequencies.")
+        raise ValueError("levels must share a range of frequencies.")
     every = np.unique(np.concatenate([one.frequency for one in sections]))
     frequency = every[(every >= low) & (every <= high)]
     rows = sorted(sections, key=lambda one: one.amplitude)
@@ -93,7 +93,7 @@ def harmonic_force_surface(data: SteadyStates, modes: LinearModes) -> MethodResu
 
 
 def _usable(data: SteadyStates, modes: LinearModes) -> list[AmplitudeSection]:
-    sections, _ = sections_of(sensor_states(data, modes, "harmonic_force_surface"))
+    sections, _ = sections_of(sensor_states(data, modes))
     return [one for one in sections if len(one.frequency) >= _FEWEST_STATES]
 
 

@@ -23,10 +23,9 @@ from snrmjax.identify.curves.family_base import AbstractCurve
 from snrmjax.identify.pointwise.backbone import Backbone
 from snrmjax.identify.pointwise.prediction import LARGEST_AMPLITUDE_RATIO, predict_response
 from snrmjax.identify.pointwise.prediction_result import PredictedResponse
-from snrmjax.identify.pointwise.snrm import reference_sensor
 from snrmjax.methods.one_sensor import drive_point
 from snrmjax.methods.result import MethodResult
-from snrmjax.model.modes import LinearModes
+from snrmjax.model.modes import LinearModes, reference_sensor
 
 _FEWEST_POINTS = 2
 _SAME = 1e-6  # relative: amplitudes nearer than this are one

@@ -33,7 +33,7 @@ def phase_resonance(data: SteadyStates, modes: LinearModes) -> MethodResult:
     interest. Returns a `MethodResult` with one point a level; 1σ from the stated errors.
     Raises `ValueError` where the data have no forces or no phases.
     """
-    states = sensor_states(data, modes, "phase_resonance")
+    states = sensor_states(data, modes)
     points = [_resonance(level, one, modes) for level, one in states.levels()]
     return method_result("phase_resonance", points, len(states.level))
 

@@ -231,14 +231,14 @@ def _map(axes: Axes, failures: Failures, places: Sequence[np.ndarray]) -> None:
         mine = np.flatnonzero(failures.failed & np.isin(failures.status, those))
         mine = mine[_thinned(len(mine))]
         cross: Style = {"linestyle": "none", "marker": "x", "markersize": 4.0}
-        axes.plot(x[mine], y[mine], **cross, color=colour, label=plain(shortened(name)))
+        axes.plot(x[mine], y[mine], **cross, color=colour, label=plain(short_name(name)))
 
 
 def counts_figure(counts: Sequence[tuple[str, dict[str, int]]]) -> Figure:
     """How often each answer was given: one panel a question, such as the verdict."""
     figure, (line,) = panels(PAGE if len(counts) > 1 else COLUMN, 2.8, 1, len(counts))
     for axes, (title, found) in zip(line, counts, strict=True):
-        names = [shortened(name) for name in found]
+        names = [short_name(name) for name in found]
         axes.barh(np.arange(len(found)), list(found.values()), color=MEASURED, alpha=0.6)
         axes.set_yticks(np.arange(len(found)), [plain(name or "none") for name in names])
         axes.invert_yaxis()
@@ -246,7 +246,7 @@ def counts_figure(counts: Sequence[tuple[str, dict[str, int]]]) -> Figure:
     return figure
 
 
-def shortened(name: str, longest: int = 28) -> str:
+def short_name(name: str, longest: int = 28) -> str:
     """A status or an answer of at most so many letters."""
     return name if len(name) <= longest else f"{name[:longest]} …"
 

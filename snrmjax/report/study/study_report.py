@@ -17,7 +17,7 @@ from snrmjax.report.study.study_figures import (
     distributions_figure,
     failures_figure,
     main_effects_figure,
-    shortened,
+    short_name,
 )
 from snrmjax.report.study.words import display
 from snrmjax.report.style import printed
@@ -179,7 +179,7 @@ def _status_table(found: StudyDigest, data: "xarray.Dataset") -> ReportTable:
     share = 100 / sum(counts.values())
     rows = [
         (
-            *(shortened(name, _LONGEST), str(count), f"{share * count:.3g} %"),
+            *(short_name(name, _LONGEST), str(count), f"{share * count:.3g} %"),
             "yes" if name in COMPLETE else "no",
         )
         for name, count in counts.items()

@@ -22,9 +22,10 @@ from snrmjax.simulate.continuation.continuation import (
     CurveRange,
     CurveStatus,
     StepControl,
+    TracedCurve,
+    on_host,
     trace_curve,
 )
-from snrmjax.simulate.continuation.response_curve import TracedCurve
 
 _BLOCK = 8  # curves that one program traces
 
@@ -103,16 +104,8 @@ def trace_through(
 
 def _trimmed(curve: Curve, count: int) -> list[TracedCurve]:
     """The first `count` curves without their unused rows, on the host."""
-    points, tangents, n_points, status, n_solves = (np.asarray(a) for a in curve)
-    return [
-        TracedCurve(
-            points[k, : n_points[k]].copy(),
-            tangents[k, : n_points[k]].copy(),
-            CurveStatus(int(status[k])),
-            int(n_solves[k]),
-        )
-        for k in range(count)
-    ]
+    rows = [np.asarray(part) for part in curve]
+    return [on_host(Curve(*(part[k] for part in rows))) for k in range(count)]
 
 
 @compiled

@@ -33,8 +33,8 @@ class StabilityLoss(Enum):
 
 def floquet_multipliers(
     model: Structure,
-    coefficients: Float[Array, "point coefficient mode"],
-    frequency: Float[Array, " point"],
+    coefficients: Float[Array | np.ndarray, "point coefficient mode"],
+    frequency: Float[Array | np.ndarray, " point"],
     *,
     steps_per_cycle: int = 6,
 ) -> Complex[np.ndarray, "point multiplier"]:

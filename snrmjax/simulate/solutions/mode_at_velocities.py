@@ -4,7 +4,6 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from snrmjax.model.effect_base import AbstractHysteresis
@@ -12,6 +11,7 @@ from snrmjax.model.modes import have_values
 from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.numerics.blocks import mapped
 from snrmjax.numerics.compiled import jitted
+from snrmjax.simulate.balance.given_numbers import positive
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, harmonic_balance
 from snrmjax.simulate.balance.harmonics import velocity_phasors, with_sines
 from snrmjax.simulate.solutions.periodic_motion import PeriodicMotion, root_of
@@ -54,9 +54,7 @@ def normal_mode_at_velocities(
     Array([1.], dtype=float64)
     """
     wanted = jnp.atleast_1d(jnp.asarray(velocities, dtype=jnp.float64))
-    if have_values(wanted) and not np.all(np.isfinite(wanted) & (wanted > 0)):
-        worst = float(wanted[np.argmin(np.isfinite(wanted) & (wanted > 0))])
-        raise ValueError(f"`velocities` must be positive and finite, but one is {worst:g} m/s.")
+    positive("velocities", wanted)
     if steps < 1:
         raise ValueError(f"`steps` must be at least 1, but is {steps}.")
     shape = model.modes.mode_shape[0, model.modes.mode_of_interest]

@@ -8,12 +8,12 @@ import numpy as np
 from jaxtyping import ArrayLike, Float
 
 from snrmjax.model.structures import Structure
+from snrmjax.simulate.balance.given_numbers import positive
 from snrmjax.simulate.solutions.controlled import (
     ControlledCurve,
     phase_controlled,
     response_controlled,
 )
-from snrmjax.simulate.solutions.forced_response import positive_values
 from snrmjax.simulate.virtual_test.appropriation import (
     around,
     between,
@@ -56,7 +56,7 @@ def phase_controlled_test(
     doi:10.1016/j.ymssp.2017.04.011.
     """
     check_recording(recording, harmonic_order)
-    loads = _positive("force", forces, "N")
+    loads = positive("forces", forces).tolist()
     angles = np.atleast_1d(np.asarray(phases, dtype=np.float64)).tolist()
     if not angles:
         raise ValueError("`phases` must name at least one phase, but is empty.")
@@ -110,7 +110,7 @@ def response_controlled_test(
     if points_per_level < 1:
         raise ValueError(f"`points_per_level` must be 1 or more, but is {points_per_level}.")
     check_recording(recording, harmonic_order)
-    speeds = _positive("velocity", velocities, "m/s")
+    speeds = positive("velocities", velocities).tolist()
     rows: list[tuple] = []
     curves = []
     for level, velocity in enumerate(speeds, start=1):
@@ -137,15 +137,6 @@ def response_controlled_test(
     found = states_at_phases(model, states, wanted, speed)
     aimed = points_per_level * len(speeds)
     return _recorded(model, found, tuple(curves), recording, aimed=aimed)
-
-
-def _positive(
-    name: str, values: float | Sequence[float] | Float[ArrayLike, " value"], unit: str
-) -> list[float]:
-    vector = positive_values(name, values, unit).tolist()
-    if not vector:
-        raise ValueError(f"a test needs at least one {name}.")
-    return vector
 
 
 def _at_force(curve: ControlledCurve, force: float) -> tuple[float, np.ndarray] | None:

@@ -170,7 +170,6 @@ def traced_members(
     models = [m for m in members.models for _ in range(loads.shape[1])]
     batch = forced_response_batch(models, loads.ravel(), *within.ends, settings=within.settings)
     columns = {name: np.asarray(one.values) for name, one in batch.variables().items()}
-    columns.pop("member")
     return batch.curves, columns
 
 

@@ -84,9 +84,7 @@ def test_a_natural_frequency_that_jumps_is_no_drift():
     drift = noise() + changed(misfit, 1e-3 * ORDER)
     assert left_curve(misfit, fitted(misfit, drift, ORDER)) is None
     jump = noise() + changed(misfit, 1e-3 * (ORDER > 0.5))
-    reason = left_curve(misfit, fitted(misfit, jump, ORDER))
-    assert reason is not None
-    assert "order of the test" in reason
+    assert left_curve(misfit, fitted(misfit, jump, ORDER))["curve"] == "order"
 
 
 @pytest.mark.parametrize(("part", "name"), [(0, "stiffness"), (1, "damping")])
@@ -94,9 +92,7 @@ def test_a_law_of_another_power_leaves_a_curve_of_amplitude(part, name):
     misfit, share = misfit_of(), SIZE / SIZE.max()
     rows = noise() + changed(misfit, 3e-3 * share**4, part)
     assert left_curve(misfit, fitted(misfit, rows, share**4, part)) is None
-    reason = left_curve(misfit, fitted(misfit, rows, share**2, part))
-    assert reason is not None
-    assert f"the {name} as a free function of the amplitude" in reason
+    assert left_curve(misfit, fitted(misfit, rows, share**2, part))["curve"] == name
 
 
 def test_what_the_answer_itself_could_still_do_is_no_curve():
@@ -114,8 +110,7 @@ def test_states_at_temperatures_of_their_own_are_no_noise():
     scatter = np.random.default_rng(5).normal(size=N)
     rows = noise() + changed(misfit, 1e-3 * scatter)
     reason = pattern(misfit, fitted(misfit, rows, SIZE**2))
-    assert reason is not None
-    assert "temperatures" in reason
+    assert reason.kind == "states_wander"
     # The same number of misfits as large, in all directions, is noise.
     large = float(np.sqrt(np.mean(rows**2)))
     assert pattern(misfit, fitted(misfit, large * noise(1), SIZE**2)) is None

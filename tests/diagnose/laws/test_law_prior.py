@@ -20,7 +20,7 @@ from snrmjax.diagnose.laws.law_prior import (
 KNOTS = np.log(np.geomspace(0.1, 1.0, 6))
 RNG = np.random.default_rng(3)
 COLUMNS = {name: RNG.normal(size=(30, 6)) for name in PARTS}
-ROWS = RNG.normal(size=30) + COLUMNS["film"] @ np.linspace(0.5, 1.0, 6)
+ROWS = RNG.normal(size=30) + COLUMNS["displacement_damping"] @ np.linspace(0.5, 1.0, 6)
 
 
 def problem(rows=ROWS):
@@ -29,7 +29,7 @@ def problem(rows=ROWS):
     return LawProblem(whole.T @ whole, -whole.T @ rows, float(rows @ rows), places)
 
 
-PAIR = ("film", "odd spring"), (Process(2.0, 1.4), Process(0.5, 0.7))
+PAIR = ("displacement_damping", "odd_spring"), (Process(2.0, 1.4), Process(0.5, 0.7))
 
 
 def full_covariance(parts, processes):
@@ -63,12 +63,14 @@ def test_the_posterior_is_that_of_the_joint_gaussian():
 
 
 def test_a_part_that_is_not_there_costs_and_one_that_is_gains():
-    strong = problem(RNG.normal(size=30) - COLUMNS["film"] @ np.linspace(1.0, 2.0, 6))
+    strong = problem(
+        RNG.normal(size=30) - COLUMNS["displacement_damping"] @ np.linspace(1.0, 2.0, 6)
+    )
     noise = problem(RNG.normal(size=30))
-    assert best_processes(strong, ("film",))[1] < -50.0
-    assert best_processes(noise, ("odd spring",))[1] > 0.0
-    both = best_processes(strong, ("film", "odd spring"))[1]
-    assert both > best_processes(strong, ("film",))[1]
+    assert best_processes(strong, ("displacement_damping",))[1] < -50.0
+    assert best_processes(noise, ("odd_spring",))[1] > 0.0
+    both = best_processes(strong, ("displacement_damping", "odd_spring"))[1]
+    assert both > best_processes(strong, ("displacement_damping",))[1]
 
 
 def test_entries_that_must_not_be_negative_have_the_truncated_mean():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from truths.made_up_misfits import noise_of
 
-from snrmjax.diagnose.checks.doubts import doubts
+from snrmjax.diagnose.checks.alternative_laws import doubts
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
 from snrmjax.diagnose.search.locating import locate_misfit, power_of_amplitude, power_of_answer
 

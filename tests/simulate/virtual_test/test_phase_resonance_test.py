@@ -475,7 +475,7 @@ def test_errors_and_chain_are_the_same_for_every_test():
             "the error `phase` must be zero or positive",
         ),
         ({"recording": Recording(MeasurementErrors(force=np.nan))}, "the error `force`"),
-        ({"forces": [0.0]}, "every force must be positive"),
+        ({"forces": [0.0]}, "`forces` must be positive"),
         (
             {"simulation": SweepSimulation(by="magic")},
             "`by` must be one of .*'time_integration'.*, but is 'magic'",
@@ -495,8 +495,8 @@ def test_wrong_settings_are_named(options, message):
 @pytest.mark.parametrize(
     ("forces", "phases", "message"),
     [
-        ([0.0], [0.0], "every force must be positive, but one is 0.0 N"),
-        ([], [0.0], "a test needs at least one force"),
+        ([0.0], [0.0], "`forces` must be positive"),
+        ([], [0.0], "`forces` must have at least one number"),
         ([1e-9], [], "`phases` must name at least one phase"),
         ([1e-9], [2.0], "`phase` must lie between"),
     ],
@@ -509,7 +509,7 @@ def test_wrong_settings_of_a_phase_locked_loop_are_named(forces, phases, message
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"velocities": [-1.0]}, "every velocity must be positive, but one is -1.0 m/s"),
+        ({"velocities": [-1.0]}, "`velocities` must be positive and finite, but is -1"),
         ({"appropriation": (1.0, 1.0)}, "`appropriation`"),
         ({"points_per_level": 0}, "`points_per_level`"),
         ({"recording": Recording(keep_harmonics=(1,))}, "`keep_harmonics`"),

@@ -1,0 +1,100 @@
+"""The command `import`: what a laboratory's files hold, and their way to our tables."""
+
+import dataclasses
+import os
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from snrmjax.cli.console import say, tell
+from snrmjax.cli.options import FILES, with_options
+from snrmjax.io.exchange.import_map import KEYS, RESPONSE_KEYS, ImportMap, MapKey
+from snrmjax.pipelines.options import option
+from snrmjax.report.writing import staged
+
+
+def import_(
+    files: Annotated[
+        list[Path],
+        typer.Argument(
+            help="UFF, MATLAB, HDF5, netCDF, TDMS, CSV or other text; several files are one test.",
+            metavar="FILE…",
+            show_default=False,
+        ),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder for measured.csv (or record.csv) and map.toml; without channels and map "
+            "nothing is written.",
+            metavar="DIR",
+            rich_help_panel=FILES,
+        ),
+    ] = None,
+    map_file: Annotated[
+        Path | None,
+        typer.Option(
+            "--map",
+            help="Map of an earlier import (map.toml); options win over it.",
+            metavar="TOML",
+            rich_help_panel=FILES,
+        ),
+    ] = None,
+    **options: Any,
+) -> None:
+    """Read a laboratory's files and write steady states as identify takes them.
+
+    Without channels and map it prints what the files hold, and a command that imports them. With
+    them it writes measured.csv, and map.toml with all that was stated, found and assumed, for the
+    next test. Records of free decays and broadband tests are written as record.csv.
+    """
+    from snrmjax.io.exchange.import_map import map_of_options
+    from snrmjax.pipelines.imports import import_test, list_contents
+    from snrmjax.report.pages import imports as page
+
+    if map_file is None and out is None and map_of_options(None, options).is_empty:
+        for path in files:
+            typer.echo("\n".join(list_contents(path, **options)))
+        return
+    if out is None:
+        raise ValueError("where shall measured.csv be written? --out DIR.")
+    found = import_test(files, map_file, **options)
+    with staged(out) as folder:
+        written = page.write(folder, found, files=[os.path.relpath(file, out) for file in files])
+    tell(found, dict.fromkeys(found.notes))
+    say(f"written to {out}: {', '.join(written)}")
+
+
+_RESPONSE = MapKey(
+    "channel or column of a response, as CH2:acceleration or CH2:acceleration:g; one a sensor",
+    "NAME[:KIND[:UNIT]]",
+)
+
+
+def _field(name: str, key: MapKey) -> tuple[str, Any, Any]:
+    """A key of the map as an option: a switch, a number, a word, or repeated words."""
+    default: Any = ImportMap._field_defaults.get(name, ())
+    several = isinstance(default, tuple)
+    said = f"{key.meaning[0].upper()}{key.meaning[1:]}{' (repeatable)' * several}."
+    kind = tuple[str, ...] if several else type(default)
+    least = 0 if kind is int else None
+    made = option(
+        *(() if several else default, said, key.metavar or None), panel=key.group, least=least
+    )
+    return name, kind, made
+
+
+_OPTIONS = {"force": KEYS["force"], "response": _RESPONSE, **RESPONSE_KEYS, **KEYS}
+with_options(
+    import_,
+    dataclasses.make_dataclass(
+        "ImportOptions",
+        [
+            _field(name, key)
+            for group in dict.fromkeys(key.group for key in _OPTIONS.values())
+            for name, key in _OPTIONS.items()
+            if key.group == group
+        ],
+    ),
+)

@@ -1,1 +1,0 @@
-"""Commands of a laboratory: files, their check, linear modes, the whole test."""

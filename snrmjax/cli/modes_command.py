@@ -1,0 +1,65 @@
+"""The command `modes`: linear modes from frequency responses, low levels and decays."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from snrmjax.cli.console import say, tell
+from snrmjax.cli.options import FILES, asked_for, with_options
+from snrmjax.pipelines.options import ModesOptions
+from snrmjax.report.writing import staged
+
+
+def modes(
+    data: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Frequency responses (UFF, MATLAB, HDF5, netCDF, CSV), low-level steady states "
+            "(CSV as for identify), or records of free decays; several files are one test.",
+            metavar="FRF…",
+            show_default=False,
+        ),
+    ],
+    out: Annotated[
+        Path,
+        typer.Option(
+            "--out",
+            help="Model to write (TOML); modes.csv and report.html come beside it.",
+            metavar="MODEL",
+            rich_help_panel=FILES,
+            show_default=False,
+        ),
+    ],
+    interest: Annotated[int, typer.Option(help="Mode of interest, from 1.", min=1)] = 1,
+    **options: Any,
+) -> None:
+    """Find linear modes with their errors and write them as a model.
+
+    Poles of all model orders are fitted to all responses together; shapes are mass-normalised by
+    the drive point, an added mass, masses at the sensors or a known shape, or refused.
+
+    Writes the model (TOML), modes.csv and report.html.
+    """
+    from snrmjax.pipelines.modes import find_linear_modes, read_modal_sources
+    from snrmjax.report.pages import modes as page
+
+    if out.suffix.lower() != ".toml":
+        raise ValueError(f"--out must be a model to write (.toml), but is {out.name!r}.")
+    if out.is_dir():
+        raise ValueError(f"--out {out} is a folder, but a file to write is expected.")
+    asked = asked_for(ModesOptions, options)
+    with staged(out.parent) as folder:
+        second = read_modal_sources(asked.with_mass) if asked.with_mass else None
+        found = find_linear_modes(
+            *(read_modal_sources(data), asked),
+            with_mass=second,
+            interest=interest - 1,
+            name=out.stem.replace("_", " "),
+        )
+        page.write(folder, found, file=out.name)
+    tell(found)
+    say(f"written to {out}: open {out.parent / 'report.html'}")
+
+
+with_options(modes, ModesOptions)

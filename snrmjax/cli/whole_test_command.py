@@ -1,0 +1,51 @@
+"""The command `test`: a folder of a laboratory's files to one report."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from snrmjax.cli.console import say, tell, written
+from snrmjax.cli.options import Out, asked_for, with_options
+from snrmjax.pipelines.options import WholeTestOptions
+from snrmjax.report.writing import staged
+
+
+def whole_test(
+    folder: Annotated[
+        Path,
+        typer.Argument(
+            help="Folder with the files of one test: steady states (CSV), time records and "
+            "frequency responses (UFF, MATLAB, HDF5, netCDF, TDMS, CSV), model.toml if there is "
+            "one.",
+            metavar="FOLDER",
+            show_default=False,
+        ),
+    ],
+    out: Out,
+    **options: Any,
+) -> None:
+    """From a folder of raw files to one report: check, linear modes, backbone, diagnosis.
+
+    Files are sorted by their content. Where a guess would be needed the command stops with a
+    question and the option that answers it.
+
+    Writes report.html (zoom, hover, linked levels), measured.csv, check.json, model.toml
+    where the linear modes were found here, and the files of identify and diagnose in folders of
+    these names.
+    """
+    from snrmjax.pipelines.whole_test import run_whole_test
+    from snrmjax.report.pages import whole_test as page
+
+    with staged(out) as target:
+        found = run_whole_test(folder, asked_for(WholeTestOptions, options), progress=_say_stage)
+        page.write(target, found)
+    tell(found)
+    written(out)
+
+
+def _say_stage(stage: str, seconds: float) -> None:
+    say(f"{stage}: {seconds:.1f} s")
+
+
+with_options(whole_test, WholeTestOptions)

@@ -1,0 +1,94 @@
+"""Diagnosis: what a model lacks, and the responses with and without it."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from snrmjax.diagnose.diagnosis import diagnose_model
+from snrmjax.diagnose.diagnosis_result import Diagnosis, FormerAnswer
+from snrmjax.diagnose.response_prediction import (
+    HeldCurve,
+    LevelPredictions,
+    LevelResponse,
+    held_curves,
+    holds_response,
+    predict_levels,
+)
+from snrmjax.io.files import FilePath
+from snrmjax.io.measurement_plans import read_further_states
+from snrmjax.io.models import read_model
+from snrmjax.io.tables import read_steady_states
+from snrmjax.measure.states import SteadyStates
+from snrmjax.model.structures import Structure
+from snrmjax.numerics.facts import Fact
+
+
+class SimulatedLevels(NamedTuple):
+    """Responses of all levels, of the model as given and as completed.
+
+    Where a test holds its response, `held` are the forces that hold it, of both models.
+    """
+
+    predicted: LevelPredictions
+    held: tuple[list[HeldCurve], list[HeldCurve]] | None
+
+
+class DiagnosedTest(NamedTuple):
+    """A diagnosis, and what was simulated of it."""
+
+    diagnosis: Diagnosis
+    model: Structure  # as given
+    simulated: SimulatedLevels | None = None  # None: not asked for, or nothing to simulate
+
+    @property
+    def predicted(self) -> tuple[LevelResponse, ...]:
+        """The simulated resonances of all levels."""
+        return () if self.simulated is None else tuple(self.simulated.predicted.levels)
+
+
+def diagnose_test(
+    data: SteadyStates,
+    model: Structure,
+    *,
+    simulate: bool = True,
+    former: FormerAnswer | None = None,
+) -> DiagnosedTest:
+    """Find what the model lacks and, if asked for, simulate all levels with and without it.
+
+    Arguments: `former` answer of fewer states. Where no structure can have the parameters found,
+    nothing is simulated. Raises `ValueError` as `diagnose_model` does.
+    """
+    found = diagnose_model(model, data, former=former)
+    if not (simulate and found.effects and found.completed is not None):
+        return DiagnosedTest(found, model)
+    simulated = simulated_levels(found, model)
+    levels = tuple(each.level for each in simulated.predicted.levels if not each.complete)
+    if levels:
+        note = Fact("responses_not_complete", levels=levels)
+        found = dataclasses.replace(found, notes=(*found.notes, note))
+    return DiagnosedTest(found, model, simulated)
+
+
+def simulated_levels(diagnosis: Diagnosis, model: Structure) -> SimulatedLevels:
+    """Resonances and responses of all levels, with the model as given and as completed.
+
+    Raises `ValueError` where there is no completed model.
+    """
+    data, sensor = diagnosis.data, diagnosis.force_misfit.sensor
+    predicted = predict_levels(diagnosis, model)
+    if diagnosis.completed is None or not holds_response(data, predicted.levels):
+        return SimulatedLevels(predicted, None)
+    given = held_curves(model, data, sensor)
+    completed = held_curves(diagnosis.completed, data, sensor, diagnosis.answer.force_gain)
+    return SimulatedLevels(predicted, (given, completed))
+
+
+def read_test(
+    data: FilePath, model: FilePath, further: Sequence[FilePath] = ()
+) -> tuple[Structure, SteadyStates]:
+    """A model, and a table of steady states with those of further tables of the same structure."""
+    structure = read_model(model)
+    measured = read_steady_states(data, structure)
+    for path in further:
+        measured = read_further_states(path, structure, measured)
+    return structure, measured

@@ -1,0 +1,234 @@
+"""What lies in the folder of a test, by content: model, steady states, responses, records."""
+
+import dataclasses
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from snrmjax.io.exchange.import_map import (
+    Assumptions,
+    ImportMap,
+    read_import_map,
+    steps_of_map,
+)
+from snrmjax.io.exchange.importing import Imported, import_files
+from snrmjax.io.exchange.own_tables import is_own_file
+from snrmjax.io.exchange.record_import import mapped_record
+from snrmjax.io.files import read_text
+from snrmjax.io.laboratory.contents import LaboratoryFile
+from snrmjax.io.laboratory.reading import read_laboratory_file
+from snrmjax.io.models import read_model
+from snrmjax.io.tables import read_steady_states
+from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
+from snrmjax.measure.recordings.step_counts import StepCounts
+from snrmjax.measure.recordings.time_recording import TimeRecording
+from snrmjax.measure.states import UNNAMED_SENSOR, SteadyStates
+from snrmjax.model.structures import Structure
+
+_MEASURED = (
+    *(".csv", ".uff", ".unv", ".unv58", ".mat", ".h5", ".hdf5", ".nc", ".nc4", ".cdf"),
+    *(".tdms", ".tsv", ".dat", ".asc"),
+)
+MAP = "map.toml"
+_WRITTEN = (".txt", ".md", ".log")
+_SHOWN = 60  # lines of a text
+
+
+class NamedStates(NamedTuple):
+    """Steady states of one file; `table` is where they are read again with a model's sensors."""
+
+    file: str
+    states: SteadyStates
+    table: Path | None = None
+
+    @property
+    def names_no_sensor(self) -> bool:
+        """Whether the file does not say which sensor it is of."""
+        return self.states.sensors == UNNAMED_SENSOR
+
+    def of_model(self, model: Structure) -> SteadyStates:
+        """The same with the sensors of the model.
+
+        Raises `ValueError` as `read_steady_states` does, and for sensors that the model lacks.
+        """
+        if self.table is not None:
+            return read_steady_states(self.table, model)
+        if self.names_no_sensor and len(model.modes.sensors) == 1:
+            return dataclasses.replace(self.states, sensors=model.modes.sensors)
+        if self.states.sensors != model.modes.sensors:
+            raise ValueError(
+                f"{self.file} has the sensors {', '.join(self.states.sensors)}, but the model "
+                f"{', '.join(model.modes.sensors)}."
+            )
+        return self.states
+
+
+class NamedResponses(NamedTuple):
+    """Frequency responses of one file."""
+
+    file: str
+    responses: FrequencyResponses
+
+
+class NamedRecord(NamedTuple):
+    """A time record of one file."""
+
+    file: str
+    record: TimeRecording
+
+
+class TestFiles(NamedTuple):
+    """All that a folder holds of a test; see `read_test_files`."""
+
+    model: Structure | None
+    model_file: str
+    states: tuple[NamedStates, ...]
+    responses: tuple[NamedResponses, ...]
+    records: tuple[NamedRecord, ...]
+    passed: tuple[tuple[str, str], ...]  # file and why nothing was measured in it
+    notes: tuple[str, ...]  # what was assumed of a file
+    texts: tuple[tuple[str, tuple[str, ...]], ...] = ()  # lines that people wrote, and the map's
+    steps_at_import: StepCounts | None = None
+
+    def rows(self) -> Iterator[tuple[str, str]]:
+        """Each file, and what was found in it."""
+        if self.model is not None:
+            count = self.model.modes.n_modes
+            yield self.model_file, f"model with {count} mode{'s' if count > 1 else ''}"
+        for file, states, _ in self.states:
+            levels = len(set(states.level.tolist()))
+            many = f"{levels} level{'s' if levels > 1 else ''}"
+            yield file, f"{states.n_states} steady states on {many}"
+        for file, one in self.responses:
+            sides = f"{len(one.responses)} × {len(one.references)}"
+            yield file, f"{sides} frequency responses of {len(one.frequency)} lines"
+        for file, record in self.records:
+            seconds = record.n_samples / record.sampling_rate
+            names = ", ".join(record.channel_names)
+            yield file, f"record of {seconds:.4g} s at {record.sampling_rate:g} Hz: {names}"
+        yield from self.passed
+
+
+def read_test_files(folder: Path, model: Path | None = None) -> TestFiles:
+    """Read every file of a folder, by its content; folders inside it are left alone.
+
+    Arguments: `model` is a file with the linear model, in place of the one in the folder.
+    Raises `ValueError` for a folder that is missing or holds nothing measured, for a file of
+    measurements that cannot be read, for several models, and as `import_files` does for a table
+    whose columns neither are understood nor stand in a `map.toml`.
+    """
+    if not folder.is_dir():
+        raise ValueError(f"{folder} must be a folder with the files of a test.")
+    files = sorted(one for one in folder.iterdir() if one.is_file() and one.name[0] != ".")
+    models = [] if model is None else [model]
+    maps = [file for file in files if file.name == MAP]
+    told = read_import_map(maps[0]) if maps else ImportMap()
+    notes: list[str] = []
+    states: list[NamedStates] = []
+    responses: list[NamedResponses] = []
+    records: list[NamedRecord] = []
+    passed: list[tuple[str, str]] = []
+    texts: list[tuple[str, tuple[str, ...]]] = []
+    for path in files:
+        suffix = path.suffix.lower()
+        if path in maps:
+            passed.append((path.name, "how files are imported"))
+            texts.append((path.name, _lines(path)))
+        elif suffix == ".toml":
+            if not _is_model(path):
+                passed.append((path.name, "not used: it has no [[mode]]"))
+            elif model is None:
+                models.append(path)
+            elif path.resolve() != model.resolve():
+                passed.append((path.name, f"not used: the model is {model.name}"))
+        elif suffix in _WRITTEN and _readable(path):
+            passed.append((path.name, "not used: a text of the laboratory, shown below"))
+            texts.append((path.name, _lines(path)))
+        elif suffix not in _MEASURED:
+            passed.append((path.name, "not used: no file of measurements, by its ending"))
+        elif suffix == ".csv" and is_own_file(path):
+            states.append(NamedStates(path.name, read_steady_states(path), path))
+        else:
+            held = read_laboratory_file(path, told.text_format)
+            assumed = Assumptions()
+            if held.tables or (held.responses and told.force_amplitude):
+                found = _imported(path, told)
+                assumed.update(found.assumed)
+                if found.states is not None:
+                    states.append(NamedStates(path.name, found.states))
+            else:
+                responses += [NamedResponses(path.name, one) for one in _linear(held, path)]
+            for recording in held.recordings:
+                record = (
+                    recording
+                    if told.is_empty
+                    else mapped_record(recording, told, path.name, assumed)[0]
+                )
+                several = f"{path.name}: {recording.name}"
+                records.append(
+                    NamedRecord(several if len(held.recordings) > 1 else path.name, record)
+                )
+            notes += [f"{path.name}: {key}: {why}" for key, why in assumed.items()]
+    if len(models) > 1:
+        listed = " and ".join(model.name for model in models)
+        raise ValueError(
+            f"which is the model of this test, {listed}? Say so by `--model {models[0].name}`."
+        )
+    if not states and not responses and not records:
+        raise ValueError(
+            f"{folder.name} holds nothing measured: steady states (CSV), frequency responses or "
+            "time records."
+        )
+    return TestFiles(
+        read_model(models[0]) if models else None,
+        models[0].name if models else "",
+        *(tuple(states), tuple(responses), tuple(records), tuple(passed), tuple(notes)),
+        tuple((name, lines) for name, lines in texts if lines),
+        steps_of_map(maps[0]) if maps else None,
+    )
+
+
+def _readable(path: Path) -> bool:
+    """Whether a file is text."""
+    return b"\0" not in path.read_bytes()[:4096]
+
+
+def _lines(path: Path) -> tuple[str, ...]:
+    """The first lines of a text, and how many follow."""
+    lines = [line.rstrip() for line in path.read_text("utf-8", errors="replace").splitlines()]
+    lines = [line for line in lines if line]
+    further = len(lines) - _SHOWN
+    return (*lines[:_SHOWN], *([f"… {further} further lines"] if further > 0 else []))
+
+
+def _is_model(path: Path) -> bool:
+    """Whether a TOML file has modes; one that cannot be read goes on to the reader of models."""
+    try:
+        return "mode" in tomllib.loads(read_text(path))
+    except tomllib.TOMLDecodeError:
+        return True
+
+
+def _imported(path: Path, told: ImportMap) -> Imported:
+    try:
+        return import_files([path], told)
+    except ValueError as error:
+        raise ValueError(
+            f"{error} `snrmjax import {path}` says how; put the {MAP} that the import writes "
+            "beside the file."
+        ) from error
+
+
+def _linear(held: LaboratoryFile, path: Path) -> tuple[FrequencyResponses, ...]:
+    """Responses of a linear test; several levels are no such test."""
+    levels = {level for level in held.levels if np.isfinite(level)}
+    if len(levels) > 1:
+        raise ValueError(
+            f"are the responses of {held.name}, of {len(levels)} levels, steady states of a "
+            f"stepped sine? Say so by `snrmjax import {path} --force-amplitude z --out DIR`, "
+            f"and put its {MAP} beside the file; for linear modes keep the lowest level alone."
+        )
+    return held.responses

@@ -1,0 +1,201 @@
+"""Identification: backbone and damping from a table of steady states, and what they predict."""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from snrmjax.doctor.column_misreadings import doubt, linear_damping_note, with_doubt
+from snrmjax.identify.inference.contributions import Contribution, contributions
+from snrmjax.identify.inference.fitted_curves import fitted_values
+from snrmjax.identify.inference.fitted_response import FittedResponse, fitted_response
+from snrmjax.identify.inference.identification import (
+    Identification,
+    identification_of_fit,
+    identify_backbone,
+)
+from snrmjax.identify.inference.optimal_design import (
+    AdviceStatus,
+    NextMeasurements,
+    next_measurements,
+)
+from snrmjax.identify.joint.joint_fit import JointFit, corrected_states, fit_jointly
+from snrmjax.identify.pointwise.backbone import BackboneValues
+from snrmjax.identify.pointwise.prediction_result import PredictedResponse, Resonance
+from snrmjax.identify.prediction.notes import notes_on_negative_damping
+from snrmjax.measure.states import SteadyStates, check_force, check_phases
+from snrmjax.model.structures import Structure
+from snrmjax.numerics.facts import Fact
+from snrmjax.pipelines.options import IdentifyOptions, checked
+from snrmjax.pipelines.predictions import (
+    Note,
+    Prediction,
+    notes_on_predictions,
+    predictions_of_fit,
+    predictions_of_points,
+    reach_of,
+    require_drive,
+)
+from snrmjax.simulate.solutions.forced_response import ResponseCurve
+from snrmjax.simulate.solutions.normal_modes import NormalModeBranch
+
+BACKBONE_POINTS = 200
+"""Amplitudes at which curves are written."""
+
+_LOOKED_AT = 100  # amplitudes of curves that are looked at for negative damping
+
+
+class FitDetails(NamedTuple):
+    """A joint fit with what its bands are made of, and what to measure next."""
+
+    fit: JointFit
+    shares: tuple[Contribution, ...]
+    advice: NextMeasurements | None  # None: no advice was asked for
+    responses: tuple[FittedResponse, ...]  # under the advised forces, the main curves
+
+
+class IdentifiedTest(NamedTuple):
+    """An identification with its predictions and, where they are known, the true responses."""
+
+    data: SteadyStates
+    model: Structure
+    options: IdentifyOptions
+    identification: Identification
+    values: BackboneValues  # of the curves, from the smallest to the largest measured amplitude
+    predictions: tuple[Prediction, ...]
+    notes: tuple[Note, ...]
+    joint: FitDetails | None = None  # None: curves through points
+    truth: NormalModeBranch | None = None
+    simulated: tuple[ResponseCurve, ...] = ()
+
+    @property
+    def responses(self) -> list[PredictedResponse]:
+        """Predicted responses of all forces."""
+        return [response for prediction in self.predictions for response in prediction.responses]
+
+    @property
+    def resonances(self) -> list[Resonance]:
+        """Predicted resonances of all forces."""
+        return [resonance for prediction in self.predictions for resonance in prediction.resonances]
+
+    @property
+    def advice(self) -> NextMeasurements | None:
+        """What to measure next, where it was asked for."""
+        return None if self.joint is None else self.joint.advice
+
+
+def identify_test(
+    data: SteadyStates,
+    model: Structure,
+    options: IdentifyOptions | None = None,
+    **settings: Any,
+) -> IdentifiedTest:
+    """Identify backbone and damping, predict responses, and advise what to measure next.
+
+    State by state with curves through the points, or by one joint fit of all states where one of
+    `fit`, `free` and `further` is stated.
+
+    Arguments: `data` in N or, for a joint fit, in V; `options`, or its fields by keyword.
+    Returns an `IdentifiedTest`.
+    Raises `ValueError` for an option without effect, and what `identify_backbone`, `fit_jointly`,
+    `predict_response` and `fitted_response` raise; where columns of the data seem to mean something
+    else the error says so.
+    """
+    options = checked(dataclasses.replace(options or IdentifyOptions(), **settings))
+    if options.predict_drive:
+        require_drive(data)
+    return (
+        _by_joint_fit(data, model, options)
+        if options.is_joint
+        else _by_points(data, model, options)
+    )
+
+
+def _by_points(data: SteadyStates, model: Structure, options: IdentifyOptions) -> IdentifiedTest:
+    check_phases(data, "an identification")
+    check_force(data, "an identification state by state")
+    try:
+        found = identify_backbone(
+            data,
+            model,
+            amplitude=options.amplitude,
+            measure=options.measure,
+            n_knots=options.knots,
+        )
+    except ValueError as error:
+        raise with_doubt(error, data, model) from error
+    backbone = found.backbone
+    predictions = predictions_of_points(found, model, options)
+    looked_at = backbone.sampled(_LOOKED_AT, reach=reach_of(options) if predictions else 1.0)
+    notes = (
+        *doubt(data, model, found.points),
+        *found.notes,
+        *notes_on_negative_damping(looked_at),
+        *notes_on_predictions(predictions, backbone, data),
+    )
+    values = backbone.sampled(BACKBONE_POINTS)
+    return IdentifiedTest(data, model, options, found, values, predictions, _each_once(notes))
+
+
+def _by_joint_fit(data: SteadyStates, model: Structure, options: IdentifyOptions) -> IdentifiedTest:
+    names = (options.fit or "auto").split(",")
+    if len(names) > 2:
+        raise ValueError(
+            f"--fit takes one or two families, but {options.fit!r} names {len(names)}."
+        )
+    fit = fit_jointly(
+        data,
+        model,
+        backbone=names[0],
+        damping=names[1] if len(names) == 2 else "auto",
+        free=[name for several in options.free for name in several.split(",")],
+        robust=options.robust,
+    )
+    data = corrected_states(data, fit)
+    found = identification_of_fit(data, fit)
+    predictions, trends = predictions_of_fit(fit, options)
+    advice = next_measurements(fit, options.further) if options.further else None
+    doubts = () if "force_gain" in fit.names() else doubt(data, model, found.points)
+    reach = np.linspace(0.0, reach_of(options) if predictions else 1.0, _LOOKED_AT) * fit.largest[0]
+    notes = (
+        *doubts,
+        *data.notes,
+        *found.notes,
+        *linear_damping_note(fit, model),
+        *_note_on_gain(fit),
+        *notes_on_negative_damping(fitted_values(fit, displacement=reach)),
+        *trends,
+        *notes_on_predictions(predictions, found.backbone, data),
+        *(advice.notes if advice else ()),
+        *_note_on_advice(advice, options),
+    )
+    forces = sorted({one.force for one in advice or ()})
+    responses = tuple(fitted_response(fit, force)[0] for force in forces)
+    details = FitDetails(fit, tuple(contributions(fit)), advice, responses)
+    ends = float(found.backbone.smallest), float(found.backbone.largest)
+    values = fitted_values(fit, displacement=np.linspace(*ends, BACKBONE_POINTS))
+    return IdentifiedTest(
+        *(data, model, options, found, values, predictions, _each_once(notes)), joint=details
+    )
+
+
+def _note_on_gain(fit: JointFit) -> tuple[Note, ...]:
+    """The force per volt that was found, where only a drive voltage is known."""
+    if not fit.drive_known_only:
+        return ()
+    place = fit.names().index("force_gain")
+    std = float(np.sqrt(fit.covariance[place, place]))
+    gain = float(np.exp(fit.unknowns.log_force_gain))
+    return (Fact("force_from_drive", newtons_per_volt=gain, relative_std=std),)
+
+
+def _note_on_advice(advice: NextMeasurements | None, options: IdentifyOptions) -> tuple[Note, ...]:
+    if advice is None or advice.status == AdviceStatus.COMPLETE:
+        return ()
+    return (
+        Fact("fewer_advised", n=len(advice), wanted=options.further, why=advice.status.message),
+    )
+
+
+def _each_once(notes: tuple[Note, ...]) -> tuple[Note, ...]:
+    return tuple(dict.fromkeys(notes))

@@ -1,0 +1,53 @@
+"""Measured data of a command: tables of steady states and time records, told apart by content."""
+
+from pathlib import Path
+
+from snrmjax.io.files import FilePath, file_name, read_text
+from snrmjax.io.laboratory.reading import read_laboratory_file
+from snrmjax.io.laboratory.record_tables import (
+    is_record_table,
+    read_record_table,
+    with_named_channels,
+)
+from snrmjax.io.tables import read_steady_states
+from snrmjax.measure.recordings.time_recording import TimeRecording
+from snrmjax.measure.states import SteadyStates
+from snrmjax.model.structures import Structure
+
+_STATES = {"level", "frequency_hz"}  # columns of which a table of steady states has one
+_NOT_CSV = (".mat", ".h5", ".hdf5", ".nc", ".nc4", ".cdf", ".tdms", ".uff", ".unv", ".58")
+
+
+def read_measured_test(path: FilePath, structure: Structure) -> list[SteadyStates | TimeRecording]:
+    """Steady states or time records of one file.
+
+    A CSV with a column `time_s` is a time record, one with `level` or `frequency_hz` a table of
+    steady states; whatever else is a laboratory's file, of which the time records are taken.
+    Raises `ValueError` as the readers do, and for a file without either.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in _NOT_CSV and _is_text(path):
+        if is_record_table(path):
+            return [read_record_table(path)]
+        if _STATES & _header(path) or not _header(path):
+            return [read_steady_states(path, structure)]
+    held = read_laboratory_file(path)
+    if not held.recordings:
+        raise ValueError(
+            f"{file_name(path)} holds no time record (a CSV needs the column time_s) and no table "
+            "of steady states (level, frequency_hz, …)."
+        )
+    return [with_named_channels(recording, file_name(path)) for recording in held.recordings]
+
+
+def _header(path: Path) -> set[str]:
+    first = read_text(path).lstrip().split("\n", 1)[0]
+    return {field.strip().strip('"') for field in first.split(",") if field.strip()}
+
+
+def _is_text(path: Path) -> bool:
+    """Whether a file is text; what cannot be read at all is, so that its reader says why."""
+    if not path.is_file():
+        return True
+    with path.open("rb") as file:
+        return b"\0" not in file.read(4096)

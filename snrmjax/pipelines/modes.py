@@ -1,0 +1,208 @@
+"""Linear modes from a laboratory's files: what they are found from, by content, and their scale."""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from snrmjax.identify.modal.free_decay import DecayModes
+from snrmjax.identify.modal.modal_fit import LinearModalFit
+from snrmjax.identify.modal.modes_of_tests import find_modes
+from snrmjax.identify.modal.response_data import joined_responses
+from snrmjax.identify.scaling.scale import (
+    AddedMassTest,
+    Calibration,
+    DrivePoint,
+    Free,
+    KnownShape,
+    Scale,
+    SensorMasses,
+    scale_modes,
+)
+from snrmjax.identify.scaling.scaled_modes import ScaledModes
+from snrmjax.io.exchange.own_tables import is_own_file
+from snrmjax.io.files import FilePath, file_name
+from snrmjax.io.laboratory.reading import read_laboratory_file
+from snrmjax.io.tables import read_steady_states
+from snrmjax.io.units import HERTZ
+from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
+from snrmjax.measure.recordings.time_recording import TimeRecording
+from snrmjax.measure.states import SteadyStates, join_steady_states
+from snrmjax.model.structures import Structure, structure
+from snrmjax.numerics.facts import Fact
+from snrmjax.pipelines.options import ModesOptions, checked
+
+ModalFit = LinearModalFit | DecayModes
+ModalSources = FrequencyResponses | SteadyStates | tuple[TimeRecording, ...]
+
+
+class LinearModesFound(NamedTuple):
+    """Linear modes, how their shapes were scaled, and the fit that they come from."""
+
+    name: str
+    fitted: ModalFit
+    scaled: ScaledModes
+    interest: int  # the mode that tests are about, from zero
+    notes: tuple[Fact | str, ...]
+
+    @property
+    def structure(self) -> Structure:
+        """The modes as the linear model of a test."""
+        return structure(self.scaled.linear_modes(self.interest), name=self.name)
+
+
+def find_linear_modes(
+    sources: ModalSources,
+    options: ModesOptions | None = None,
+    *,
+    with_mass: ModalSources | None = None,
+    interest: int = 0,
+    name: str = "model",
+    **settings: Any,
+) -> LinearModesFound:
+    """Linear modes with errors, their shapes mass-normalised as asked for.
+
+    Arguments: `sources` as `read_modal_sources` gives them; `options`, or its fields by keyword;
+    `with_mass` the same of a second test with the added mass; `interest` counts from zero.
+    Raises `ValueError` as `find_modes` and `scale_modes` do, and for two ways to scale.
+    """
+    options = checked(dataclasses.replace(options or ModesOptions(), **settings))
+    low, high = options.from_hz, options.to_hz
+    fit: dict[str, Any] = {
+        name: getattr(options, name)
+        for name in (
+            *("reference", "level", "order", "highest_order", "residual_terms", "window"),
+            *("instrument_phase", "base"),
+        )
+    }
+    fit |= {
+        "from_frequency": None if low is None else low * HERTZ,
+        "to_frequency": None if high is None else high * HERTZ,
+        "poles": _poles(options.poles),
+    }
+    fitted, notes = find_modes(sources, **fit)
+    second = None if with_mass is None else find_modes(with_mass, **fit)[0]
+    scaled = scale_modes(
+        fitted,
+        _asked_scale(options, second),
+        calibration=Calibration(
+            options.newtons_per_volt, options.newtons_per_volt_std, options.calibration_std
+        ),
+        free=Free(options.mass) if options.free or options.mass is not None else None,
+    )
+    return LinearModesFound(name, fitted, scaled, interest, (*notes, *scaled.notes))
+
+
+def read_modal_sources(
+    files: Sequence[FilePath],
+) -> FrequencyResponses | SteadyStates | tuple[TimeRecording, ...]:
+    """One test from its files: joined frequency responses, steady states, or records of decays.
+
+    Raises `ValueError` that names the file: of mixed kinds, with nothing of these in it, or as its
+    reader says.
+    """
+    paths = [Path(file) for file in files]
+    found = [_read(path) for path in paths]
+    kinds = {type(one) for one in found}
+    if len(kinds) > 1:
+        listed = ", ".join(
+            f"{path.name} holds {_WORDS[type(one)]}" for path, one in zip(paths, found, strict=True)
+        )
+        raise ValueError(f"files of one test must be of one kind, but {listed}.")
+    if isinstance(found[0], FrequencyResponses):
+        return joined_responses([one for one in found if isinstance(one, FrequencyResponses)])
+    if isinstance(found[0], SteadyStates):
+        states = [one for one in found if isinstance(one, SteadyStates)]
+        return states[0] if len(states) == 1 else join_steady_states(states)
+    return tuple(record for one in found if isinstance(one, tuple) for record in one)
+
+
+_WORDS = {
+    FrequencyResponses: "frequency responses",
+    SteadyStates: "steady states",
+    tuple: "records",
+}
+
+
+def _read(path: Path) -> FrequencyResponses | SteadyStates | tuple[TimeRecording, ...]:
+    if path.suffix.lower() == ".csv" and is_own_file(path):
+        return read_steady_states(path)
+    held = read_laboratory_file(path)
+    if held.responses:
+        return joined_responses(held.responses)
+    if held.recordings:
+        forces = [
+            c.name
+            for recording in held.recordings
+            for c in recording.channels
+            if c.quantity == "force"
+        ]
+        if forces:
+            raise ValueError(
+                f"{file_name(path)} holds time records with a force ({forces[0]}): modes need "
+                "frequency responses of them, or records of a decay without a force."
+            )
+        return held.recordings
+    raise ValueError(
+        f"{file_name(path)} holds neither frequency responses nor records nor our table of steady "
+        "states: `snrmjax import` says what it holds, and a map what its columns are."
+    )
+
+
+def _sensor_values(option: str, words: Sequence[str]) -> dict[str, float]:
+    """Numbers by sensor from words such as "tip=0.2"."""
+    values: dict[str, float] = {}
+    for word in words:
+        name, _, value = word.rpartition("=")
+        try:
+            number = float(value)
+        except ValueError:
+            name = ""
+        if not name:
+            raise ValueError(f"{option} must be a sensor and a number as tip=0.2, but is {word!r}.")
+        if name in values:
+            raise ValueError(f"{option} names the sensor {name} twice.")
+        values[name] = number
+    return values
+
+
+def _asked_scale(options: ModesOptions, with_mass: ModalFit | None) -> Scale | None:
+    """The one way to scale shapes that was asked for; without one, the drive point."""
+    drive = DrivePoint(options.drive_point, options.turned)
+    ways: dict[str, Scale | None] = {}
+    if options.unscaled:
+        ways["unscaled shapes"] = None
+    if drive.sensor is not None:
+        ways["a drive point"] = drive
+    if options.second_mass is not None or with_mass is not None:
+        if (
+            options.second_mass is None
+            or options.mass_at is None
+            or not isinstance(with_mass, LinearModalFit)
+        ):
+            raise ValueError(
+                "an added mass needs its kilograms, the sensor where it is, and frequency "
+                "responses of a second test with it."
+            )
+        ways["an added mass"] = AddedMassTest(with_mass, options.mass_at, options.second_mass)
+    masses = _sensor_values("--sensor-mass", options.sensor_mass)
+    if masses or options.fixture_mass is not None:
+        ways["sensor masses"] = SensorMasses(masses, options.fixture_mass)
+    known = () if options.known_shape is None else (options.known_shape,)
+    for name, value in _sensor_values("--known-shape", known).items():
+        ways["a known shape"] = KnownShape(name, value)
+    if len(ways) > 1:
+        raise ValueError(f"one scale of the shapes is wanted, but there are {' and '.join(ways)}.")
+    return next(iter(ways.values()), drive)
+
+
+def _poles(text: str | None) -> tuple[float, ...] | None:
+    """Natural frequencies (rad/s) from "79.0,427.5"."""
+    if text is None:
+        return None
+    try:
+        return tuple(float(word) * HERTZ for word in text.split(","))
+    except ValueError as error:
+        raise ValueError(
+            f"--poles must be frequencies in Hz with commas between them, but is {text!r}."
+        ) from error

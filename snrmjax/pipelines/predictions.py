@@ -1,0 +1,163 @@
+"""Responses and resonances that identified curves predict under forces that were asked for."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from snrmjax.identify.inference.fitted_response import (
+    FittedResponse,
+    fitted_response,
+    predicted_resonance,
+)
+from snrmjax.identify.inference.identification import Identification
+from snrmjax.identify.joint.joint_fit import JointFit
+from snrmjax.identify.pointwise.backbone import Backbone
+from snrmjax.identify.pointwise.missing_resonance import level_in_resonance
+from snrmjax.identify.pointwise.prediction import (
+    LARGEST_AMPLITUDE_RATIO,
+    PredictedResponse,
+    Resonance,
+    predict_response,
+    resonances,
+)
+from snrmjax.identify.prediction.new_level import DayToDay, new_level
+from snrmjax.identify.prediction.notes import notes_on_resonance, notes_on_trends
+from snrmjax.identify.prediction.resonance_distribution import ResonanceDistribution
+from snrmjax.measure.states import SteadyStates
+from snrmjax.model.structures import Structure
+from snrmjax.numerics.facts import Fact
+from snrmjax.pipelines.options import IdentifyOptions
+
+Note = Fact | str
+
+
+class Prediction(NamedTuple):
+    """What the identified curves predict under one force."""
+
+    force: float  # N
+    resonances: Sequence[Resonance]  # in order of amplitude
+    responses: Sequence[PredictedResponse]  # the main curve first; those of a joint fit with 1σ
+    further: ResonanceDistribution  # of the resonance of a level that was not measured
+    drive: float | None = None  # V, where the force is known as a drive voltage
+
+    @property
+    def banded(self) -> list[FittedResponse]:
+        """The responses that have bands."""
+        return [each for each in self.responses if isinstance(each, FittedResponse)]
+
+    @property
+    def load(self) -> Fact:
+        """The force, and its drive voltage where the force is known as one."""
+        return Fact("load", force=self.force, drive=self.drive)
+
+
+def reach_of(options: IdentifyOptions) -> float:
+    """Up to which multiple of the largest measured amplitude curves are continued."""
+    return LARGEST_AMPLITUDE_RATIO if options.extrapolate is None else options.extrapolate
+
+
+def predictions_of_points(
+    identification: Identification, model: Structure, options: IdentifyOptions
+) -> tuple[Prediction, ...]:
+    """What curves through points predict."""
+    backbone, ratio = identification.backbone, reach_of(options)
+    return tuple(
+        Prediction(
+            force,
+            resonances(backbone, model.modes, force, largest_amplitude_ratio=ratio),
+            predict_response(backbone, model.modes, force, largest_amplitude_ratio=ratio),
+            predicted_resonance(
+                identification.fit,
+                force,
+                largest_amplitude_ratio=ratio,
+                of=new_level(identification.fit, force, day=_day_of(options)),
+                self_excited=options.self_excited,
+            ),
+        )
+        for force in dict.fromkeys(options.predict_force)
+    )
+
+
+def predictions_of_fit(
+    fit: JointFit, options: IdentifyOptions
+) -> tuple[tuple[Prediction, ...], tuple[Note, ...]]:
+    """What a joint fit predicts, and notes on trends of its levels, by which bands are wider."""
+    loads: list[tuple[float, float | None, bool]] = []
+    for force in dict.fromkeys(options.predict_force):
+        record = float(fit.recorded_force(np.array(force))) if fit.drive_known_only else None
+        loads.append((force, record, False))
+    for drive in dict.fromkeys(options.predict_drive):
+        loads.append((float(fit.force_of_drive(np.array(drive))), drive, True))
+    predictions: list[Prediction] = []
+    notes: list[Note] = []
+    for force, record, as_recorded in loads:
+        settings: dict[str, Any] = {
+            "largest_amplitude_ratio": reach_of(options),
+            "of": new_level(fit, force, as_recorded=as_recorded, day=_day_of(options)),
+        }
+        banded = fitted_response(fit, force, **settings)
+        further = predicted_resonance(fit, force, self_excited=options.self_excited, **settings)
+        tips = sorted((tip for one in banded for tip in one.resonances), key=lambda t: t.amplitude)
+        predictions.append(Prediction(force, tips, banded, further, record))
+        notes += notes_on_trends(settings["of"].trends, predictions[-1].load)
+    return tuple(predictions), tuple(notes)
+
+
+def require_drive(data: SteadyStates) -> None:
+    """Raise `ValueError` for data whose force is known in newtons."""
+    if np.any(np.isfinite(np.asarray(data.force))):
+        raise ValueError(
+            "`--predict-drive` is for data with a drive voltage (`drive_v`), but these have the "
+            "force in newtons (`force_n`): use `--predict-force`."
+        )
+
+
+def notes_on_predictions(
+    predictions: Sequence[Prediction], backbone: Backbone, data: SteadyStates
+) -> list[Note]:
+    """Forces whose resonance lies beyond the range or the data, or is one of several.
+
+    Where the curves have none within the range, but a level of that force was measured in
+    resonance, this is said too.
+    """
+    notes: list[Note] = []
+    for each in predictions:
+        notes += notes_on_resonance(each.further, each.load)
+        near = None if each.resonances else level_in_resonance(data, backbone, each.force)
+        if near is not None:
+            notes.append(
+                Fact(
+                    "level_missed_by_curves",
+                    level=near.level,
+                    force=near.force,
+                    frequency_hz=near.frequency,
+                    velocity=near.velocity,
+                )
+            )
+        if any(resonance.continued for resonance in each.resonances):
+            notes.append(Fact("resonance_beyond_data", load=each.load))
+        notes += [
+            Fact("response_note", load=each.load, note=str(response.note))
+            for response in each.responses
+            if response.note
+        ]
+        if len(each.resonances) > 1:
+            notes.append(Fact("several_resonances", n=len(each.resonances), load=each.load))
+    return notes
+
+
+def _day_of(options: IdentifyOptions) -> DayToDay | None:
+    """By how much another day's test differs: the option `--day-std`."""
+    if options.day_std is None:
+        return None
+    try:
+        day = DayToDay(*map(float, options.day_std.split(",")))
+    except (TypeError, ValueError):
+        day = DayToDay(-1.0)
+    if not all(0 <= each < 1 for each in day):
+        raise ValueError(
+            "`--day-std` takes up to three relative standard deviations from 0 to below 1, "
+            f"FREQUENCY,DAMPING,GAIN as 0.001,0.05,0.02, but is {options.day_std!r}."
+        )
+    return day

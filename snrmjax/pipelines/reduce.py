@@ -1,0 +1,187 @@
+"""A reduced-order model from its source: load cases, condensation, and how far it holds."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from snrmjax.condense.condensation import Condensation, reduced_model
+from snrmjax.condense.load_cases import StaticCases
+from snrmjax.condense.load_set import modal_loads
+from snrmjax.condense.scale_study import (
+    TOLERANCE,
+    LoadScaleStudy,
+    leading_terms,
+    load_scale_study,
+    typical_displacement,
+)
+from snrmjax.io.calculix.reduction import read_deck_source
+from snrmjax.io.files import FilePath
+from snrmjax.io.reduction.beam_source import read_beam
+from snrmjax.io.reduction.load_tables import read_load_tables
+from snrmjax.io.reduction.source import ReductionSource, run_load_cases
+from snrmjax.io.units import HERTZ
+from snrmjax.model.potential import monomial_key
+from snrmjax.model.structures import Structure, equilibria
+from snrmjax.numerics.facts import Fact
+from snrmjax.pipelines.options import ReduceOptions, checked
+
+_SWEEP = (2.0, 3.0, 5.0, 7.5, 10.0)  # of the loads of single modes, to see the model's range
+_FEW_SCALES = (0.1, 0.3, 1.0, 3.0)  # of a study whose load cases take long
+_MEANINGLESS = 0.5  # share of a force or a coefficient that is missed: beyond it there is no model
+_REFUSED_LINEAR = 0.2  # deviation of the linear stiffness beyond which nothing fits together
+
+
+class Reduction(NamedTuple):
+    """A reduced-order model and how it was made."""
+
+    source: ReductionSource
+    condensation: Condensation
+    structure: Structure
+    displacement: np.ndarray | None  # m that single modes move linearly; None for tables
+    study: LoadScaleStudy | None
+    sweep: StaticCases | None  # single modes, far beyond the load cases; None for tables
+    notes: tuple[Fact | str, ...]
+
+    @property
+    def load_scale(self) -> float | None:
+        """The largest of those displacements, in thicknesses."""
+        if self.displacement is None or self.source.thickness is None:
+            return None
+        return float(np.max(self.displacement)) / self.source.thickness
+
+    @property
+    def mode_names(self) -> list[str]:
+        """Modes as texts name them."""
+        basis = self.condensation.basis
+        hertz = np.asarray(basis.frequency) / HERTZ
+        return [f"mode {n} ({h:.4g} Hz)" for n, h in zip(basis.numbers, hertz, strict=True)]
+
+
+def reduce_model(
+    source: ReductionSource,
+    *,
+    study: bool = True,
+    report: Callable[[int, int], None] | None = None,
+) -> Reduction:
+    """Run what load cases are missing, condense them, and repeat it over the size of the loads.
+
+    Raises `ValueError` where load cases contradict one another or the modes, where they do not
+    determine the model, and where none of them has a solution.
+    """
+    displacement, cases = None, source.cases
+    if cases is None:
+        displacement, cases = run_load_cases(source)
+    found = reduced_model(source.basis, cases, degree=source.degree)
+    _refuse_contradictions(source, found)
+    compared = _stated_scale_compared(source, found)
+    scales = sweep = None
+    if displacement is not None and source.solve is not None:
+        far = modal_loads(source.basis, displacement, most_modes=1, levels=_SWEEP)
+        sweep = source.solve(np.asarray(far.force))
+    if study and source.solve is not None and displacement is not None:
+        scales = load_scale_study(
+            source.basis,
+            source.solve,
+            displacement,
+            degree=source.degree,
+            scales=source.scales,
+            report=report,
+        )
+    structure = source.structure(found)
+    notes: list[Fact | str] = [*source.notes, *compared]
+    notes += found.warnings
+    if scales is not None and not scales.holds_default:
+        notes.append(Fact("load_scale_outside_plateau"))
+    states = [one for one in equilibria(structure) if one.stable]
+    if len(states) > 1:
+        notes.append(Fact("several_equilibria", n=len(states)))
+    return Reduction(source, found, structure, displacement, scales, sweep, tuple(notes))
+
+
+def _refuse_contradictions(source: ReductionSource, found: Condensation) -> None:
+    if source.cases is None:
+        return
+    for warning in found.warnings:
+        if warning.kind == "inconsistent_case":
+            raise ValueError(f"{warning}; mend or remove it.")
+    ratio = found.quality.linear_stiffness_ratio
+    worst = int(np.argmax(np.abs(np.nan_to_num(ratio, nan=1.0) - 1)))
+    if abs(ratio[worst] - 1) > _REFUSED_LINEAR:
+        raise ValueError(
+            f"the load cases show {ratio[worst]:.4g} times the squared natural frequency of mode "
+            f"{found.basis.numbers[worst]} as linear stiffness: units, loads, shapes and "
+            "frequencies do not belong together."
+        )
+
+
+def _stated_scale_compared(source: ReductionSource, found: Condensation) -> list[Fact]:
+    """What a stated load scale does to the coefficients, beside the one that would be chosen.
+
+    Raises `ValueError` where the model is none of the structure: where the potential leaves more
+    than half of the nonlinear force of its own load cases, or where a leading coefficient differs
+    from that of the chosen scale by more than half of it.
+    """
+    if source.load_scale is None or source.solve is None or source.thickness is None:
+        return []
+    stated, misfit = f"`load_scale` = {source.load_scale:g} thicknesses", found.quality.misfit
+    if misfit > _MEANINGLESS:
+        raise ValueError(
+            f"with {stated} the potential leaves {100 * misfit:.0f} % of the nonlinear force of "
+            "its own load cases, so that it is no model of the structure: leave the key out, and a "
+            "scale is chosen."
+        )
+    try:
+        displacement, cases = run_load_cases(source._replace(load_scale=None))
+    except ValueError as error:
+        why = str(error)
+        return [Fact("load_scale_not_compared", stated=source.load_scale, why=why)]
+    chosen = reduced_model(source.basis, cases, degree=source.degree)
+    scale = float(np.max(displacement)) / source.thickness
+    monomials, own = chosen.potential.monomials, np.asarray(chosen.potential.coefficient)
+    leading = np.flatnonzero(leading_terms(own, typical_displacement(cases), monomials))
+    change = np.asarray(found.potential.coefficient)[leading] / own[leading] - 1
+    worst = int(np.argmax(np.abs(change)))
+    if not abs(change[worst]) > TOLERANCE:
+        return []
+    fact = Fact(
+        "load_scale_compared",
+        stated=source.load_scale,
+        coefficient=monomial_key(monomials[leading[worst]]),
+        change=float(change[worst]),
+        chosen=scale,
+    )
+    if abs(change[worst]) > _MEANINGLESS:
+        raise ValueError(f"{fact}: leave the key out, or state a smaller scale.")
+    return [fact]
+
+
+def read_reduction_source(
+    beam: FilePath | None = None, options: ReduceOptions | None = None, **settings: Any
+) -> ReductionSource:
+    """What is condensed: a beam file, or tables or a deck by the options; exactly one of them.
+
+    Raises `ValueError` for none or several of them, and as the readers do.
+    """
+    options = checked(dataclasses.replace(options or ReduceOptions(), **settings))
+    sources = {"BEAM": beam, "--tables": options.tables, "--calculix": options.calculix}
+    given = [name for name, path in sources.items() if path is not None]
+    if len(given) != 1:
+        listed = " and ".join(given) or "none of them"
+        raise ValueError(f"`rom` needs one of BEAM, --tables and --calculix, but has {listed}.")
+    if options.tables is not None:
+        return read_load_tables(options.tables)
+    if beam is not None:
+        return read_beam(beam)
+    source = read_deck_source(options.calculix or "", _mode_numbers(options.modes))
+    return source._replace(scales=_FEW_SCALES)
+
+
+def _mode_numbers(modes: str | None) -> tuple[int, ...]:
+    parts = [part.strip() for part in (modes or "").split(",")]
+    numbers = [int(part) for part in parts if part.isdecimal() and int(part) > 0]
+    if len(numbers) < len(parts) or len(set(numbers)) < len(numbers):
+        given = "not given" if modes is None else repr(modes)
+        raise ValueError(f"`--modes` must be different mode numbers such as 1,3,5, but is {given}.")
+    return tuple(numbers)

@@ -1,0 +1,140 @@
+"""Simulation of a model: responses and nonlinear normal mode, with what they do not show."""
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from snrmjax.identify.pointwise.snrm import reference_sensor
+from snrmjax.io.units import HERTZ
+from snrmjax.model.structures import Structure, equilibria
+from snrmjax.numerics.facts import Fact
+from snrmjax.simulate.continuation.continuation import CurveStatus
+from snrmjax.simulate.continuation.response_curve import ResponseCurve
+from snrmjax.simulate.continuation.stability import Stability
+from snrmjax.simulate.solutions.forced_response import ResponseSettings, forced_response
+from snrmjax.simulate.solutions.isolated_responses import isolated_responses
+from snrmjax.simulate.solutions.normal_modes import NormalModeBranch, nonlinear_normal_mode
+
+_TRUNCATED = 0.02  # share of the velocity that harmonics left out may have, without a note
+_ENDS = (CurveStatus.UPPER_END, CurveStatus.LOWER_END)
+
+
+class SimulatedResponses(NamedTuple):
+    """Forced responses of a model, the isolated ones after the main one of their force."""
+
+    curves: tuple[ResponseCurve, ...]
+    sensor: str  # that figures and tables show
+    notes: tuple[Fact, ...]
+
+
+class SimulatedMode(NamedTuple):
+    """The nonlinear normal mode of a model."""
+
+    branch: NormalModeBranch
+    sensor: str  # that figures and tables show
+    notes: tuple[Fact, ...]
+
+
+def simulate_responses(
+    model: Structure,
+    forces: Sequence[float],
+    from_hz: float,
+    to_hz: float,
+    *,
+    harmonics: int = 9,
+    isolated: bool = False,
+    progress: Callable[[float], None] = lambda force: None,
+) -> SimulatedResponses:
+    """Responses to harmonic forces, around folds and with unstable parts.
+
+    Arguments: `forces` in N; `harmonics` that are balanced; `isolated` also searches for curves
+    that are not connected to the one from rest; `progress` is told each force when it begins.
+    Raises `ValueError` as `forced_response` does, and where no curve has a point.
+    """
+    ends, settings = (from_hz * HERTZ, to_hz * HERTZ), ResponseSettings(harmonic_order=harmonics)
+    curves: list[ResponseCurve] = []
+    notes = list(_notes_on_equilibria(model))
+    for force in forces:
+        progress(force)
+        main = forced_response(model, [force], *ends, harmonic_order=harmonics)
+        curves += main
+        if isolated:
+            further = isolated_responses(model, force, *ends, known=main, settings=settings)
+            curves += further
+            notes.append(
+                Fact(
+                    "isolated_searched",
+                    force=force,
+                    n=len(further),
+                    n_starts=further.n_starts,
+                    n_failed=further.n_failed,
+                )
+            )
+    if not any(len(curve.frequency) for curve in curves):
+        raise ValueError("no response was found in this range; start farther from resonance.")
+    notes += [note for curve in curves for note in _notes_on_curve(curve)]
+    estimates = [np.max(c.truncation, initial=0.0) for c in curves if c.truncation is not None]
+    share = float(max(estimates, default=0.0))
+    if share > _TRUNCATED:
+        notes.append(Fact("harmonics_left_out", harmonics=harmonics, share=share))
+    return SimulatedResponses(tuple(curves), _sensor(model), tuple(notes))
+
+
+def simulate_mode(
+    model: Structure,
+    to_hz: float,
+    *,
+    harmonics: int = 9,
+    tongues: Literal["follow", "skip"] = "follow",
+) -> SimulatedMode:
+    """The undamped nonlinear normal mode of interest, from its linear frequency to `to_hz`.
+
+    Raises `ValueError` as `nonlinear_normal_mode` does.
+    """
+    linear = float(model.modes.natural_frequency[model.modes.mode_of_interest]) / HERTZ
+    if np.isclose(to_hz, linear, rtol=1e-12):
+        raise ValueError(f"`--to-hz` must differ from the linear frequency, {linear:g} Hz.")
+    branch = nonlinear_normal_mode(model, to_hz * HERTZ, harmonic_order=harmonics, tongues=tongues)
+    notes = [
+        *_notes_on_equilibria(model),
+        *(
+            Fact(
+                "internal_resonance",
+                harmonic=tongue.harmonic,
+                mode=tongue.mode + 1,
+                from_hz=tongue.from_frequency / HERTZ,
+                to_hz=tongue.to_frequency / HERTZ,
+            )
+            for tongue in branch.tongues
+        ),
+    ]
+    if branch.status not in _ENDS:
+        notes.append(Fact("mode_not_followed", status=branch.status))
+    return SimulatedMode(branch, _sensor(model), tuple(notes))
+
+
+def _sensor(model: Structure) -> str:
+    return model.modes.sensors[reference_sensor(model.modes)]
+
+
+def _notes_on_curve(curve: ResponseCurve) -> Iterator[Fact]:
+    if curve.branch == "main" and curve.status != CurveStatus.UPPER_END:
+        yield Fact("curve_ended", force=curve.force, status=curve.status)
+    if curve.not_located:
+        yield Fact("curve_events_not_located", force=curve.force, kinds=curve.not_located)
+    unknown = int(np.sum(curve.stability == int(Stability.NOT_COMPUTED)))
+    if unknown:
+        yield Fact("stability_not_computed", force=curve.force, n=unknown)
+
+
+def _notes_on_equilibria(model: Structure) -> tuple[Fact, ...]:
+    """That the structure has other equilibria than rest."""
+    others = [one for one in equilibria(model) if np.linalg.norm(one.displacement) > 0]
+    if not others:
+        return ()
+    shape = np.asarray(model.modes.mode_shape)
+    places = tuple(float((shape @ other.displacement)[0]) for other in others)  # m
+    stable = tuple(bool(other.stable) for other in others)
+    sensor = model.modes.sensors[0]
+    return (Fact("further_equilibria", sensor=sensor, displacement=places, stable=stable),)

@@ -1,0 +1,295 @@
+"""A whole test: a folder of a laboratory's files to linear modes, check, backbone and diagnosis."""
+
+import dataclasses
+import itertools
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from snrmjax.doctor.check import check_test
+from snrmjax.doctor.column_misreadings import doubt
+from snrmjax.doctor.findings import Checkup
+from snrmjax.identify.modal.modes_of_tests import find_modes
+from snrmjax.identify.modal.response_data import joined_responses
+from snrmjax.identify.scaling.scale import DrivePoint, scale_modes
+from snrmjax.identify.scaling.scaled_modes import ScaledModes
+from snrmjax.io.files import FilePath
+from snrmjax.measure.phase_convention import wrong_phases
+from snrmjax.measure.recordings.step_counts import StepCounts, joined_counts
+from snrmjax.measure.recordings.stepped_sine import SteppedSineStates, stepped_sine_states
+from snrmjax.measure.states import (
+    UNNAMED_SENSOR,
+    SteadyStates,
+    join_steady_states,
+    with_levels_apart,
+)
+from snrmjax.methods.records.recorded_test import RecordedTest, RecordKind, recorded_test
+from snrmjax.model.structures import Structure
+from snrmjax.numerics.facts import Fact
+from snrmjax.pipelines.check import files_of_test, is_certain, with_imports
+from snrmjax.pipelines.diagnose import DiagnosedTest, diagnose_test
+from snrmjax.pipelines.folded_records import FoldedRecord, folded_records
+from snrmjax.pipelines.folder_contents import NamedRecord, TestFiles, read_test_files
+from snrmjax.pipelines.identify import IdentifiedTest, identify_test
+from snrmjax.pipelines.modes import LinearModesFound, ModalFit
+from snrmjax.pipelines.options import WholeTestOptions, checked
+from snrmjax.pipelines.predictions import Note
+
+_FEWEST_ALIKE = 3  # states of two files
+_ALIKE = 1e-5  # relative difference of frequency and velocity, below what repeated tests reach
+_TINY = 1e-300
+_MOTIONS = ("velocity", "acceleration", "displacement")
+
+
+class SteppedRecord(NamedTuple):
+    """A record of a stepped sine: its steady states, and each folded to one period."""
+
+    file: str
+    steps: SteppedSineStates
+    folded: tuple[FoldedRecord | None, ...]
+
+
+class WholeTest(NamedTuple):
+    """All that was found in the files of one test."""
+
+    name: str
+    files: TestFiles
+    model: Structure
+    modes: LinearModesFound | None  # None where the folder had a model
+    records: tuple[tuple[str, RecordedTest], ...]  # by file
+    stepped: tuple[SteppedRecord, ...]
+    counts: StepCounts | None  # of all steps; None where not all states are of steps
+    data: SteadyStates  # of all files
+    checkup: Checkup
+    identified: IdentifiedTest
+    diagnosed: DiagnosedTest | None
+    left_out: tuple[Note, ...]  # why the diagnosis is left out
+    notes: tuple[Note, ...]
+
+    @property
+    def folded(self) -> list[FoldedRecord | None]:
+        """The record of every state, folded; None of a table's."""
+        of_steps = [each for record in self.stepped for each in record.folded]
+        return [None] * (self.data.n_states - len(of_steps)) + of_steps
+
+
+def run_whole_test(
+    folder: FilePath,
+    options: WholeTestOptions | None = None,
+    *,
+    progress: Callable[[str, float], None] = lambda stage, seconds: None,
+    **settings: Any,
+) -> WholeTest:
+    """Linear modes, steady states, check, backbone and diagnosis of the files in a folder.
+
+    Arguments: `options`, or its fields by keyword; `progress` is told each stage when it ends, with
+    its seconds.
+    Raises `ValueError`, as a question, where it would have to guess: which sensor is at the force,
+    or whether to go on in spite of what the check found; and as its stages do.
+    """
+    options = checked(dataclasses.replace(options or WholeTestOptions(), **settings))
+    folder = Path(folder)
+    stage, name = _Stages(progress), folder.resolve().name
+    files = read_test_files(folder, options.model)
+    read = files_of_test(folder, files)
+    stage.ends("files")
+    model, modes = files.model, None
+    if model is None:
+        modes = _linear_modes(files, options)
+        model = modes.structure
+    stage.ends("linear modes")
+    records = tuple((named.file, _sorted(named, model)) for named in files.records)
+    stepped = tuple(
+        _steps(named, test)
+        for named, (_, test) in zip(files.records, records, strict=True)
+        if test.kind is RecordKind.STEPPED_SINE
+    )
+    tables = [table.of_model(model) for table in files.states]
+    parts = with_levels_apart([*tables, *(each.steps.states for each in stepped)])
+    if not parts:
+        raise ValueError(
+            f"{name} holds no steady states and no record of a stepped sine: the linear modes are "
+            "all that it tells, as `snrmjax modes` writes them."
+        )
+    _refuse_doubled([*(t.file for t in files.states), *(each.file for each in stepped)], parts)
+    data = join_steady_states(parts)
+    stage.ends(f"{data.n_states} steady states")
+    checkup = check_test(parts, model, [named.record for named in files.records])
+    checkup = with_imports(checkup, read)
+    if not options.go_on:
+        _stop_at_errors(checkup)
+    stage.ends("check")
+    identified, by_points = _identified(data, model)
+    stage.ends("backbone and damping")
+    diagnosed = None
+    left_out = not_diagnosed(data, model) if options.diagnose else ()
+    if options.diagnose and not left_out:
+        diagnosed = diagnose_test(data, model)
+        stage.ends("diagnosis")
+    notes = (
+        *left_out,
+        *files.notes,
+        *_taken_sensors(files, model),
+        *(_note_on_steps(each) for each in stepped),
+        *by_points,
+    )
+    counts = _used_steps(files, stepped)
+    return WholeTest(
+        *(name, files, model, modes, records, stepped, counts),
+        *(data, checkup, identified, diagnosed, left_out, notes),
+    )
+
+
+class _Stages:
+    """Tells each stage with its seconds."""
+
+    def __init__(self, progress: Callable[[str, float], None]) -> None:
+        self.progress, self.began = progress, time.perf_counter()
+
+    def ends(self, name: str) -> None:
+        """One stage ended, and the next one begins."""
+        now = time.perf_counter()
+        self.progress(name, now - self.began)
+        self.began = now
+
+
+def not_diagnosed(data: SteadyStates, model: Structure) -> tuple[Note, ...]:
+    """Why a test is not diagnosed: phases, units or scales are not those of the model's mode.
+
+    The search would explain them by ever larger effects, which harmonic balance follows for many
+    minutes. A mode that is merely far from the linear one is diagnosed: effects may be why.
+    """
+    doubts = (*wrong_phases(data, model), *doubt(data, model))
+    return (Fact("diagnosis_left_out", why=str(doubts[0])),) if doubts else ()
+
+
+def _note_on_steps(record: SteppedRecord) -> Note:
+    return Fact("note_of_file", file=record.file, note=record.steps.counts.fact)
+
+
+def _taken_sensors(files: TestFiles, model: Structure) -> tuple[Note, ...]:
+    """That files without a name of a sensor were taken for the model's only one."""
+    names = tuple(table.file for table in files.states if table.names_no_sensor)
+    if not names or model.modes.sensors == UNNAMED_SENSOR:
+        return ()
+    return (Fact("sensor_not_named", files=names, sensor=model.modes.sensors[0]),)
+
+
+def _linear_modes(files: TestFiles, options: WholeTestOptions) -> LinearModesFound:
+    if files.responses:
+        source: object = joined_responses([named.responses for named in files.responses])
+    elif files.states:
+        source = join_steady_states(with_levels_apart([table.states for table in files.states]))
+    else:
+        raise ValueError(
+            "what are the linear modes? The folder has time records only: put a model.toml or "
+            "frequency responses beside them."
+        )
+    fitted, notes = find_modes(source)  # type: ignore[arg-type]
+    scaled = _scaled(fitted, DrivePoint(options.drive_point))
+    return LinearModesFound("model", fitted, scaled, _nearest_mode(scaled, files), notes)
+
+
+def _scaled(fitted: ModalFit, by: DrivePoint) -> ScaledModes:
+    try:
+        return scale_modes(fitted, by)
+    except ValueError as error:
+        raise ValueError(
+            f"how are the mode shapes scaled? {error} Answer by `--drive-point SENSOR`, or write "
+            "the model by `snrmjax modes`, which knows further ways, into this folder."
+        ) from error
+
+
+def _nearest_mode(scaled: ScaledModes, files: TestFiles) -> int:
+    """The mode at which the steady states are; the first where there are none."""
+    if not files.states:
+        return 0
+    frequency = np.concatenate([np.asarray(table.states.frequency) for table in files.states])
+    return int(np.argmin(np.abs(np.asarray(scaled.natural_frequency) - np.median(frequency))))
+
+
+def _sorted(named: NamedRecord, model: Structure) -> RecordedTest:
+    try:
+        return recorded_test(named.record, model.modes)
+    except ValueError as error:
+        moves = any(channel.quantity in _MOTIONS for channel in named.record.channels)
+        mend = (
+            ""
+            if moves
+            else f" `snrmjax import {named.file}` says what the file holds and how to import it; "
+            "put the map.toml that the import writes into the folder."
+        )
+        raise ValueError(f"{named.file}: {str(error).lstrip(' :')}{mend}") from error
+
+
+def _refuse_doubled(names: Sequence[str], parts: Sequence[SteadyStates]) -> None:
+    """Raise `ValueError` where two files hold the same states: no repetition is that alike."""
+    for (a, one), (b, two) in itertools.combinations(zip(names, parts, strict=True), 2):
+        first, second = (
+            np.log([part.frequency, np.sum(np.abs(part.velocity), axis=1) + _TINY])
+            for part in (one, two)
+        )
+        apart = np.max(np.abs(first[:, :, None] - second[:, None, :]), axis=0)
+        same = int(np.sum(apart.min(axis=0) < _ALIKE))
+        if same >= max(_FEWEST_ALIKE, min(one.n_states, two.n_states) / 2):
+            raise ValueError(
+                f"which of {a} and {b} is the test? Both hold the same {same} steady states, which "
+                "would count twice: move one of them out of the folder."
+            )
+
+
+def _steps(named: NamedRecord, test: RecordedTest) -> SteppedRecord:
+    """Steady states of a stepped sine, by its channels."""
+    channels = test.channels
+    force = channels.force or channels.drive
+    if force is None:
+        raise ValueError(f"{named.file} is a stepped sine, but has no channel of force or drive.")
+    steps = stepped_sine_states(
+        named.record,
+        force,
+        channels.motions,
+        sensors=channels.sensors,
+        drive=channels.drive if channels.force else None,
+    )
+    folded = folded_records(named.record, steps, force, channels.reference)
+    return SteppedRecord(named.file, steps, tuple(folded))
+
+
+def _used_steps(files: TestFiles, stepped: Sequence[SteppedRecord]) -> StepCounts | None:
+    """The counts of the records, or those of the import of all tables; None where not all are."""
+    if stepped:
+        return None if files.states else joined_counts([each.steps.counts for each in stepped])
+    imported = files.steps_at_import
+    used = sum(table.states.n_states for table in files.states)
+    return imported if imported is not None and imported.used == used else None
+
+
+def _stop_at_errors(checkup: Checkup) -> None:
+    errors = [finding for finding in checkup.findings if finding.severity == "error"]
+    if not errors:
+        return
+    first, *others = errors
+    more = "".join(
+        f" {'Besides,' if is_certain(first) and is_certain(other) else 'Or'} {other.evidence} "
+        f"{other.mend}"
+        for other in others
+    )
+    raise ValueError(
+        f"is this meant? {first.name} in {first.where}: {first.evidence} To mend "
+        f"it: {first.mend}{more} To go on nevertheless: `--go-on`."
+    )
+
+
+def _identified(data: SteadyStates, model: Structure) -> tuple[IdentifiedTest, tuple[Note, ...]]:
+    """A joint fit; curves through the points where the states are too few for one."""
+    drive_only = not np.isfinite(np.asarray(data.force)).any()
+    free = ("instrument_phase",) if drive_only else ()
+    try:
+        return identify_test(data, model, fit="auto", free=free), ()
+    except ValueError as error:
+        if drive_only:
+            raise
+        return identify_test(data, model), (Fact("no_joint_fit", why=str(error)),)

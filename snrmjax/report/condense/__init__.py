@@ -1,1 +1,0 @@
-"""Reports of reduced-order models."""

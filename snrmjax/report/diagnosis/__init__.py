@@ -1,1 +1,0 @@
-"""Parts of the report of a diagnosis."""

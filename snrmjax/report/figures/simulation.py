@@ -1,0 +1,284 @@
+"""Figures of simulated motions: responses, nonlinear modes, batches and virtual tests."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from matplotlib import colormaps
+from matplotlib.figure import Figure
+
+from snrmjax.io.units import DEGREE, HERTZ
+from snrmjax.measure.signals import peak_amplitude
+from snrmjax.report.sampling import BAND, velocity_of
+from snrmjax.report.style import (
+    BACKGROUND,
+    COLUMN,
+    CURVE,
+    DOT,
+    HOLLOW,
+    IDENTIFIED,
+    LINE,
+    MEASURED,
+    PAGE,
+    SERIES,
+    SIMULATED,
+    Style,
+    amplitude_and_phase,
+    banded,
+    explain_lines,
+    fit_axis,
+    frequency_and_damping,
+    legend,
+    marks,
+    name_axes,
+    panels,
+    phase_axis,
+    plain,
+    response_line,
+    stars,
+    unit_for,
+    with_unit,
+)
+from snrmjax.simulate.solutions.controlled import DampedModeBranch
+from snrmjax.simulate.solutions.forced_response import ResponseBatch, ResponseCurve
+from snrmjax.simulate.solutions.normal_modes import NormalModeBranch
+
+
+def simulated_response_figure(
+    curves: Sequence[ResponseCurve], *, sensor: str | None = None
+) -> Figure:
+    """Forced responses by harmonic balance: amplitude and phase of the velocity fundamental.
+
+    Unstable parts are dashed, parts whose stability was not computed dash-dotted; triangles mark
+    peaks, squares folds, dots phase resonances.
+
+    Arguments: `sensor` by default the first of the curves.
+    Returns the figure. Raises `ValueError` when no curve has a point or the sensor is missing.
+    """
+    drawn = sorted((c for c in curves if len(c.frequency)), key=lambda c: c.force)
+    if not drawn:
+        raise ValueError("there is no response to show: no curve has a point.")
+    name = sensor or drawn[0].sensors[0]
+    forces = sorted({c.force for c in drawn})
+    shades = colormaps["viridis"](np.linspace(0.0, 0.85, len(forces)))
+    colours = dict(zip(forces, shades, strict=True))
+    unit = unit_for(np.concatenate([velocity_of(c, name) for c in drawn]), "m/s")
+    figure, speeds, phases = amplitude_and_phase(PAGE, 5.4, name, unit)
+    markers = {"peak": "^", "fold": "s", "phase_resonance": "o"}
+    for event in (None, *markers):
+        for curve in drawn:
+            v, x = velocity_of(curve, name), curve.frequency / HERTZ
+            for axes, y in ((speeds, np.abs(v) / unit.size), (phases, np.angle(v) / DEGREE)):
+                if event is None:
+                    label, colour = with_unit(curve.force, "N"), colours[curve.force]
+                    response_line(axes, x, y, curve.stability, label, colour, LINE)
+                    continue
+                at, style = curve.at_events(event), {**HOLLOW, "marker": markers[event]}
+                if event == "phase_resonance":
+                    style |= {"color": "black", "markersize": 2.0}
+                marks(axes, x[at], y[at], style, event.replace("_", " "))
+    speeds.set_ylim(bottom=0.0)
+    phase_axis(phases)
+    explain_lines(figure)
+    legend(figure)
+    return figure
+
+
+def normal_mode_figure(branch: NormalModeBranch, *, sensor: str | None = None) -> Figure:
+    """A nonlinear normal mode: velocity against frequency, and frequency against energy.
+
+    The velocity is shown as amplitude of the fundamental and as peak of the whole signal: they
+    part where an internal resonance puts energy into higher harmonics. The energy axis shows the
+    last five decades.
+
+    Arguments: `sensor` by default the branch's first.
+    Returns the figure. Raises `ValueError` when the branch has no point or not this sensor.
+    Reference: Kerschen et al., Mech. Syst. Signal Process. 23 (2009) 170,
+    doi:10.1016/j.ymssp.2008.04.002, for the frequency-energy plot.
+    """
+    if not len(branch.frequency):
+        raise ValueError("there is no normal mode to show: the branch has no point.")
+    name = sensor or branch.sensors[0]
+    fundamental = np.abs(velocity_of(branch, name))
+    signal = branch.velocity[:, 1:, branch.sensors.index(name)]
+    peak = np.asarray(peak_amplitude(jnp.asarray(signal), tuple(range(1, signal.shape[1] + 1))))
+    unit, omega = unit_for(peak, "m/s"), branch.frequency / HERTZ
+    figure, ((speeds, energies),) = panels(PAGE, 3.2, 1, 2)
+    speeds.plot(omega, peak / unit.size, color=SERIES[5], **CURVE, label="peak of the signal")
+    speeds.plot(omega, fundamental / unit.size, color=SIMULATED, **CURVE, label="fundamental")
+    energies.semilogx(branch.energy, omega, color=SIMULATED, **CURVE)
+    energies.set_xlim(left=max(1e-5 * branch.energy.max(), branch.energy.min()))
+    speeds.set_ylim(bottom=0.0)
+    title, level = f"(a) amplitude at {plain(name)}", f"Velocity amplitude ({unit.name})"
+    name_axes(speeds, title, "Frequency (Hz)", level)
+    name_axes(energies, "(b) frequency and energy", "Energy (J)", "Frequency (Hz)")
+    legend(figure)
+    return figure
+
+
+def motions_figure(
+    frequency: np.ndarray,
+    velocity: np.ndarray,
+    *,
+    sensor: str = "the first sensor",
+    joined: bool,
+    stable: np.ndarray | None = None,
+    beyond: np.ndarray | None = None,
+) -> Figure:
+    """Amplitude and phase of the velocity of motions against their frequency.
+
+    Arguments: `frequency` in rad/s, `velocity` the complex fundamental in m/s, of every motion;
+    `joined` draws them as a curve, dashed where it is not `stable` and pale `beyond` the data.
+    Returns the figure. Raises `ValueError` without a motion.
+    """
+    speeds, omega = np.atleast_1d(velocity), np.atleast_1d(frequency) / HERTZ
+    if not np.any(np.isfinite(speeds)):
+        raise ValueError("there is no motion to show: none was found.")
+    unit = unit_for(speeds[np.isfinite(speeds)], "m/s")
+    figure, upper, lower = amplitude_and_phase(COLUMN, 4.4, sensor, unit)
+    steady = np.ones(len(speeds), dtype=bool) if stable is None else stable
+    for axes, y in ((upper, np.abs(speeds) / unit.size), (lower, np.angle(speeds) / DEGREE)):
+        if joined:
+            response_line(axes, omega, y, steady, "response", SIMULATED, LINE, beyond)
+        else:
+            axes.plot(omega, y, **{**DOT, "color": MEASURED})
+    upper.set_ylim(bottom=0.0)
+    phase_axis(lower)
+    if joined and not (np.all(steady) and beyond is None):
+        explain_lines(figure)
+        legend(figure)
+    return figure
+
+
+def damped_mode_figure(branch: DampedModeBranch, *, sensor: str | None = None) -> Figure:
+    """Natural frequency and damping ratio of a damped nonlinear mode against its amplitude.
+
+    Arguments: `sensor` by default the branch's first.
+    Returns the figure. Raises `ValueError` when the branch has no point or not this sensor.
+    """
+    if not len(branch.frequency):
+        raise ValueError("there is no mode to show: the branch has no point.")
+    name = sensor or branch.sensors[0]
+    if name not in branch.sensors:
+        raise ValueError(f"`sensor` must be one of {branch.sensors}, but is {name!r}.")
+    velocity = np.abs(branch.velocity[:, 1, branch.sensors.index(name)])
+    return amplitudes_figure(velocity, branch.frequency, branch.damping_ratio, name)
+
+
+def amplitudes_figure(
+    velocity: Float[Array | np.ndarray, " point"],
+    frequency: Float[Array | np.ndarray, " point"],
+    damping_ratio: Float[Array | np.ndarray, " point"],
+    sensor: str = "the sensor",
+    *,
+    stds: tuple[Any, Any] | None = None,
+    joined: bool = True,
+) -> Figure:
+    """Natural frequency and damping ratio of a mode against the velocity amplitude.
+
+    Arguments: `velocity` in m/s at `sensor`, `frequency` in rad/s; `stds` the 1σ of frequency
+    and damping ratio, drawn as 95 % bands or bars; `joined` draws a curve.
+    Returns the figure. Raises `ValueError` without a finite point.
+    """
+    speeds = np.asarray(velocity)
+    if not np.any(np.isfinite(speeds)):
+        raise ValueError("there is no mode to show: no point is finite.")
+    unit = unit_for(speeds[np.isfinite(speeds)], "m/s")
+    level = f"Velocity amplitude ({unit.name})"
+    figure, frequencies, dampings = frequency_and_damping(3.2, level, f", at {plain(sensor)}")
+    colour = SIMULATED if stds is None else IDENTIFIED
+    for number, (axes, values, scale) in enumerate(
+        ((frequencies, frequency, 1 / HERTZ), (dampings, damping_ratio, 100.0))
+    ):
+        x, y = speeds / unit.size, scale * np.asarray(values)
+        error = None if stds is None else BAND * scale * np.asarray(stds[number])
+        if not joined:
+            stars(axes, x, y, "identified, 95 % bars" if error is not None else None, yerr=error)
+        else:
+            banded(axes, x, y, error, colour, None if error is None else "curve")
+        axes.set_xlim(left=0.0)
+        fit_axis(axes, "y", y)
+    if stds is not None:
+        legend(figure)
+    return figure
+
+
+def batch_figure(batch: ResponseBatch) -> Figure:
+    """Where the peaks and the phase resonances of many responses lie.
+
+    Returns the figure. Raises `ValueError` when no member has either.
+    """
+    series: Sequence[tuple[str, np.ndarray, np.ndarray]] = (
+        ("highest peak", batch.peak_frequency, batch.peak_velocity),
+        ("phase resonance", batch.resonance_frequency, batch.resonance_velocity),
+    )
+    every = np.concatenate([velocity[np.isfinite(velocity)] for _, _, velocity in series])
+    if not every.size:
+        raise ValueError("there is nothing to show: no member has a peak or a resonance.")
+    unit = unit_for(every, "m/s")
+    figure, ((axes,),) = panels(COLUMN, 3.4, 1, 1)
+    for (name, frequency, velocity), colour, marker in zip(
+        series, SERIES[:2], ("o", "x"), strict=True
+    ):
+        style: Style = {**DOT, "color": colour, "marker": marker}
+        marks(axes, frequency / HERTZ, velocity / unit.size, style, name)
+    axes.set_ylim(bottom=0.0)
+    title = f"{len(batch.status)} responses"
+    name_axes(axes, title, "Frequency (Hz)", f"Velocity amplitude ({unit.name})")
+    legend(figure)
+    return figure
+
+
+def force_velocity_points(force: np.ndarray, velocity: np.ndarray) -> Figure:
+    """Size and phase of the force of prescribed motions against their velocity amplitude.
+
+    Arguments: `force` in N and `velocity` in m/s, complex. Returns the figure.
+    Raises `ValueError` when no motion was found.
+    """
+    found = np.isfinite(force) & np.isfinite(velocity)
+    if not found.any():
+        raise ValueError("there is no force to show: no motion was found.")
+    speed, load = np.abs(velocity[found]), force[found]
+    unit, newton = unit_for(speed, "m/s"), unit_for(load, "N")
+    figure, ((upper,), (lower,)) = panels(COLUMN, 5.0, 2, 1)
+    upper.plot(speed / unit.size, np.abs(load) / newton.size, **DOT)
+    lower.plot(speed / unit.size, np.angle(load) / DEGREE, **DOT)
+    lower.sharex(upper)
+    phase_axis(lower)
+    name_axes(upper, "(a) amplitude", "", f"Force ({newton.name})")
+    below = f"Velocity amplitude ({unit.name})"
+    name_axes(lower, "(b) phase relative to the measured force", below, "Phase (°)")
+    return figure
+
+
+def points_figure(
+    x: np.ndarray | Sequence[int],
+    y: np.ndarray,
+    title: str,
+    below: str,
+    beside: str,
+    *,
+    error: np.ndarray | None = None,
+    joined: bool = False,
+    limits: Sequence[float] = (),
+) -> Figure:
+    """Points with error bars, or `joined` a curve in the band of its errors; dashed `limits`.
+
+    Arguments: `title` and what the axes `below` and `beside` are. Returns the figure. Raises
+    `ValueError` without a finite value.
+    """
+    if not np.isfinite(y).any():
+        raise ValueError(f"there is nothing to show: no {beside.split(' (')[0].lower()} was found.")
+    figure, ((axes,),) = panels(COLUMN, 3.4, 1, 1)
+    if joined:
+        banded(axes, x, y, error, SIMULATED)
+    elif error is None:
+        axes.plot(x, y, **DOT)
+    else:
+        axes.errorbar(x, y, yerr=error, **DOT)
+    for limit in limits:
+        axes.axhline(limit, color=BACKGROUND, linestyle="--")
+    name_axes(axes, title, below, beside)
+    return figure

@@ -1,1 +1,0 @@
-"""Figures of a report that answer to the mouse: zoom, hover, levels and states linked."""

@@ -1,1 +1,0 @@
-"""Laws that a diagnosis draws, as figures and tables."""

@@ -1,1 +1,0 @@
-"""Reports of several methods on the same data."""

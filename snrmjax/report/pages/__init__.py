@@ -1,0 +1,1 @@
+"""Pages: what a report of each result tells, and the files beside it."""

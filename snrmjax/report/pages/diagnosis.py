@@ -1,0 +1,411 @@
+"""The report of a diagnosis: verdict, effects and their laws, evidence, resonances."""
+
+from collections.abc import Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from snrmjax.diagnose.decide import Verdict
+from snrmjax.diagnose.diagnosis_result import Diagnosis
+from snrmjax.diagnose.evidence import NOISE_REJECTED, NONE, UNKNOWN
+from snrmjax.diagnose.misfit.candidates import scales_of_motions
+from snrmjax.diagnose.priors import AS_NOISE
+from snrmjax.diagnose.response_prediction import (
+    LevelResponse,
+    holds_response,
+)
+from snrmjax.diagnose.search.locating import Located
+from snrmjax.diagnose.search.model_search import TriedEffect, beyond_data
+from snrmjax.io.diagnosis_results import summarise_diagnosis
+from snrmjax.io.files import write_summary
+from snrmjax.io.models import write_model
+from snrmjax.measure.states import relative_errors
+from snrmjax.model.effect_shape import shape_of
+from snrmjax.model.effects import EFFECTS, effect_class
+from snrmjax.pipelines.diagnose import DiagnosedTest, SimulatedLevels
+from snrmjax.report.figures.diagnosis import (
+    HELD_CAPTION,
+    candidates_figure,
+    comparison_figure,
+    effect_laws_figure,
+    found_effects,
+    held_velocity_figure,
+    misfit_figure,
+)
+from snrmjax.report.figures.drawn_laws import LAW_CAPTION, drawn_laws_figure, law_tables
+from snrmjax.report.figures.identification import save_figures
+from snrmjax.report.html import (
+    Report,
+    ReportFigure,
+    ReportTable,
+    Section,
+    minus,
+    number,
+    with_error,
+    write_report,
+)
+from snrmjax.report.pages.resonance_table import (
+    resonance_in_words,
+    resonance_rows,
+    velocity_unit,
+)
+from snrmjax.report.sentences.diagnose import effect_name
+from snrmjax.report.sentences.diagnose import probability_in_words as in_words
+from snrmjax.report.style import PrintedFigure, unit_for, with_unit
+
+_SHOWN = 10  # candidates
+_LEAST_P_VALUE = 1e-12  # smaller ones are not told apart
+
+_CAPTIONS = {
+    "laws": (
+        "What the completed model adds, over the measured range of motion. Forces are those that "
+        "would have to act at the drive to do the same to the mode."
+    ),
+    "responses": (
+        "Responses at the force of every level, without and with the effects that were found, over "
+        "the measured states. Lines should pass through the dots."
+    ),
+    "residuals": (
+        "How far the force that each measured state needs is from the one that acted, in standard "
+        "deviations of the noise (of its size alone where the phase is unknown). A correct model "
+        "leaves about 1 everywhere; dark regions show where the model is wrong."
+    ),
+    "candidates": (
+        "How much better each effect, added alone, makes the model: gain of the Bayesian "
+        "information criterion. Left of the dashed line an effect is not detected; vermilion bars "
+        "are effects of the answer, or what the data cannot tell from them. Several effects "
+        "together may explain more than the longest bar."
+    ),
+}
+_PROBABILITIES = (
+    "The most probable answers, by how well each explains these data with all its parameters "
+    "uncertain. All answers considered add up to 100 %."
+)
+_OTHER_ANSWERS = {
+    NONE: "nothing is missing",
+    UNKNOWN: "something that no effect of the library explains",
+    NOISE_REJECTED: "the noise is not as stated",
+}
+
+
+def write(folder: Path, found: DiagnosedTest, *, title: str = "", data: str = "") -> Report:
+    """Write all that is told of a diagnosis: diagnosis.json, model.toml, figures and page.
+
+    Where no structure can have the parameters found, there is no `model.toml`.
+    """
+    diagnosis, predicted = found.diagnosis, found.predicted
+    figures = diagnosis_figures(diagnosis)
+    if found.simulated is not None:
+        figures["responses"] = responses_figure(diagnosis, found.simulated)
+    write_summary(folder / "diagnosis.json", summarise_diagnosis(diagnosis, predicted))
+    if diagnosis.completed is not None:
+        write_model(folder / "model.toml", diagnosis.completed)
+    report = diagnosis_report(
+        diagnosis,
+        f"Diagnosis of {title}",
+        save_figures(folder, figures),
+        predicted,
+        done={"data": data, "model": found.model.name},
+    )
+    write_report(folder / "report.html", report)
+    return report
+
+
+def answer_in_words(diagnosis: Diagnosis) -> str:
+    """The verdict with the effects of the answer, or of the best attempt."""
+    effects = ", ".join(diagnosis.effects)
+    if effects:
+        effects = f" ({effects})" if diagnosis.verdict.is_answer else f"; best attempt: {effects}"
+    return f"{diagnosis.verdict.replace('_', ' ')}{effects}"
+
+
+def headline(found: DiagnosedTest) -> list[str]:
+    """Verdict, probability, and what would decide an open answer."""
+    diagnosis = found.diagnosis
+    lines = [
+        diagnosis.verdict_sentence,
+        f"probability: {diagnosis.most_probable()}",
+    ]
+    if diagnosis.decide_by:
+        lines.append(f"what would decide: {diagnosis.decide_by}")
+    return lines
+
+
+def responses_figure(diagnosis: Diagnosis, simulated: SimulatedLevels) -> Figure:
+    """Responses of all levels, of the model as given and as completed."""
+    data = diagnosis.data
+    sensor = data.sensors[diagnosis.force_misfit.sensor]
+    _, before, after = simulated.predicted
+    if simulated.held is None:
+        return comparison_figure(before, after, data, sensor=sensor)
+    return held_velocity_figure(*simulated.held, data, sensor)
+
+
+def diagnosis_figures(diagnosis: Diagnosis) -> dict[str, Figure]:
+    """The figures that need no simulation, by the names of their files."""
+    figures = {"residuals": misfit_figure(diagnosis), "candidates": candidates_figure(diagnosis)}
+    found = found_effects(diagnosis)
+    if diagnosis.answer.laws:
+        figures["laws"] = drawn_laws_figure(diagnosis.answer.laws)
+    elif found is not None:
+        data = diagnosis.data
+        sensor = data.sensors[diagnosis.force_misfit.sensor]
+        figures["laws"] = effect_laws_figure(found, data, sensor=sensor)
+    return figures
+
+
+def diagnosis_report(
+    diagnosis: Diagnosis,
+    title: str,
+    figures: Mapping[str, Figure | PrintedFigure],
+    predicted: Sequence[LevelResponse] = (),
+    *,
+    done: Mapping[str, str] | None = None,
+) -> Report:
+    """The report of a diagnosis.
+
+    Arguments: `figures` by the names that `diagnosis_figures` gives them, and `responses`;
+    `predicted` resonances of the levels; `done` names the inputs.
+    """
+    captions = {**_CAPTIONS} | ({"laws": LAW_CAPTION} if diagnosis.answer.laws else {})
+    if holds_response(diagnosis.data, predicted):
+        captions["responses"] = HELD_CAPTION
+    shown = {name: ReportFigure(figure, captions[name]) for name, figure in figures.items()}
+    return Report(
+        title=title,
+        done=[*(done or {}).items(), ("program", f"snrmjax {version('snrmjax')}")],
+        result=diagnosis.verdict_sentence,
+        summary=_key_numbers(diagnosis, predicted),
+        notes=[*map(str, diagnosis.notes)],
+        sections=[
+            *([_effects_section(diagnosis, shown)] if diagnosis.effects else []),
+            _comparison_section(diagnosis, predicted, shown),
+            _candidates_section(diagnosis, shown),
+            _limits_section(diagnosis),
+        ],
+    )
+
+
+def _times(misfit: float) -> str:
+    return f"{misfit:.1f}" if misfit < 10 else number(misfit, 2)
+
+
+def _key_numbers(diagnosis: Diagnosis, predicted: Sequence[LevelResponse]) -> list[tuple[str, str]]:
+    gap, rows = diagnosis.gap, []
+    for kind in diagnosis.effects:
+        values = [
+            " ".join((_words(name), *_value_and_unit(kind, name, pair))).strip()
+            for name, pair in _own(kind, diagnosis.parameters).items()
+        ]
+        name = effect_name(kind)
+        unsure = diagnosis.verdict == Verdict.UNKNOWN
+        rows.append((f"best attempt: {name}" if unsure else name, ", ".join(values)))
+    misfit = f"{_times(gap.before)} → {_times(gap.after)} × noise"
+    if diagnosis.effects and gap.after > AS_NOISE:
+        misfit += "; the ± above holds only if the noise is as stated"
+    rows.append(("misfit of the force (rms), errors of levels and laws in it", misfit))
+    if np.isfinite(np.asarray(relative_errors(diagnosis.data))).any():
+        rows.append(
+            (
+                "random part of it, by neighbouring states",
+                f"{_times(diagnosis.checks.noise_scale)} × noise, errors of whole levels apart",
+            )
+        )
+    rows.append(("probability of this answer", in_words(diagnosis.probability)))
+    for place, out in (
+        ("misfit of a level between others", gap.interpolated),
+        ("misfit of the largest level", gap.extrapolated),
+    ):
+        if out:
+            name = f"{place} (level {out.level}), left out"
+            text = f"{_times(out.before)} → {_times(out.after)} × its prediction error"
+            rows.append((name, text))
+    if predicted:
+        top = max(predicted, key=lambda one: one.force)
+        pairs = [("measured", top.measured), ("model as given", top.before)]
+        pairs.append(("completed model", top.completed))
+        if top.held_out:
+            pairs.append((f"predicted without having seen level {top.level}", top.after))
+        unit = velocity_unit(one for _, one in pairs)
+        text = "; ".join(f"{name}: {resonance_in_words(one, unit)}" for name, one in pairs)
+        rows.append((f"resonance at {with_unit(top.force, 'N')}", text))
+    if diagnosis.decide_by:
+        rows.append(("what to measure next", diagnosis.decide_by))
+    return rows
+
+
+def _effects_section(diagnosis: Diagnosis, shown: Mapping[str, ReportFigure]) -> Section:
+    """What was found: what it is physically, its law, its parameters."""
+    text = []
+    for kind, group in zip(diagnosis.effects, diagnosis.candidates, strict=True):
+        name = effect_name(kind)
+        text.append(f"{name[0].upper()}{name[1:]}. {_description(kind)}")
+        others = [effect_name(other) for other in group if other != kind]
+        if others:
+            text[-1] += f" These data do not tell it from: {', '.join(others)}."
+    rows = [
+        (effect_name(kind), _meaning(kind, name), *_value_and_unit(kind, name, pair))
+        for kind in diagnosis.effects
+        for name, pair in _own(kind, diagnosis.parameters).items()
+    ]
+    caption = "Parameters of the effects ± 1σ, as model.toml has them."
+    if diagnosis.gap.after > AS_NOISE:
+        caption += (
+            " The ± holds only if the noise is as stated, but the misfit that is left is "
+            f"{_times(diagnosis.gap.after)} times that noise."
+        )
+    table = ReportTable(("effect", "parameter", "value ± 1σ", "unit"), rows, caption)
+    figures = [shown["laws"]] if "laws" in shown else []
+    unsure = diagnosis.verdict == Verdict.UNKNOWN
+    heading = "The best attempt, which does not explain the data" if unsure else "What is missing"
+    tables = law_tables(diagnosis.answer.laws) or [table]
+    return Section(heading, text, figures, tables)
+
+
+def _comparison_section(
+    diagnosis: Diagnosis, predicted: Sequence[LevelResponse], shown: Mapping[str, ReportFigure]
+) -> Section:
+    """Responses and misfit before and after, what disagrees, and the resonances."""
+    tables = []
+    if predicted:
+        header = ["level", "force", "measured", "model as given", "completed model"]
+        caption = (
+            "Phase resonances of the levels: frequency, velocity amplitude and, of models, the "
+            "fold where the branch ends. Where no phase was measured: the state with the largest "
+            "velocity over force."
+        )
+        if any(row.held_out for row in predicted):
+            header.append("predicted without having seen the level")
+            caption += " The last column is of models that were fitted without that level."
+        tables.append(ReportTable(header, resonance_rows(predicted), caption))
+    figures = [shown[name] for name in ("responses", "residuals") if name in shown]
+    text = [_located(part, diagnosis.gap.after) for part in diagnosis.located]
+    if not text:
+        text = ["No part of the force balance differs from the model by more than the noise."]
+    return Section("Model and data, before and after", text, figures, tables)
+
+
+def _candidates_section(diagnosis: Diagnosis, shown: Mapping[str, ReportFigure]) -> Section:
+    header = ("effect", "gain", "parameters")
+    tables = [
+        ReportTable(header, [_tried(row) for row in step[:_SHOWN]], folded=_step(k, len(step)))
+        for k, step in enumerate(diagnosis.table)
+        if step
+    ]
+    rows = [
+        (_OTHER_ANSWERS.get(name) or _answer(name), in_words(value))
+        for name, value in list(diagnosis.probabilities.items())[:_SHOWN]
+    ]
+    tables.insert(0, ReportTable(("answer", "probability"), rows, _PROBABILITIES))
+    return Section("What else was considered", (), [shown["candidates"]], tables)
+
+
+def _step(number_of: int, count: int) -> str:
+    return f"Comparison {number_of + 1}: the best {min(count, _SHOWN)} of {count} candidates"
+
+
+def _limits_section(diagnosis: Diagnosis) -> Section:
+    rows, misfit, scales = [], diagnosis.force_misfit, None
+    if diagnosis.completed is not None:
+        modes, data = diagnosis.completed.modes, diagnosis.data
+        columns = (np.abs(data.velocity[:, misfit.sensor]), data.frequency, data.force)
+        of_states = (np.asarray(column)[misfit.rows] for column in columns)
+        scales = scales_of_motions(modes, misfit.sensor, *of_states)
+    for name, limit in sorted(diagnosis.detection_limits.items()):
+        kind, parameter = name.split(".", 1)
+        size = (number(limit, 2), _unit(kind, parameter))
+        if beyond_data(EFFECTS[kind], limit, scales):
+            size = ("not detectable in these data", "")
+        rows.append((effect_name(kind), _meaning(kind, parameter), *size))
+    table = ReportTable(
+        ("effect", "parameter", "detected from", "unit"),
+        rows,
+        folded=f"Detection limits of {len(rows)} further effects",
+    )
+    text = "Effects larger than these limits would have been detected beside what was found."
+    return Section("What would have been detected", [text], (), [table])
+
+
+def _own(kind: str, parameters: Mapping[str, tuple[float, float]]) -> dict:
+    """The parameters of one effect by their own names."""
+    start = f"{kind}."
+    return {k.removeprefix(start): v for k, v in parameters.items() if k.startswith(start)}
+
+
+def _value_and_unit(kind: str, name: str, pair: tuple[float, float]) -> tuple[str, str]:
+    value, std = pair
+    if std > 0:
+        return with_error(value, std), _unit(kind, name)
+    return f"{number(value)} (1σ not determined by these data)", _unit(kind, name)
+
+
+def _description(kind: str) -> str:
+    """What an effect is physically and where it shows, as its class states it."""
+    shape = shape_of(effect_class(kind))
+    return f"{effect_class(kind).description} {shape.fact if shape else ''}".strip()
+
+
+def _unit(kind: str, name: str) -> str:
+    unit = effect_class(kind).parameters()[name].unit.replace("kg^1/2", "√kg")
+    return "" if unit == "1" else unit
+
+
+def _meaning(kind: str, name: str) -> str:
+    return effect_class(kind).parameters()[name].meaning or _words(name)
+
+
+def _answer(name: str) -> str:
+    return " with ".join(map(effect_name, name.split("+")))
+
+
+def _words(name: str) -> str:
+    return name.removesuffix("_hz").removesuffix("_deg").replace("_", " ")
+
+
+def _tried(row: TriedEffect) -> tuple[str, str, str]:
+    own = _own(row.kind, {name: (value, 0.0) for name, value in row.parameters.items()})
+    own = own or {name: (value, 0.0) for name, value in row.parameters.items()}
+    values = [
+        f"{_words(name)} {number(value, 3)} {_unit(row.kind, name)}".strip()
+        for name, (value, _) in own.items()
+    ]
+    return (
+        effect_name(row.kind),
+        _gain(row.gain) if np.isfinite(row.gain) else "not fitted",
+        ", ".join(values),
+    )
+
+
+def _gain(gain: float) -> str:
+    return minus(f"{gain:.0f}") if abs(gain) < 1e4 else number(gain, 2)
+
+
+_PARTS = {
+    "stiffness": "The stiffness, and with it the natural frequency, differs from the model's",
+    "damping": "The damping differs from the model's",
+    "harmonic_2": "The second harmonic of the velocity differs from the model's",
+    "harmonic_3": "The third harmonic of the velocity differs from the model's",
+    "not_a_function_of_amplitude": (
+        "A part of the misfit is no function of the amplitude: it differs between states of one "
+        "amplitude"
+    ),
+}
+
+
+def _located(part: Located, misfit: float = 1.0) -> str:
+    """One part of the disagreement as a sentence.
+
+    The 1σ of its power of amplitude is widened by the misfit that is left, in units of noise.
+    """
+    unit = unit_for(part.velocity_range, "m/s")
+    low, high = (f"{one / unit.size:.3g}" for one in part.velocity_range)
+    small = part.p_value < _LEAST_P_VALUE
+    chance = "below 10⁻¹²" if small else number(part.p_value, 1)
+    text = f"{_PARTS[part.part]}, at velocity amplitudes from {low} to {high} {unit.name}"
+    if part.exponent is not None:
+        power = with_error(part.exponent, (part.exponent_std or 0.0) * max(1.0, misfit))
+        how = "grows" if part.exponent > 0 else "falls"
+        text += f"; the change {how} as amplitude^({power})"
+    return f"{text} (by chance: {chance})."

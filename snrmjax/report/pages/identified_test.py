@@ -1,0 +1,227 @@
+"""An identification in full: its figures, its page, and the files that are written of it."""
+
+from collections.abc import Mapping
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from snrmjax.identify.prediction.notes import where_in_words
+from snrmjax.io import joint_results, results
+from snrmjax.io.files import write_summary
+from snrmjax.io.units import HERTZ
+from snrmjax.model.structures import Structure
+from snrmjax.pipelines.identify import FitDetails, IdentifiedTest
+from snrmjax.report.figures import identification as plot
+from snrmjax.report.figures.simulation import normal_mode_figure
+from snrmjax.report.html import Report, ReportFigure, Section, write_report
+from snrmjax.report.pages.identification import ComparedResponses, identification_report
+from snrmjax.report.pages.joint_fit import (
+    curves_in_words,
+    joint_figures,
+    joint_sections,
+    words_of_fit,
+)
+from snrmjax.report.sampling import SHOWN_AMPLITUDES, VELOCITY, ShownAmplitude
+from snrmjax.report.style import PrintedFigure
+
+
+def settings_in_words(found: IdentifiedTest) -> dict[str, str]:
+    """Which amplitude and which curves, as the summary and the page name them."""
+    if found.joint is None:
+        asked = found.options
+        return {"amplitude": f"{asked.amplitude}, {asked.measure}", "curves": "smooth"}
+    unknowns = found.joint.fit.unknowns
+    pair = (unknowns.squared_frequency, unknowns.modal_damping)
+    curves = " and ".join(curve.label for curve in pair)
+    return {"amplitude": "displacement, fundamental", "curves": curves}
+
+
+def headline(found: IdentifiedTest) -> list[str]:
+    """What was found, in lines to be read as soon as the command ends."""
+    values = found.values
+    speed, ratio = np.asarray(values.velocity), 100 * np.asarray(values.damping_ratio)
+    hertz = np.asarray(values.natural_frequency) / HERTZ
+    ends = [
+        f"{hertz[k]:.5g} Hz and {ratio[k]:.3g} % of critical damping at {speed[k]:.3g} m/s"
+        for k in (0, -1)
+    ]
+    lines = [f"backbone: {ends[0]} to {ends[1]}"]
+    for prediction in found.predictions:
+        for each in prediction.resonances:
+            place = f"{each.frequency / HERTZ:.5g} Hz, {each.velocity:.3g} m/s"
+            damped = f"{100 * each.damping_ratio:.3g} % of critical damping"
+            lines.append(f"resonance at {prediction.load}: {place}, {damped}")
+        lines.append(f"resonance at {prediction.load} {where_in_words(prediction.further)}")
+    for advised in found.advice or ():
+        force, drive = advised.force, advised.drive
+        load = f"force {force:.4g} N" if drive is None else f"drive {drive:.4g} V"
+        place = f"{load}, {advised.frequency / HERTZ:.6g} Hz (expected {advised.expected})"
+        lines.append(f"measure next, {advised.rank}: {place}: {advised.reason}")
+    return lines
+
+
+def identification_figures(
+    found: IdentifiedTest, shown: ShownAmplitude = VELOCITY
+) -> dict[str, Figure]:
+    """Figures of an identification by the names of their files."""
+    points, backbone = found.identification.points, found.identification.backbone
+    modes = found.model.modes
+    figures = {
+        "backbone": plot.backbone_figure(
+            points, backbone, truth=found.truth, modes=modes, shown=shown
+        ),
+        "modal_damping": plot.modal_damping_figure(
+            [plot.DampingSeries("identified", points=points, backbone=backbone)],
+            linear=_linear_modal_damping(found.model),
+            shown=shown,
+        ),
+        "loops": plot.force_velocity_figure(
+            found.data, _typical_states(found), sensor=points.sensor
+        ),
+    }
+    if found.predictions:
+        figures["prediction"] = plot.response_figure(
+            backbone,
+            found.responses,
+            found.resonances,
+            simulated=found.simulated,
+            measured=found.data,
+        )
+    if found.joint is not None:
+        figures |= joint_figures(found.joint, points, shown)
+    if found.truth is not None:
+        figures["nnm"] = normal_mode_figure(found.truth, sensor=points.sensor)
+    return figures
+
+
+def _linear_modal_damping(model: Structure) -> float:
+    j = model.modes.mode_of_interest
+    return 2 * float(model.modes.damping_ratio[j] * model.modes.natural_frequency[j])
+
+
+def _typical_states(found: IdentifiedTest) -> list[int]:
+    """Three states of the largest level: nearest to resonance, farthest and one between."""
+    points = found.identification.points
+    phase = np.abs(np.angle(np.asarray(points.mode_velocity)))
+    amplitude = np.where(np.asarray(points.usable), np.asarray(points.amplitude), -np.inf)
+    level = np.asarray(points.level)[int(np.argmax(amplitude))]
+    rows = np.flatnonzero((np.asarray(points.level) == level) & np.isfinite(amplitude))
+    ordered = rows[np.argsort(phase[rows])]
+    # dict, not set: the order is the caption's, and a level may have fewer than three states.
+    return list(dict.fromkeys(int(ordered[k]) for k in (0, len(ordered) // 2, -1)))
+
+
+LOOPS_CAPTION = (
+    "Force against velocity over one period, nearest to resonance first: a straight line at phase "
+    "resonance, the wider the farther from it."
+)
+DAMPING_CAPTION = (
+    "Modal damping 2ζω against amplitude. Linear damping gives a constant near the dotted line, "
+    "whatever the stiffness does; harmonics of the motion add a few per cent."
+)
+MODE_CAPTION = (
+    "The nonlinear normal mode of the model, followed by harmonic balance: velocity against "
+    "frequency, and frequency against energy."
+)
+
+
+def findings_report(
+    found: IdentifiedTest,
+    title: str,
+    done: dict[str, str],
+    figures: Mapping[str, Figure | PrintedFigure],
+) -> Report:
+    """The report of an identification; `done` says what was done with which files."""
+    further = [] if found.joint is None else joint_sections(found.joint, figures)
+    further.append(
+        Section(
+            "What was measured, and its damping",
+            (),
+            [
+                ReportFigure(figures["loops"], LOOPS_CAPTION),
+                ReportFigure(figures["modal_damping"], DAMPING_CAPTION),
+            ],
+        )
+    )
+    if "nnm" in figures:
+        shown = [ReportFigure(figures["nnm"], MODE_CAPTION)]
+        further.append(Section("The nonlinear normal mode", (), shown))
+    return identification_report(
+        found.identification,
+        found.model.modes,
+        figures,
+        title=title,
+        done=done,
+        notes=[str(note) for note in found.notes],
+        responses=ComparedResponses(
+            *(found.responses, found.resonances, found.simulated),
+            [f"Resonance at {p.load}: {where_in_words(p.further)}." for p in found.predictions],
+        ),
+        further=further,
+        words=None if found.joint is None else words_of_fit(found.joint.fit),
+    )
+
+
+def write(
+    folder: Path,
+    found: IdentifiedTest,
+    *,
+    title: str = "",
+    data: str = "",
+    model: str = "",
+    axis: str = "velocity",
+) -> Report:
+    """Write what an identification found into a folder: tables, summary, figures and page.
+
+    Arguments: `data` and `model` name the files; `axis` is the amplitude of the figures of
+    backbone and damping, of which the tables then have a column. Returns the page's report.
+    """
+    shown = SHOWN_AMPLITUDES[axis]
+    done = {"data": data, "model": model or found.model.name} | settings_in_words(found)
+    added = (shown.column, shown.power)
+    results.write_points(folder / "points.csv", found.identification, added=added)
+    if found.predictions:
+        drives = [
+            prediction.drive for prediction in found.predictions for _ in prediction.responses
+        ]
+        stds = [b.velocity_std for prediction in found.predictions for b in prediction.banded]
+        given = (folder / "prediction.csv", found.responses)
+        results.write_prediction(*given, drives=drives, velocity_stds=stds)
+    summary: dict[str, object] = {"program": "snrmjax", "version": version("snrmjax"), **done}
+    if found.joint is None:
+        results.write_backbone(folder / "backbone.csv", found.identification, added=added)
+    else:
+        _write_fit(folder, found.joint, added)
+        banded = [response for prediction in found.predictions for response in prediction.banded]
+        details = found.joint
+        summary["joint_fit"] = joint_results.summarise_fit(details.fit, banded, details.shares)
+    summary |= results.summarise(found.identification, found.values)
+    summary["resonances"] = [
+        results.summarise_resonance(each)
+        | ({} if prediction.drive is None else {"drive_v": prediction.drive})
+        for prediction in found.predictions
+        for each in prediction.resonances
+    ]
+    summary["resonance_distributions"] = [
+        results.summarise_distribution(prediction.further)
+        | ({} if prediction.drive is None else {"drive_v": prediction.drive})
+        for prediction in found.predictions
+    ]
+    summary["notes"] = [str(note) for note in found.notes]
+    write_summary(folder / "summary.json", summary)
+    figures = plot.save_figures(folder, identification_figures(found, shown))
+    if found.joint is not None:
+        done = done | {"curves": curves_in_words(found.joint.fit)}
+    report = findings_report(found, title, done, figures)
+    write_report(folder / "report.html", report)
+    return report
+
+
+def _write_fit(folder: Path, details: FitDetails, added: tuple[str, int]) -> None:
+    """Write the files that a joint fit adds, and its curves."""
+    joint_results.write_fitted_backbone(folder / "backbone.csv", details.fit, added=added)
+    joint_results.write_joint_fit(folder / "fit.json", details.fit)
+    if details.advice is not None:
+        joint_results.write_next(folder / "next.csv", details.advice)

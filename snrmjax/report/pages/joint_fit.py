@@ -1,0 +1,235 @@
+"""What a report tells of a joint fit: its parameters, errors and residuals, and its advice."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from snrmjax.identify.inference.contributions import Contribution
+from snrmjax.identify.inference.optimal_design import NextMeasurement
+from snrmjax.identify.joint.joint_fit import JointFit
+from snrmjax.identify.pointwise.backbone_points import BackbonePoints
+from snrmjax.io.joint_results import summarise_fit
+from snrmjax.io.units import DEGREE, HERTZ
+from snrmjax.pipelines.identify import FitDetails
+from snrmjax.report.figures.joint_fit import (
+    FitSeries,
+    contributions_figure,
+    fitted_curves_figure,
+    next_measurements_figure,
+    residuals_figure,
+)
+from snrmjax.report.html import ReportFigure, ReportTable, Section, minus, with_error
+from snrmjax.report.pages.identification import (
+    GAIN_NOT_IN_BANDS,
+    NO_SCATTER,
+    CurveWords,
+    noise_in_words,
+)
+from snrmjax.report.sampling import VELOCITY, ShownAmplitude
+from snrmjax.report.sentences.identify import in_words
+from snrmjax.report.style import PrintedFigure, unit_for
+
+_LISTED = 12  # contributions by name; the rest stands in one row
+
+CURVES_CAPTION = (
+    "The joint fit. Lines are the curves fitted to all states at once; the darker band contains "
+    "the true curve with a probability of 95 %. Where levels differ from one another, the paler "
+    "band contains the curve of one further level. Dots are what single states give on their own, "
+    "with the errors that their level shares: dots beside the line on a vertical streak are such "
+    "errors, a line beside all dots is not."
+)
+RESIDUALS_CAPTION = (
+    "Misfit of each point in standard deviations: what the fit leaves of the force balance in "
+    "phase with the force (at resonance that of the damping) and in quadrature with it (at "
+    "resonance that of the stiffness). Where curves and noise are right the dots are a cloud "
+    "without shape, and one in twenty lies outside the dashed lines. A bend means that "
+    "the curves, the phase or the linear modes are wrong; a funnel, that the noise is."
+)
+SHARES_CAPTION = (
+    "Where the width of the bands comes from: shares of the variance, mean over the measured "
+    "amplitudes. Bars of one colour sum to 100 %. Random errors shrink with more states, errors "
+    "of levels only with more levels."
+)
+ADVICE_CAPTION = (
+    "Where to measure next: the states of the table, numbered in its order, on the responses that "
+    "the fit predicts. Dashed parts are unstable."
+)
+
+
+def joint_figures(
+    details: FitDetails, points: BackbonePoints, shown: ShownAmplitude = VELOCITY
+) -> dict[str, Figure]:
+    """Figures of a joint fit by the names of their files; `points` of single states.
+
+    `shown` is the amplitude over which curves and residuals are drawn.
+    """
+    series = [FitSeries("joint fit", details.fit, points)]
+    drawn = fitted_curves_figure(series, shown=shown)
+    figures = {
+        "joint_fit": drawn,
+        "residuals": residuals_figure(details.fit, shown),
+        "contributions": contributions_figure(details.shares),
+    }
+    if details.advice:
+        sensor = details.fit.modes.sensors[details.fit.data.sensor]
+        figures["next"] = next_measurements_figure(
+            details.responses, details.advice.rows, sensor=sensor
+        )
+    return figures
+
+
+def joint_sections(
+    details: FitDetails, figures: Mapping[str, Figure | PrintedFigure]
+) -> list[Section]:
+    """The sections of a report that tell a joint fit, with its figures."""
+    fit = details.fit
+    summary = summarise_fit(fit, ())
+    intro = (
+        f"Both curves were fitted together to {len(fit.data.level)} states of "
+        f"{fit.data.n_levels} levels: {curves_in_words(fit)}. Errors that the states of a level "
+        "share are unknowns of the fit."
+    )
+    shown = [
+        ReportFigure(figures["joint_fit"], CURVES_CAPTION),
+        ReportFigure(figures["residuals"], RESIDUALS_CAPTION),
+    ]
+    gain_unit = "N/V" if fit.drive_known_only else ""
+    tables = [parameter_table(summary, gain_unit), error_table(summary)]
+    sections = [
+        Section("Joint fit", [intro], shown, tables),
+        Section(
+            "What the bands are made of",
+            (),
+            [ReportFigure(figures["contributions"], SHARES_CAPTION)],
+            [contribution_table(details.shares)],
+        ),
+    ]
+    if details.advice:
+        pictured = [ReportFigure(figures["next"], ADVICE_CAPTION)]
+        table = advice_table(details.advice.rows)
+        sections.append(Section("What to measure next", (), pictured, [table]))
+    return sections
+
+
+def curves_in_words(fit: JointFit) -> str:
+    """The families of both curves: "natural frequency: power law of displacement; damping: …"."""
+    squared, damping = fit.unknowns.squared_frequency, fit.unknowns.modal_damping
+    return f"natural frequency: {squared.words}; damping: {damping.words}"
+
+
+def words_of_fit(fit: JointFit) -> CurveWords:
+    """What a report says of the curves of a joint fit."""
+    noise = fit.noise
+    squared, damping = fit.unknowns.squared_frequency, fit.unknowns.modal_damping
+    fitted = "force_gain" in fit.free
+    gain = ", and the error of the fitted force gain." if fitted else f".{GAIN_NOT_IN_BANDS}"
+    return CurveWords(
+        line="The line is the joint fit to all steady states, not a curve drawn through the "
+        "stars; the band is its 95 % range.",
+        bands="Error bars and bands are 95 %. The bands of the joint fit hold the noise, stated or "
+        f"estimated, and what the points of one level share{gain}",
+        noise=f"{noise_in_words(noise, 'velocity')}, errors of whole levels apart",
+        scatter=f"{in_words(noise.level_std)} (1σ)" if np.any(noise.level_std > 0) else NO_SCATTER,
+        argument=f"natural frequency: {squared.argument} amplitude; damping: {damping.argument} "
+        "amplitude",
+    )
+
+
+def parameter_table(summary: dict, gain_unit: str = "") -> ReportTable:
+    """Parameters as `summarise_fit` has them, ± 1σ, and what they read as in other units.
+
+    Arguments: `gain_unit` of the force gain: N/V where only the drive voltage is known.
+    """
+    rows = []
+    for name, one in summary["parameters"].items():
+        value, std = one["value"], one["std"]
+        row = (name, minus(with_error(value, std)), _unit(one["unit"]))
+        rows.append((*row, minus(_reads_as(name, value, std))))
+        if name == "force_gain":
+            # The fit's own unknown is the gain's logarithm.
+            rows[-1] = (name, f"{np.exp(value):.4g} ± {100 * std:.2g} %", gain_unit, "")
+    caption = (
+        "Parameters ± 1σ. Those of a curve are values of ω² or 2ζω, or what a term adds to them "
+        "at the largest measured amplitude. Knots ascend in amplitude, the first at zero."
+    )
+    return ReportTable(("parameter", "value ± 1σ", "unit", "that is"), rows, caption)
+
+
+def _unit(name: str) -> str:
+    return {"rad^2/s^2": "rad²/s²", "1": "", "log": "", "smallest force": "× smallest force"}.get(
+        name, name
+    )
+
+
+def _reads_as(name: str, value: float, std: float) -> str:
+    """Values of a backbone as frequencies, a phase in degrees."""
+    if name.startswith(("backbone.at_zero", "backbone.knot_")) and value > 0:
+        omega = float(np.sqrt(value))
+        return f"{with_error(omega / HERTZ, 0.5 * std / omega / HERTZ)} Hz"
+    if name == "instrument_phase":
+        return f"{with_error(value / DEGREE, std / DEGREE)}°"
+    return ""
+
+
+def error_table(summary: dict) -> ReportTable:
+    """The noise, and what levels have in common, as the fit takes them."""
+    noise, levels = summary["noise"], summary["levels"]
+    scale, std = noise["scale"], noise["scale_std"]
+    of_noise = (
+        f"{with_error(scale, std)} × the stated one"
+        if noise["stated"]
+        else f"{with_error(100 * scale, 100 * std)} % of the velocity"
+    )
+    wandering = 100 * noise["wandering_of_natural_frequency"]
+    rows = [
+        ("random noise, from the residuals", of_noise),
+        ("natural frequency, from state to state", f"{wandering:.2g} %"),
+        ("gain of a level", f"{100 * levels['gain_std']:.2g} %"),
+        ("phase of a level", f"{levels['phase_std_deg']:.2g}°"),
+        (
+            "natural frequency, from level to level",
+            f"{100 * levels['natural_frequency_std_relative']:.2g} %",
+        ),
+        ("damping, from level to level", f"{100 * levels['damping_std_relative']:.2g} %"),
+    ]
+    return ReportTable(("error", "1σ"), rows, "Errors as the fit takes them, stated or found.")
+
+
+def contribution_table(shares: Sequence[Contribution]) -> ReportTable:
+    """The largest contributions to the bands by name, and all others in one row."""
+    named, others = shares[:_LISTED], shares[_LISTED:]
+    pairs = [(one.source, one.frequency_share, one.damping_share) for one in named]
+    if others:
+        rest = sum(o.frequency_share for o in others), sum(o.damping_share for o in others)
+        pairs.append((f"{len(others)} further ones together", *rest))
+    rows = [(name, f"{100 * a:.1f}", f"{100 * b:.1f}") for name, a, b in pairs]
+    header = ("source of error", "natural frequency (%)", "damping (%)")
+    caption = "Shares of the variance of both bands, largest first."
+    return ReportTable(header, rows, caption, "Every source of error by name")
+
+
+def advice_table(advice: Sequence[NextMeasurement]) -> ReportTable:
+    """Advised states by rank, with the reason of each."""
+    drives = [one.drive for one in advice if one.drive is not None]
+    # Where only the drive is known, nobody can set a force in newtons.
+    loads, what = (drives, "drive") if drives else ([one.force for one in advice], "force")
+    load = unit_for(loads, "V" if drives else "N")
+    unit = unit_for([one.velocity for one in advice], "m/s")
+    rows = [
+        (
+            *(f"{one.rank}", f"{size / load.size:.4g}", f"{one.frequency / HERTZ:.6g}"),
+            *(f"{one.velocity / unit.size:.3g}", minus(f"{round(one.phase / DEGREE):d}")),
+            *(f"{100 * one.expected_band_ratio:.1f}", str(one.reason)),
+        )
+        for one, size in zip(advice, loads, strict=True)
+    ]
+    header = (
+        *("rank", f"{what} ({load.name})", "frequency (Hz)", f"velocity ({unit.name})"),
+        *("phase (°)", "bands left (%)", "reason"),
+    )
+    caption = (
+        "Each state given the ones before it. Velocity and phase are those to be expected; bands "
+        "left: the mean width of the bands after this measurement, of today's."
+    )
+    return ReportTable(header, rows, caption)

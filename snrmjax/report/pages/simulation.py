@@ -1,0 +1,46 @@
+"""Simulated responses and normal modes: a table and a figure of each."""
+
+from pathlib import Path
+
+import numpy as np
+
+from snrmjax.io import results
+from snrmjax.io.units import HERTZ
+from snrmjax.pipelines.simulate import SimulatedMode, SimulatedResponses
+from snrmjax.report.figures.identification import save_figure
+from snrmjax.report.figures.simulation import normal_mode_figure, simulated_response_figure
+from snrmjax.simulate.continuation.response_curve import ResponseCurve
+
+
+def write(folder: Path, found: SimulatedResponses | SimulatedMode) -> None:
+    """Write response.csv and response.png, or nnm.csv and nnm.png."""
+    sensor = found.sensor
+    if isinstance(found, SimulatedMode):
+        results.write_normal_mode(folder / "nnm.csv", found.branch, sensor=sensor)
+        save_figure(folder / "nnm.png", normal_mode_figure(found.branch, sensor=sensor))
+        return
+    results.write_response(folder / "response.csv", found.curves, sensor=sensor)
+    figure = simulated_response_figure(found.curves, sensor=sensor)
+    save_figure(folder / "response.png", figure)
+
+
+def headline(found: SimulatedResponses | SimulatedMode) -> list[str]:
+    """The largest response of every curve, or where the mode ends."""
+    if isinstance(found, SimulatedMode):
+        branch = found.branch
+        speed = np.abs(branch.velocity[-1, 1, branch.sensors.index(found.sensor)])
+        place = f"{branch.frequency[-1] / HERTZ:.5g} Hz, {speed:.3g} m/s at {found.sensor}"
+        return [f"the mode ends at {place}"]
+    return [_largest(curve, found.sensor) for curve in found.curves]
+
+
+def _largest(curve: ResponseCurve, sensor: str) -> str:
+    speed = np.abs(curve.velocity[:, 1, curve.sensors.index(sensor)])
+    name = "" if curve.branch == "main" else f" ({curve.branch})"
+    if not speed.size:
+        return f"force {curve.force:g} N{name}: no response"
+    top = int(np.argmax(speed))
+    return (
+        f"force {curve.force:g} N{name}: {speed[top]:.4g} m/s at {sensor} at most, at "
+        f"{curve.frequency[top] / HERTZ:.5g} Hz; {len(curve.at_events('fold'))} folds"
+    )

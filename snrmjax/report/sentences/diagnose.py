@@ -1,0 +1,380 @@
+"""What a diagnosis has to tell: verdict, reasons, notes, drawn laws."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from snrmjax.report.sentences import Wording, enumerated, number_of
+
+_PEOPLE = ("Coulomb", "Jenkins", "Iwan", "Van der Pol")
+_PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"))
+_LAWS = {
+    "spring": ("stiffness", "hardening", "softening", "m"),
+    "damper": ("damping", "more damping", "less damping", "m/s"),
+    "displacement_damping": (
+        *("damping that depends on the displacement", "more damping", "less damping"),
+        "m",
+    ),
+    "slip": ("friction with a memory", "gaining stiffness", "losing stiffness", "m"),
+}
+_CURVES = {
+    "stiffness": "the stiffness as a free function of the amplitude",
+    "damping": "the damping as a free function of the amplitude",
+    "order": "a natural frequency that moves freely in the order of the test",
+}
+_COMPLETED = {
+    "completed": "",
+    "nothing_added": "nothing was added to the model",
+    "not_physical": ", but no structure can have these parameters: there is no completed model",
+}
+_UNITS = {"velocity": "m/s", "displacement": "m"}
+
+
+def effect_name(kind: str) -> str:
+    """An effect's kind in words.
+
+    >>> effect_name("internal_resonance_1_3")
+    'internal resonance 1:3'
+    """
+    words = kind.replace("_", " ")
+    for name in _PEOPLE:
+        words = words.replace(name.lower(), name)
+    return f"{words[:-2]}:{words[-1]}" if words[-3:-2].isdigit() and words[-1].isdigit() else words
+
+
+def probability_in_words(probability: float) -> str:
+    """A probability in per cent, never rounded to certainty.
+
+    >>> probability_in_words(0.937), probability_in_words(0.9999)
+    ('94 %', 'above 99 %')
+    """
+    if 0.005 <= probability <= 0.995:
+        return f"{100 * probability:.0f} %"
+    return "below 1 %" if probability < 0.5 else "above 99 %"
+
+
+def effect_names(kinds: Sequence[str], word: str = "and") -> str:
+    """Kinds in words as a list."""
+    names = [effect_name(kind) for kind in kinds]
+    return f" {word} ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
+
+
+def level_names(levels: Sequence[int]) -> str:
+    """Levels by their numbers."""
+    return f"level{'s' if len(levels) > 1 else ''} {enumerated(levels)}"
+
+
+def _times(misfit: float) -> str:
+    return f"{misfit:.1f}" if misfit < 10 else f"{misfit:.0f}"
+
+
+def _answer(name: str) -> str:
+    return " with ".join(effect_name(kind) for kind in name.split("+"))
+
+
+def _verdict(
+    *,
+    verdict: str,
+    classes: Sequence[Sequence[str]],
+    laws: Sequence[str],
+    misfit_before: float,
+    misfit: float,
+) -> str:
+    found = effect_names([group[0] for group in classes])
+    falls = f"the misfit falls from {_times(misfit_before)} to {_times(misfit)} times the noise"
+    with_it = "with them" if len(classes) > 1 else "with it"
+    match verdict:
+        case "none":
+            return (
+                "Nothing is missing that these data could show: the model as given fits them to "
+                f"{_times(misfit)} times the noise."
+            )
+        case "noise_rejected":
+            return (
+                "The stated noise does not fit the scatter of these data, so no effect is named: "
+                "state the noise of a repeated test, or none, and diagnose again."
+            )
+        case "unknown":
+            start = "Something is missing that no effect of the library explains reliably"
+            return f"{start}; the best attempt is {found}: {falls}." if found else f"{start}."
+        case "drawn":
+            return (
+                "The model lacks a force that no effect of the library explains, drawn from the "
+                f"data: {'; beside it '.join(laws)}. With it {falls}."
+            )
+        case "named":
+            return f"The model lacks {found}: {with_it} {falls}, and nothing else explains as much."
+    if any(len(group) > 1 for group in classes):
+        rivals = " and ".join(effect_names(group, "or") for group in classes)
+        return f"The model lacks {rivals}, and these data cannot tell which: {with_it} {falls}."
+    return (
+        f"The model probably lacks {found}: {with_it} {falls}, but something else could have the "
+        "same effect (see the notes)."
+    )
+
+
+def _most_probable(*, verdict: float, answers: Sequence[tuple[str, float]]) -> str:
+    listed = ", ".join(f"{_answer(name)} {probability_in_words(p)}" for name, p in answers)
+    return f"{probability_in_words(verdict)} of this verdict ({listed})"
+
+
+def _before(
+    *,
+    verdict: str,
+    effects: Sequence[str],
+    probabilities: Sequence[tuple[str, float | None, float]],
+) -> str:
+    changes = [
+        f"{_answer(name)} "
+        + (f"now {100 * now:.0f} %" if p is None else f"{100 * p:.0f} % → {100 * now:.0f} %")
+        for name, p, now in probabilities
+    ]
+    named = effect_names(effects) or "no effect"
+    return (
+        f"before the further states the verdict was {verdict} ({named}). Probabilities: "
+        f"{', '.join(changes)}."
+    )
+
+
+def _level_errors(
+    *, gain: float, phase: float, frequency: float, damping: float, of_data: bool
+) -> str:
+    sizes = (
+        *((gain, 100.0, " % in gain"), (phase, 180 / np.pi, "° in phase")),
+        *((frequency, 100.0, " % in frequency"), (damping, 100.0, " % in damping")),
+    )
+    listed = ", ".join(f"{unit * size:.2g}{word}" for size, unit, word in sizes if size > 0)
+    if of_data:
+        return (
+            f"levels differ by {listed} (1σ), which nobody stated: taken for errors that the "
+            "states of a level share. State them in [measurement] if they are known."
+        )
+    return (
+        f"nobody stated by how much levels may be off: {listed} (1σ) are allowed for. State them "
+        "in [measurement] if they are known."
+    )
+
+
+def _law_class(*, law: str, symmetries: Sequence[str], onsets: Sequence) -> str:
+    name, more, less, unit = _LAWS[law]
+    words = " and ".join(symmetries)
+    text = f"{words} {name}".strip()
+    for onset in onsets:
+        size, prefix = next((one for one in _PREFIXES if onset.at >= one[0]), _PREFIXES[-1])
+        side = {1: " for positive values", -1: " for negative values", 0: ""}[onset.side]
+        text += f", {more if onset.adds else less} from {onset.at / size:.2g} {prefix}{unit}{side}"
+    return text
+
+
+def _level_force(*, level: int, gain: float, std: float) -> str:
+    digits = max(0, 1 - int(np.floor(np.log10(max(std, 1e-9)))))
+    return (
+        f"The force at level {level} was {gain:.{digits}f} ± {std:.{digits}f} times the recorded "
+        "one."
+    )
+
+
+SENTENCES: dict[str, Wording] = {
+    # The verdict and what a result says first.
+    "verdict": _verdict,
+    "level_force": _level_force,
+    "most_probable": _most_probable,
+    "probability_of_verdict": "probability: {probability}",
+    "parameter_found": lambda *, name, unit, value, std: (
+        f"{name} = {value:.4g} ± {std:.2g} {'' if unit == '1' else unit}".rstrip()
+    ),
+    "misfits": lambda *, before, after, unsure: (
+        f"misfit: {before:.3g} before, {after:.3g} after, in units of noise"
+        + ("; the ± above holds only if the noise is as stated" if unsure else "")
+    ),
+    "level_left_out": "level {level}, left out: {before:.3g} before, {after:.3g} after",
+    "to_decide": "to decide: {by}",
+    "diagnosis_ended": lambda *, fit, completed: (
+        "status: "
+        + (f"fit {fit.replace('_', ' ')}" if completed != "nothing_added" else "")
+        + _COMPLETED[completed]
+    ),
+    "diagnosis_note": "note: {note}",
+    # Reasons of a verdict.
+    "noise_misstated": lambda *, ratio: (
+        f"the misfit is {ratio:.2g} times the stated noise, without a pattern: it is "
+        f"{'overstated' if ratio < 1 else 'understated'}."
+    ),
+    "no_effect_explains": "no effect of the library explains what is left.",
+    "unknown_law": lambda *, probability, left: (
+        f"a law outside the library has a probability of {100 * probability:.0f} %: "
+        + ("what is left is small, but smoother than noise." if left is None else str(left))
+    ),
+    "curve_left": lambda *, curve, chance: (
+        f"{_CURVES[curve]} still explains a part of the misfit that is left (probability by chance "
+        f"{chance:.0e}): the law is not the true one."
+    ),
+    "level_worse": lambda *, level, of_force, ratio: (
+        (f"level {level} is" if of_force else f"the harmonics of level {level} are")
+        + f" fitted {ratio:.2g} times worse than the others: something is missing there."
+    ),
+    "states_wander": (
+        "the misfit that is left is {ratio:.2g} times as large in the direction of a change of the "
+        "natural frequency as across it, which noise is not: were the states of a level measured "
+        "at different temperatures?"
+    ),
+    "neighbours_alike": lambda *, correlation, of_test: (
+        "the misfits of neighbouring states "
+        f"{'in the order of the test' if of_test else 'along the resonance'} are correlated "
+        f"({correlation:.2f}): those of noise are not."
+    ),
+    "level_missed": (
+        "level {level}, left out of the fit, is missed by {misfit:.2g} times the noise: the law is "
+        "not the true one."
+    ),
+    "top_level_missed": (
+        "level {level}, left out of the fit, is missed by {misfit:.2g} times the noise, within the "
+        "uncertainty of the parameters: nothing proves the law there."
+    ),
+    "one_direction_alike": lambda *, effect: (
+        "a damping that acts in one direction only has the same fundamental as "
+        f"{effect_name(effect)}."
+    ),
+    "adds_energy": lambda *, effect: (
+        f"{effect_name(effect)} with a negative coefficient adds energy: a feedback, or a force "
+        "that lags behind the displacement, does the same."
+    ),
+    "wider_than_measured": lambda *, effect: (
+        f"{effect_name(effect)} is wider than the range of frequencies measured: it was not "
+        "observed as a resonance, and many laws of amplitude look like one side of it."
+    ),
+    "three_effects": lambda *, effects: "three effects together can fit most laws.",
+    "same_part_twice": lambda *, effects: (
+        f"{effect_names(effects)} change the same part of the force balance: together they may "
+        "stand for one law that the library does not have."
+    ),
+    "further_mode_beside": (
+        "a further mode beside another effect can fit a law that the library does not have."
+    ),
+    "other_power": lambda *, effect, part, exponent, exponent_std, expected: (
+        f"the {part} changes with the power {exponent:.2f} ± {exponent_std:.2f} of the amplitude, "
+        f"not with the power {expected:.3g} of {effect_name(effect)}."
+    ),
+    "level_forces_alike": lambda *, levels, effects: (
+        f"a force of {level_names(levels)} that is recorded in a wrong scale"
+        f"{f' beside {effect_names(effects)}' if effects else ''} explains these data as well."
+    ),
+    "strength_unknown": lambda *, effect, strength, std: (
+        f"these data do not determine {effect_name(effect)}: its strength is {strength:.2g} with a "
+        f"1σ of {std:.2g}, larger than itself."
+    ),
+    "gain_or_modal_mass": lambda *, effect, gain, mass, mass_of_model: (
+        f"{effect_name(effect)} of {gain:+.2g} may be the modal mass: with {mass:.4g} kg in place "
+        f"of the model's {mass_of_model:.4g} kg, of which no error is stated (`modal_mass_std`), "
+        "the model needs no such effect."
+    ),
+    "force_gain_far": (
+        "the answer needs {gain:.2g} times the force that smooth curves need: with a force of any "
+        "size almost any law fits, so the force gain cannot be determined beside it."
+    ),
+    "force_gain_moved": lambda *, change: (
+        f"the answer moves the force gain by {100 * change:+.2g} %: smooth curves of amplitude "
+        "need the former one, and beside a free gain these data hardly determine the law."
+    ),
+    "force_gain_in_answer": (
+        "the force gain, which these data hardly determine, may be a part of the answer."
+    ),
+    # Notes on data and model.
+    "answer_before": _before,
+    "gain_of_drive": lambda *, gain, from_curves: (
+        f"the force is known as a drive voltage only: about {gain:.4g} N/V by "
+        f"{'smooth curves of amplitude' if from_curves else 'the model as given'}. The gain is "
+        "fitted too: a 1 % error of the gain looks like 1 % of damping."
+    ),
+    "gain_with_effects": (
+        "with the effects found the gain becomes {gain:.3g} N/V (before: {before:.3g})."
+    ),
+    "best_as_recorded": lambda *, effects, levels, lead: (
+        f"with the forces as recorded the best answer is {_answer('+'.join(effects) or 'none')}, "
+        f"and it fits worse than a gain of the force of {level_names(levels)} (Schwarz's "
+        f"criterion: by {lead:.0f})."
+    ),
+    "noise_not_stated": lambda *, size: (
+        f"no noise is stated: what is left ({100 * size:.2g} % of velocity, "
+        f"{np.degrees(size):.2g}°) is taken for it, so a good fit proves nothing."
+    ),
+    "levels_not_stated": _level_errors,
+    "no_level_left_out": lambda *, n_levels: (
+        f"{number_of(n_levels, 'level')} only: no level can be left out of the fit to test the "
+        "answer."
+    ),
+    "phases_of_sensors_unknown": (
+        "the phases of some sensors are unknown: their amplitudes alone are compared."
+    ),
+    "phases_unknown": (
+        "the phases of {n_states} of {of_states} states are unknown: for these only the size of "
+        "the force is compared, one number in place of two, and the phases are those of the model. "
+        "This hardly separates stiffness from damping: at resonance an amplitude shows the damping "
+        "alone, off resonance hardly any of it."
+    ),
+    "sensor_phase_unseen": (
+        "an error of the sensor's phase cannot be detected: it is not among the candidates."
+    ),
+    "harmonics_without_phase": (
+        "of harmonics the sizes alone are compared: their signs, which separate cubic from van der "
+        "Pol damping, are lost."
+    ),
+    "no_state_there": lambda *, near, levels: (
+        f"no state {'within' if near else 'beyond'} 30° of resonance at level "
+        f"{', '.join(map(str, levels))} (by the model): its {'damping' if near else 'stiffness'} "
+        "is hardly determined."
+    ),
+    "stated_parameters_moved": lambda *, parameters: (
+        "the answer moves "
+        + ", ".join(
+            f"`{name}` by {step:+.2g} times its 1σ of {std:.2g}" for name, step, std in parameters
+        )
+        + ", as the model states it: check the linear test, or whether it was of another assembly."
+    ),
+    "other_modal_mass": lambda *, value, std, model, stated_std, beyond: (
+        f"the data say that the modal mass is {value:.4g} ± {std:.2g} kg; the model has "
+        f"{model:.4g} kg (1σ stated: {100 * stated_std:.2g} %)"
+        f"{', which is farther than that: check the linear test' if beyond else ''}. A gain of the "
+        "force or of the sensor does the same, so that none of that size can be told from it: "
+        "calibrate both statically, or repeat a level with a known added mass."
+    ),
+    "frequency_off": lambda *, share: (
+        f"the model's natural frequency is off by {100 * share:.0f} %: are these measurements of "
+        "another mode?"
+    ),
+    "not_physical": (
+        "there is no completed model: {reason} The parameters that fit best are none that a "
+        "structure can have."
+    ),
+    "not_physical_without": (
+        "without level {levels} the parameters are none that a structure can have."
+    ),
+    "answer_not_converged": "the fit of the answer itself had not converged when it ended.",
+    "effects_not_fitted": lambda *, effects: (
+        f"{', '.join(map(effect_name, effects))} could not be fitted: with no starting point does "
+        "the model have the measured motions."
+    ),
+    # Drawn laws.
+    "law_class": _law_class,
+    "law_is_drawn": lambda *, freedom, largest, argument: (
+        "no effect of the library explains the data; the law is drawn from them with "
+        f"{freedom:.1f} effective parameters. It was measured up to {largest:.3g} "
+        f"{_UNITS[argument]}: beyond, it goes on straight, which nothing proves."
+    ),
+    "law_left_out": (
+        "level {inner[0]}, left out, is predicted by interpolation: {inner[2]:.2g} times the noise "
+        "({inner[1]:.2g} before); the top level {outer[0]} by extrapolation: {outer[2]:.2g} "
+        "({outer[1]:.2g} before)."
+    ),
+    "odd_part_alone": "without harmonics the odd part of the force alone is seen.",
+    "laws_as_good": lambda *, effects: f"{effect_names(effects, 'or')} would do about as well.",
+    "law_of_library": lambda *, effect, beyond, argument: (
+        f"{effect_name(effect)}, fitted alone, "
+        + (
+            "stays within the 95 % band of the law."
+            if beyond is None
+            else f"leaves the 95 % band of the law between {beyond[0]:.3g} and {beyond[1]:.3g} "
+            f"{_UNITS[argument]}."
+        )
+    ),
+}

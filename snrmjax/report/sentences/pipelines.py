@@ -1,0 +1,98 @@
+"""What pipelines have to tell beside what their parts tell."""
+
+from snrmjax.numerics.status import Status
+from snrmjax.report.sentences import Wording, enumerated
+
+
+def _ended(force: float, status: Status) -> str:
+    return f"force {force:g} N: {status.message}."
+
+
+def _not_followed(status: Status) -> str:
+    return f"the mode {status.message}."
+
+
+def _equilibria(sensor: str, displacement: tuple[float, ...], stable: tuple[bool, ...]) -> str:
+    listed = [
+        f"{'stable' if holds else 'unstable'} at {1e3 * place:.3g} mm"
+        for place, holds in zip(displacement, stable, strict=True)
+    ]
+    return (
+        f"the model has {len(listed)} further equilibria, at {sensor}: {enumerated(listed)}. "
+        "Curves start from rest."
+    )
+
+
+def _load(force: float, drive: float | None) -> str:
+    return f"{force:g} N" if drive is None else f"{drive:.5g} V ({force:.4g} N)"
+
+
+def _load_scale(stated: float, coefficient: str, change: float, chosen: float) -> str:
+    return (
+        f"with `load_scale` = {stated:g} thicknesses the coefficient {coefficient} differs by "
+        f"{100 * change:+.0f} % from that of {chosen:.2g} thicknesses, the scale that is chosen "
+        "where none is stated"
+    )
+
+
+SENTENCES: dict[str, Wording] = {
+    "load": _load,
+    "level_missed_by_curves": (
+        "level {level} has its resonance under {force:.4g} N, measured at {frequency_hz:.5g} Hz, "
+        "{velocity:.3g} m/s: the curves miss this level."
+    ),
+    "resonance_beyond_data": ("the resonance at {load} lies beyond the measured amplitudes."),
+    "response_note": "response at {load}: {note}",
+    "several_resonances": (
+        "{n} resonances at {load}: damping that falls with amplitude allows several."
+    ),
+    "force_from_drive": (
+        "forces in N are drive voltage times the fitted gain ({newtons_per_volt:.4g} N/V ± "
+        "{relative_std:%.2g}); if the model's modal mass is wrong, so is the gain."
+    ),
+    "fewer_advised": "{n} of {wanted} further measurements are advised: {why}.",
+    "responses_not_complete": (
+        "the simulated responses of level {levels} were not traced to the end of the frequency "
+        "range: a resonance may be missing there."
+    ),
+    "diagnosis_left_out": (
+        "The diagnosis was left out, as it would explain an error of the columns by effects that "
+        "the structure does not have: {why} `snrmjax diagnose` of measured.csv does it "
+        "nevertheless."
+    ),
+    "sensor_not_named": (
+        "no sensor is named in {files}: taken for the model's only one, {sensor}. A column "
+        "`sensor`, or `--sensor` of the import, states it."
+    ),
+    "no_joint_fit": ("curves go through single points, as a joint fit was not possible: {why}"),
+    "isolated_searched": (
+        "{n} further branches found at {force:g} N, of {n_starts} starts ({n_failed} failed)"
+    ),
+    "harmonics_left_out": (
+        "the harmonics above {harmonics} would change the velocity by up to about {share:%.2g} "
+        "somewhere; use more --harmonics."
+    ),
+    "internal_resonance": (
+        "internal resonance: harmonic {harmonic} drives mode {mode} from {from_hz:.2f} to "
+        "{to_hz:.2f} Hz"
+    ),
+    "mode_not_followed": _not_followed,
+    "curve_ended": _ended,
+    "curve_events_not_located": "force {force:g} N: not located: {kinds}.",
+    "stability_not_computed": (
+        "force {force:g} N: the stability of {n} points could not be computed; response.csv has 0 "
+        "there and says so in `event`."
+    ),
+    "further_equilibria": _equilibria,
+    "load_scale_outside_plateau": (
+        "the load scale of the model is not inside a plateau of the coefficients"
+    ),
+    "several_equilibria": (
+        "the reduced model has {n} stable equilibria: responses may end in another one than rest"
+    ),
+    "load_scale_compared": _load_scale,
+    "load_scale_not_compared": (
+        "`load_scale` = {stated:g} thicknesses cannot be compared with a scale that is chosen: "
+        "{why}"
+    ),
+}

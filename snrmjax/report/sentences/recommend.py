@@ -1,0 +1,136 @@
+"""What to measure next so that a diagnosis is decided."""
+
+from collections.abc import Sequence
+
+from snrmjax.report.sentences import Wording, enumerated
+from snrmjax.report.sentences.diagnose import effect_names, level_names
+
+_UNITS = {"velocity": "m/s", "frequency": "Hz"}
+
+
+def _recommended(*, measurements: Sequence[object]) -> str:
+    """Each measurement once: the one that says most of those that begin alike."""
+    texts = [str(measurement).rstrip(".") for measurement in measurements]
+    texts = list(dict.fromkeys(f"{text[0].upper()}{text[1:]}" for text in texts))
+    return " ".join(
+        f"{text}."
+        for k, text in enumerate(texts)
+        if not any(text.lower() in other.lower() for j, other in enumerate(texts) if j != k)
+    )
+
+
+def _measure(
+    *,
+    kind: str,
+    level: int,
+    force: float,
+    frequency: float,
+    scale: float,
+    states: int,
+    harmonics: Sequence[int],
+    harmonic_std: float | None,
+    largest: float,
+    difference: object,
+) -> str:
+    at, named = f"near {frequency:.4g} Hz", f"level {level} ({force:.3g} N)"
+    closely = ""
+    if harmonic_std is not None:
+        closely = (
+            f"harmonic{'s' if len(harmonics) > 1 else ''} {enumerated(harmonics)} to better than "
+            f"{100 * harmonic_std / largest:.2g} % of the fundamental ({harmonic_std:.2g} m/s)"
+        )
+    if kind == "harmonics":
+        return f"measure {closely} at {named} {at}: {difference}."
+    if kind == "off_resonance":
+        return (
+            f"measure {states} states 30° to 60° off resonance, on both sides, at {named} {at}: "
+            f"{difference}."
+        )
+    beside = f", with {closely}" if closely else ""
+    return (
+        f"add a level of {force:.3g} N, {scale:g} times the velocities of level {level}, with "
+        f"{states} states within 55° of resonance {at}{beside}: {difference}."
+    )
+
+
+def _harmonics_apart(
+    *,
+    models: Sequence[Sequence[str]],
+    harmonic: int,
+    shares: Sequence[float],
+    turned_deg: float | None,
+) -> str:
+    one, other = (f"{round(100 * share, 6):.2g} %" for share in shares)
+    turn = "" if turned_deg is None else f", turned by {turned_deg:.0f}°"
+    return (
+        f"harmonic {harmonic} is {one} of the fundamental with {effect_names(models[0])}, "
+        f"{other}{turn} with {effect_names(models[1])}"
+    )
+
+
+def _resonances_apart(
+    *, models: Sequence[Sequence[str]], quantity: str, values: Sequence[float]
+) -> str:
+    one, other = map(effect_names, models)
+    return (
+        f"{quantity} at resonance {values[0]:.4g} {_UNITS[quantity]} with {one}, {values[1]:.4g} "
+        f"with {other}"
+    )
+
+
+SENTENCES: dict[str, Wording] = {
+    "recommendation": _recommended,
+    "record_phase": "record the phase of the velocity relative to the force.",
+    "no_test_settles": (
+        "no single test that was compared is expected to decide; the most informative one follows."
+    ),
+    "measure_test": _measure,
+    "motion_of_one": lambda *, models: (
+        f"with {effect_names(models[0])} there is such a motion, with {effect_names(models[1])} "
+        "there is none"
+    ),
+    "harmonics_apart": _harmonics_apart,
+    "velocities_apart": lambda *, models, share: (
+        f"with {effect_names(models[0])} and {effect_names(models[1])} velocities differ by up to "
+        f"{100 * share:.2g} %"
+    ),
+    "resonances_apart": _resonances_apart,
+    "widen_levels": (
+        "widen the range of levels at both ends and record the second and third harmonics"
+    ),
+    "widen_range": ("widen the range of levels and measure farther off resonance on both sides"),
+    "record_harmonics": (
+        "record the second and third harmonics of the velocity (with their noise floor) at the "
+        "largest level"
+    ),
+    "record_second_harmonic": lambda *, closer: (
+        f"record harmonic 2 at the largest level{' with less noise' if closer else ''}"
+    ),
+    "record_harmonics_of_law": lambda *, kind_is_open: (
+        "record harmonics 2 and 3 of the velocity (with their noise floor) at the largest level: "
+        "their sign and size tell a force of the velocity from one of the displacement."
+        if kind_is_open
+        else "record harmonic 2 of the velocity (with its noise floor) at the largest level: it "
+        "shows whether the force is the same in both directions."
+    ),
+    "measure_without_feedback": ("measure with every feedback off, or record the feedback's force"),
+    "step_wider": "step through a wider range of frequencies at the largest level",
+    "step_through_mode": (
+        "step finely through the frequency of the further mode, or widen the range of levels at "
+        "both ends and record the second and third harmonics"
+    ),
+    "measure_level_again": "measure level {level} again, and further levels around it",
+    "measure_beside_level": (
+        "measure levels between level {level} and the one below it, or above it"
+    ),
+    "measure_more": "measure at more amplitudes and frequencies",
+    "check_level_forces": lambda *, levels: (
+        f"check the force's range setting and calibration at {level_names(levels)}, or measure "
+        f"{level_names(levels)} again"
+    ),
+    "determine_force_gain": (
+        "measure the force, or calibrate the drive (a force transducer at one state, or a known "
+        "added mass); or add states 30° to 70° from resonance on both sides, where the inertia of "
+        "the modal mass is known"
+    ),
+}

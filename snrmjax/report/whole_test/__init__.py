@@ -1,1 +1,0 @@
-"""A folder of a test from its files to one report."""

@@ -1,0 +1,153 @@
+"""What identification says where columns mean something else, on the exact responses of a mode."""
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import NamedTuple
+
+import equinox as eqx
+import numpy as np
+import pytest
+from truths.one_mode import OMEGA, SHAPE, ZETA, model, noisy, states, table
+
+import snrmjax as sj
+from snrmjax.doctor import column_misreadings
+from snrmjax.doctor.column_misreadings import doubt, linear_damping_note, with_doubt
+from snrmjax.measure.phase_convention import wrong_phases
+from snrmjax.pipelines.identify import identify_test
+
+DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
+FEW = slice(None, None, 5)  # nine states, three a level, from which no phase can be told wrong
+
+
+def few(change=lambda w, f, v: (f, v), seed=0):
+    level, w, f, v = (column[FEW] for column in states())
+    return table(level, w, *change(w, f, noisy(v, seed)))
+
+
+class Points(NamedTuple):
+    """What `identify_points` finds, by the same balance in a line: Ω² + Re iΩF/(cV), Im /Ω."""
+
+    level: np.ndarray
+    amplitude: np.ndarray
+    natural_frequency: np.ndarray
+    damping_ratio: np.ndarray
+    usable: np.ndarray
+
+
+def said(data, structure):
+    w, v = np.asarray(data.frequency), np.asarray(data.velocity)[:, 0]
+    balance = 1j * w * np.asarray(data.force) * float(structure.modes.mode_shape[0, 0]) ** 2 / v
+    natural = np.sqrt(np.abs(w**2 + balance.real))
+    ratio = balance.imag / w / (2 * natural)
+    level, every = np.asarray(data.level), np.ones(len(w), dtype=bool)
+    return doubt(data, structure, Points(level, np.abs(v) / w, natural, ratio, every))
+
+
+@pytest.mark.parametrize(
+    ("change", "kind", "named"),
+    [
+        (lambda w, f, v: (f, v / 9.80665), "mixed_units", ("response", "g", "m/s²")),
+        (lambda w, f, v: (f, 1e3 * v), "mixed_units", ("response", "mm", "m")),
+        (lambda w, f, v: (f / 4.4482216, v), "mixed_units", ("force", "pounds", "N")),
+        (lambda w, f, v: (f, v.conj()), "misread", "conjugated"),
+        (lambda w, f, v: (f, 1j * w * v), "misread", "acceleration"),
+        (lambda w, f, v: (f, v / np.sqrt(2)), "rms", "response"),
+    ],
+)
+def test_a_wrong_unit_or_phase_sign_is_named_with_its_mend(change, kind, named):
+    (note,) = said(few(change), model())
+    evidence = note["evidence"]
+    assert (note.kind, evidence.kind) == ("column_misread", kind)
+    assert named in (evidence.get("reading"), evidence.get("column"), *evidence.get("units", ()))
+    assert note["importable"]
+    assert str(note["mend"]).rstrip(".") in str(note)
+
+
+@pytest.mark.parametrize("factor", [9.80665, 1e-3, 1 / 4.4482216])
+def test_the_size_is_that_of_the_mixed_units(factor):
+    (note,) = said(few(lambda w, f, v: (f, v / factor)), model())
+    evidence = note["evidence"]
+    # 4σ: one in 16000 by chance
+    assert abs(evidence["ratio"] - factor) < 4 * evidence["ratio_std"] < 0.04 * factor
+
+
+def test_good_states_are_silent():
+    for seed in range(5):
+        assert said(few(seed=seed), model()) == ()
+
+
+def test_what_identification_says_of_phases_is_not_said_twice():
+    level, w, f, v = states()
+    data = table(level, w, f, noisy(v).conj())
+    assert wrong_phases(data, model())[0]["conjugated"]
+    assert doubt(data, model()) == ()
+
+
+def test_another_assembly_is_doubted():
+    """1 % of the frequency is a linear test's error; 20 % and five times the damping are not."""
+
+    def other(frequency, damping):
+        modes = sj.model.linear_modes(
+            [frequency * OMEGA], [damping * ZETA], [[SHAPE]], [SHAPE], sensors=("tip",)
+        )
+        return said(few(), sj.model.structure(modes))
+
+    assert other(1.01, 1.2) == ()
+    (note,) = other(1.2, 0.2)
+    assert note["quantities"] == ("natural frequency", "damping")
+    assert note["linear"] == pytest.approx((1.2 * OMEGA / (2 * np.pi), 0.2 * ZETA))
+
+
+def test_few_states_and_voltages_are_left_alone():
+    data = few(lambda w, f, v: (f, 1e3 * v))
+    assert doubt(data.select(np.arange(7)), model()) == ()
+    level, w, f, v = (column[FEW] for column in states())
+    driven = sj.measure.steady_states(level, w, np.full(9, np.nan), v, drive=f, sensors=("tip",))
+    assert doubt(driven, model()) == ()
+
+
+def test_an_error_of_identification_says_why():
+    data = few(lambda w, f, v: (f, v / (1j * w)))
+    told = str(with_doubt(ValueError("no points."), data, model()))
+    assert told.startswith("no points. the responses are displacements")
+    assert str(with_doubt(ValueError("no points."), few(), model())) == "no points."
+
+
+def test_damping_at_rest_is_compared_with_the_linear_tests(monkeypatch):
+    """2 % and 2.2 %, each ± 0.05 %: 0.2/√(0.05² + 0.05²) = 2.8 standard deviations apart."""
+
+    def note(fitted, own):
+        at_rest = SimpleNamespace(damping_ratio=[fitted], damping_ratio_std=[5e-4])
+        monkeypatch.setattr(column_misreadings, "fitted_values", lambda *_, **__: at_rest)
+        linear = eqx.tree_at(lambda m: m.modes.damping_ratio_std, model(), np.array([own]))
+        return linear_damping_note(None, linear)
+
+    (said_so,) = note(0.022, 5e-4)
+    assert said_so["apart"] == pytest.approx(0.002 / np.hypot(5e-4, 5e-4))
+    assert note(0.021, 5e-4) == ()
+    assert note(0.022, 0.0) == note(0.022, np.nan) == note(np.nan, 5e-4) == ()
+
+
+@pytest.mark.long
+def test_an_identification_without_points_says_why():
+    data = few(lambda w, f, v: (f, v / (1j * w)))
+    with pytest.raises(ValueError, match=r"no real natural frequency.*as displacements"):
+        identify_test(data, model())
+
+
+@pytest.mark.long
+def test_the_note_comes_first():
+    data = few(lambda w, f, v: (f, v / 9.80665))
+    found = identify_test(data, model())
+    assert found.notes[0] == said(data, model())[0]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["response_controlled", "force_controlled"])
+def test_measured_beams_are_silent(name):
+    folder = DATA / "brake_reuss_beam"
+    if not folder.exists():
+        pytest.skip("the measured data are not beside the project, in ../shared/data")
+    structure = sj.read_model(folder / "model.toml")
+    data = sj.read_steady_states(folder / f"{name}.csv", structure)
+    assert said(data, structure) == ()
