@@ -13,13 +13,6 @@ _CAP = 0.99  # of the largest level-to-level variance that a fit allows: where i
 LARGEST_LEVEL_STD = 0.3
 """1σ of what levels share beyond which they are not levels of one structure's test."""
 
-REMEDY_OF_GAIN = (
-    "Measure the force, or calibrate the drive (a force transducer at one state, or a known added "
-    "mass); or add states 30° to 70° from resonance on both sides, where the inertia of the modal "
-    "mass is known"
-)
-"""What determines the gain of a force that is known in volts."""
-
 # 1σ from which on an unknown is doubted, and from which on there is no answer: of a gain's
 # logarithm, of an offset over the smallest force, of a phase in rad.
 _BOUNDS = {

@@ -4,10 +4,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from snrmjax.identify.checks.instruments import REMEDY_OF_GAIN, Determination
+from snrmjax.identify.checks.instruments import Determination
 from snrmjax.identify.test_model.states import LEVEL_ERRORS
 from snrmjax.report.sentences import Wording, enumerated, number_of
 
+_MEASURE_GAIN = (
+    "Measure the force, or calibrate the drive (a force transducer at one state, or a known added "
+    "mass); or add states 30° to 70° from resonance on both sides, where the inertia of the modal "
+    "mass is known"
+)
 _LISTED = 8  # levels by name
 _UNITS = {
     "gain": (100, " % in gain"),
@@ -48,12 +53,12 @@ def _undetermined_gain(std: float, how: str) -> str:
         return (
             f"these data hardly determine the force gain: its 1σ is {100 * std:.2g} %, and so is "
             "that of every damping; natural frequencies rest on the states near resonance. "
-            f"{REMEDY_OF_GAIN}."
+            f"{_MEASURE_GAIN}."
         )
     wide = "any value fits them about equally well"
     if std < np.log(100):
         wide = f"its 1σ is a factor of {np.exp(std):.2g}, and damping is proportional to it"
-    return f"the force gain cannot be determined from these data ({wide}). {REMEDY_OF_GAIN}."
+    return f"the force gain cannot be determined from these data ({wide}). {_MEASURE_GAIN}."
 
 
 def _undetermined(name: str, std: float, how: str) -> str:
@@ -71,7 +76,7 @@ def _at_limit(errors: Sequence[str], limit: float, gain: bool) -> str:
     )
     if not gain:
         return said
-    return f"{said} The force gain cannot be determined beside it. {REMEDY_OF_GAIN}."
+    return f"{said} The force gain cannot be determined beside it. {_MEASURE_GAIN}."
 
 
 def _wanders(std: float, noise_stated: bool) -> str:
@@ -292,7 +297,7 @@ SENTENCES: dict[str, Wording] = {
     "force_gain_near_resonance": (
         "these data hardly determine the force gain: all states lie within {farthest_deg:.0f}° of "
         "resonance, where an error of the velocity that changes with the amplitude passes for a "
-        f"gain; the 1σ of gain and damping leave such errors out. {REMEDY_OF_GAIN}."
+        f"gain; the 1σ of gain and damping leave such errors out. {_MEASURE_GAIN}."
     ),
     "force_gain_undetermined": _undetermined_gain,
     "instrument_undetermined": _undetermined,
