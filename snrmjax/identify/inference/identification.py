@@ -8,11 +8,11 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
+from snrmjax.identify.curves.family_base import Argument
 from snrmjax.identify.inference.fitted_curves import as_backbone
 from snrmjax.identify.joint.joint_fit import JointFit, fit_jointly
 from snrmjax.identify.pointwise.backbone import Backbone
 from snrmjax.identify.pointwise.backbone_points import (
-    AmplitudeArgument,
     AmplitudeMeasure,
     BackbonePoints,
     identify_points,
@@ -114,7 +114,7 @@ def identify_backbone(
     data: SteadyStates,
     modes: LinearModes | Structure,
     *,
-    amplitude: AmplitudeArgument = "displacement",
+    amplitude: Argument = "displacement",
     measure: AmplitudeMeasure = "fundamental",
     n_knots: int | None = None,
 ) -> Identification:
@@ -157,7 +157,7 @@ def identification_of_fit(
     data: SteadyStates,
     fit: JointFit,
     *,
-    amplitude: AmplitudeArgument = "displacement",
+    amplitude: Argument = "displacement",
     measure: AmplitudeMeasure = "fundamental",
 ) -> Identification:
     """Each steady state's own point beside the curves of a joint fit.

@@ -57,7 +57,7 @@ from snrmjax.model.modes import LinearModes
 from snrmjax.model.structures import Structure, modes_of
 from snrmjax.numerics.blocks import on_one_core
 from snrmjax.numerics.facts import Fact
-from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
 from snrmjax.numerics.units import HERTZ
 
 _MOVED = 2.0  # standard deviations of a level's error, from which on the fit says so
@@ -78,10 +78,13 @@ class JointFit(AbstractResult):
     covariance: Float[np.ndarray, "unknown unknown"]
     problem: BalanceProblem
     noise: NoiseEstimate
-    residuals: Float[np.ndarray, "state part"]  # whitened, of unit variance if all is right
+    # Of unit variance if all is right.
+    residuals: Float[np.ndarray, "state part"] = quantity(
+        "state part", "1", "whitened residual", name="residual"
+    )
     drive_known_only: bool = eqx.field(static=True)
     free: tuple[str, ...] = eqx.field(static=True)
-    notes: tuple[Fact, ...] = eqx.field(static=True)
+    notes: tuple[Fact, ...] = setting()
     status: FitStatus = eqx.field(static=True)
     level_numbers: tuple[int, ...] = eqx.field(static=True)  # of the file; `data` counts from 0
 
@@ -164,11 +167,6 @@ class JointFit(AbstractResult):
         """What the free unknowns are called."""
         return tuple(name for name, _ in named_unknowns(self.unknowns, self.data, self.free))
 
-    def labels(self) -> tuple[str, ...]:
-        """`names` with the levels' own numbers, for readers."""
-        named = named_unknowns(self.unknowns, self.data, self.free, self.level_numbers)
-        return tuple(name for name, _ in named)
-
     def units(self) -> tuple[str, ...]:
         """Units of the free unknowns; a curve's terms count at the largest amplitude."""
         return tuple(unit for _, unit in named_unknowns(self.unknowns, self.data, self.free))
@@ -200,9 +198,11 @@ class JointFit(AbstractResult):
         std, data, per = np.sqrt(np.diag(self.covariance)), self.data, ("parameter",)
         state, force = ("state",), "V" if self.drive_known_only else "N"
         measured, numbers = np.asarray(data.force), np.array(self.level_numbers)
-        parts = Variable(("state", "part"), self.residuals, "1", "whitened residual")
+        # With the levels' own numbers, for readers.
+        named = named_unknowns(self.unknowns, data, self.free, self.level_numbers)
+        labels = [name for name, _ in named]
         return {
-            "parameter": Variable(per, np.array(self.labels()), "", "free unknown"),
+            "parameter": Variable(per, np.array(labels), "", "free unknown"),
             "value": Variable(per, np.asarray(self.vector()[0]), "", "value, in `unit`"),
             "std": Variable(per, std, "", "1σ, in `unit`"),
             "unit": Variable(per, np.array(self.units()), "", "unit of the parameter"),
@@ -212,7 +212,7 @@ class JointFit(AbstractResult):
             "velocity_m_s": Variable(
                 state, np.abs(np.asarray(self.motion().velocity)), "m/s", "velocity of the mode"
             ),
-            "residual": parts,
+            **super().variables(),
         }
 
     def attributes(self) -> dict[str, str | float | int]:
@@ -222,7 +222,7 @@ class JointFit(AbstractResult):
             "damping": self.unknowns.modal_damping.label,
             "noise_scale": self.noise.scale,
             "status": self.status.message,
-            "notes": "\n".join(map(str, self.notes)),
+            **super().attributes(),
         }
 
 
