@@ -177,13 +177,13 @@ def identification_of_fit(
         gain, phase = map(float, fit.noise.level_std[:2])
         j = fit.modes.mode_of_interest
         natural = float(fit.modes.natural_frequency[j])
-        wandering = 0.5 * natural * float(np.max(np.asarray(fit.data.std)[:, 3]))
+        frequency_jitter_std = 0.5 * natural * float(np.max(np.asarray(fit.data.std)[:, 3]))
         points = errors_from_scatter(
             points,
             fit.noise.scale,
             level_gain=gain,
             level_phase=phase,
-            frequency_std=float(np.hypot(identified.level_frequency_std, wandering)),
+            frequency_std=float(np.hypot(identified.level_frequency_std, frequency_jitter_std)),
             damping_std=identified.level_damping_std,
             modal_mass_std=fit.modes_found.own_modal_mass_std,
         )

@@ -299,8 +299,10 @@ def fit_jointly(
         FitStatus.CONVERGED if posterior.settled else FitStatus.NOT_SETTLED,
     )
     if not all(choice.kind in SMOOTH and choice.argument != "velocity" for choice in choices):
-        wander = np.full(n, view.wandering / (1.0 if view.believed else view.noise.scale))
-        errors = np.column_stack([np.asarray(measured.std)[:, :3], wander])
+        jitter = np.full(
+            n, view.stiffness_jitter_std / (1.0 if view.believed else view.noise.scale)
+        )
+        errors = np.column_stack([np.asarray(measured.std)[:, :3], jitter])
         best = fit_families(
             *(unknowns, view.problem, released, view.noise, errors), believed=view.believed
         )
@@ -325,7 +327,7 @@ def fit_jointly(
         level_numbers=numbers,
     )
     notes = notes_on_instruments(fit, LEVEL_ERRORS)
-    notes += _notes(fit, 0.5 * view.wandering, level_std)
+    notes += _notes(fit, 0.5 * view.stiffness_jitter_std, level_std)
     return dataclasses.replace(fit, notes=tuple(notes))
 
 
@@ -347,17 +349,19 @@ def corrected_states(data: SteadyStates, fit: JointFit) -> SteadyStates:
     )
 
 
-def _notes(fit: JointFit, wandering: float, stated: Float[np.ndarray, " error"]) -> list[Fact]:
+def _notes(
+    fit: JointFit, frequency_jitter_std: float, stated: Float[np.ndarray, " error"]
+) -> list[Fact]:
     """All that a reader of a joint fit should know.
 
-    Arguments: `wandering` 1σ of the natural frequency from state to state, relative; `stated` 1σ
-    of levels' errors.
+    Arguments: `frequency_jitter_std` 1σ of the natural frequency from state to state, relative;
+    `stated` 1σ of levels' errors.
     """
     notes = []
     if not fit.converged:
         notes.append(Fact("fit_not_converged", reason=fit.status.message))
     level, n_levels = np.asarray(fit.data.level), fit.data.n_levels
-    notes += notes_on_noise(fit.noise, wandering, stated, n_levels)
+    notes += notes_on_noise(fit.noise, frequency_jitter_std, stated, n_levels)
     if np.any((stated == 0) & (fit.noise.level_std > 0)):
         shifts = np.asarray(fit.unknowns.level) * np.asarray(fit.prior.level)
         force = [np.median(np.asarray(fit.data.force)[level == k]) for k in range(n_levels)]

@@ -20,7 +20,7 @@ from snrmjax.numerics.units import HERTZ
 
 MotionKind = Literal["absolute", "relative"]
 
-_CERTAIN = 2.0  # standard errors of a difference between levels
+_CHANGE_STDS = 2.0  # standard errors of a difference between levels
 _POWERS = {"displacement": 0, "velocity": 1, "acceleration": 2}
 _OF_DECAYS = ("to_frequency", "poles", "highest_order")
 
@@ -160,7 +160,7 @@ def amplitude_dependence(
         other = int(np.argmin(np.abs(next_level.natural_frequency - omega)))
         for row, (values, errors) in enumerate(zip(pairs, stds, strict=True)):
             change = float(values[1][other] - values[0][k])
-            allowed = _CERTAIN * float(np.hypot(errors[1][other], errors[0][k]))
+            allowed = _CHANGE_STDS * float(np.hypot(errors[1][other], errors[0][k]))
             if abs(change) > allowed:
                 added[row, k] = abs(change) * rest
                 at = {"mode": k + 1, "frequency_hz": omega / HERTZ, "of_damping": row == 1}

@@ -26,7 +26,7 @@ AmplitudeMeasure = Literal["fundamental", "peak"]
 INPUTS = ("log_force", "log_velocity", "phase")
 """The measured quantities whose errors are carried to the points."""
 
-OFF_RESONANCE = 4.0
+NOISE_GROWTH = 4.0
 """Error of a point 90° off resonance over that of one at resonance, where no noise is stated."""
 
 OUTPUTS = ("squared_frequency", "modal_damping", "log_amplitude")
@@ -346,4 +346,4 @@ def off_resonance_error_factor(
     √(1 + (4 sin φ)²), φ the phase of the mode's velocity: at resonance a point needs no correction
     for the distance from resonance, and away from it the correction brings its own errors.
     """
-    return np.sqrt(1.0 + (OFF_RESONANCE * np.sin(np.angle(mode_velocity))) ** 2)
+    return np.sqrt(1.0 + (NOISE_GROWTH * np.sin(np.angle(mode_velocity))) ** 2)
