@@ -199,6 +199,11 @@ def _trend(error: str, change: float, there: float, p_value: float, load: object
     )
 
 
+def _errors_of_a_level(another_day: bool) -> str:
+    day = " and another day's" if another_day else ""
+    return f"a further level's errors{day}"
+
+
 def _resonance_range(
     probability: float,
     ratio: float,
@@ -215,9 +220,8 @@ def _resonance_range(
         ]
     (low, high), (slow, fast) = frequency_hz, velocity
     if np.isfinite(low) and np.isfinite(high):
-        day = " and another day's" if another_day else ""
         band = f"{low:.6g} to {high:.6g} Hz, {slow:.3g} to {fast:.3g} m/s"
-        words.append(f"95 % {band} (a further level's errors{day})")
+        words.append(f"95 % {band} ({_errors_of_a_level(another_day)})")
     return "; ".join(words)
 
 
@@ -300,6 +304,7 @@ SENTENCES: dict[str, Wording] = {
         "so read the band upwards of zero."
     ),
     "resonance_of_a_level": _resonance_range,
+    "errors_of_a_level": _errors_of_a_level,
     # Advice.
     "advice_of_unconverged_fit": (
         "the fit that this advice rests on has not converged: another fit may advise other states"
