@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 from snrmjax.io.files import near_miss
-from snrmjax.io.rows import Cells, shortened
+from snrmjax.io.rows import Cells, shortened_name
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.rules import FRACTION, IN_RANGE_HZ, NOT_NEGATIVE, POSITIVE, SHORT, WHOLE, Rule
 
@@ -98,13 +98,13 @@ def read_header(cells: Cells) -> Header:
         other_force_known = expected in FORCES and not used.isdisjoint(FORCES)
         if expected is not None and (expected in used or not other_force_known):
             raise ValueError(
-                f"the column `{shortened(name)}` of {file} is not one of the format: "
+                f"the column `{shortened_name(name)}` of {file} is not one of the format: "
                 f"expected `{expected}`."
             )
     _require(used, further, file)
     for name in further:
         near = near_miss(name, sorted(_KNOWN - used), cutoff=0.8) or ""
-        notes.append(Fact("column_not_used", name=shortened(name), file=file, near=near))
+        notes.append(Fact("column_not_used", name=shortened_name(name), file=file, near=near))
     return Header(frozenset(used), _harmonic_orders(used, file), tuple(notes))
 
 
@@ -114,7 +114,7 @@ def _require(used: set[str], further: list[str], file: str) -> None:
     def instead(name: str) -> str:
         """The column that may stand for a missing one."""
         near = near_miss(name, further)
-        return "" if near is None else f" (is it `{shortened(near)}`?)"
+        return "" if near is None else f" (is it `{shortened_name(near)}`?)"
 
     for name in REQUIRED:
         if name not in used and not (name in PHASOR and AMPLITUDE in used):

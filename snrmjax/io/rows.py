@@ -133,13 +133,13 @@ def cells_of(text: str, file: str) -> Cells:
     for k, name in enumerate(names):
         if name and name in names[:k]:
             raise ValueError(
-                f"each column must stand once, but {file} has the column `{shortened(name)}` twice "
-                f"(columns {names.index(name) + 1} and {k + 1})."
+                f"each column must stand once, but {file} has the column `{shortened_name(name)}` "
+                f"twice (columns {names.index(name) + 1} and {k + 1})."
             )
     return Cells(names, rows, file)
 
 
-def shortened(name: str) -> str:
+def shortened_name(name: str) -> str:
     """A column's name on one line and not too long."""
     text = name if name.isprintable() else ascii(name)
     return text if len(text) <= 40 else f"{text[:37]}..."

@@ -46,10 +46,11 @@ class EquivalentForce(AbstractResult):
 
     coordinates: ClassVar[tuple[str, ...]] = ("level",)
 
+    force_covariance: Float[Array, "level level"]  # N²
+    misfit: Float[Array, " level"]  # rms residual: in stated σ, or in m/s where none is stated
     level: Int[Array, " level"] = quantity("level", "1", "level of the test")
     drive: Float[Array, " level"] = quantity("level", "V", "drive voltage")
     force: Float[Array, " level"] = quantity("level", "N", "equivalent force")
-    force_covariance: Float[Array, "level level"]  # N²
     # Of the mode of interest; a 1σ is 0 where nothing was adjusted.
     natural_frequency: Float[Array, " level"] = quantity("level", "Hz", "natural frequency")
     natural_frequency_std: Float[Array, " level"] = quantity("level", "Hz", "its 1σ")
@@ -57,7 +58,6 @@ class EquivalentForce(AbstractResult):
     damping_ratio_std: Float[Array, " level"] = quantity("level", "1", "its 1σ")
     phase: Float[Array, " level"] = quantity("level", "deg", "velocities lead the model's by")
     phase_std: Float[Array, " level"] = quantity("level", "deg", "its 1σ")
-    misfit: Float[Array, " level"]  # rms residual: in stated σ, or in m/s where none is stated
     status: Int[Array, " level"] = quantity("level", "", "what became of the level", of=ForceStatus)
 
     def variables(self) -> dict[str, Variable]:
@@ -239,7 +239,7 @@ def _fit_level(
         full = jnp.zeros(2).at[iterated].set(step)
         return start * jnp.stack([1 + start[1] * full[0], jnp.exp(full[1])])
 
-    mode, found = start, jnp.all(jnp.isfinite(measured))
+    mode, solved = start, jnp.all(jnp.isfinite(measured))
     if iterated.size:
         solution: optx.Solution = optx.least_squares(
             lambda step, _: eliminated(mode_of(step))[1],
@@ -249,7 +249,7 @@ def _fit_level(
             throw=False,
         )
         mode = mode_of(solution.value)
-        found &= jnp.asarray(solution.result == optx.RESULTS.successful)
+        solved &= jnp.asarray(solution.result == optx.RESULTS.successful)
     best, remaining = eliminated(mode)
     scale = jnp.where(best == 0, 1.0, best).at[3].set(1.0)
     sensitivity = jax.jacfwd(deviation)(best) * scale
@@ -269,9 +269,9 @@ def _fit_level(
     held = jnp.stack([modes.natural_frequency_std[j], modes.damping_ratio_std[j]])
     held = jnp.where(jnp.asarray(adjusted[:2]), 0.0, held) / scale[1:3]
     shared = -scale[0] * (inverse @ (orthogonal.T @ sensitivity[:, 1:3]))[0] * held
-    found &= (mode[0] > 0.5 * lowest) & (mode[0] < 2 * highest) & jnp.all(jnp.isfinite(best))
+    solved &= (mode[0] > 0.5 * lowest) & (mode[0] < 2 * highest) & jnp.all(jnp.isfinite(best))
     status = jnp.where(best[0] > 0, int(ForceStatus.SUCCESSFUL), int(ForceStatus.NEGATIVE))
     determined = singular[-1] > 1e-9 * singular[0]
-    status = jnp.where(found & determined, status, int(ForceStatus.NOT_CONVERGED))
+    status = jnp.where(solved & determined, status, int(ForceStatus.NOT_CONVERGED))
     status = jnp.where(freedom >= 0, status, int(ForceStatus.TOO_FEW))
     return best, std, shared, misfit * jnp.where(use_stated, 1.0, size), status

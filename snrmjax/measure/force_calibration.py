@@ -10,6 +10,7 @@ from jaxtyping import Array, Float, Shaped
 
 from snrmjax.measure.states import SteadyStates
 from snrmjax.numerics.result import AbstractResult, quantity
+from snrmjax.numerics.rules import POSITIVE, require
 
 
 class ForceCalibration(AbstractResult):
@@ -69,28 +70,28 @@ def calibrate_force(
     (Array(0.027307, dtype=float64), Array(-8.091e-05, dtype=float64))
     """
     volts, newtons = jnp.asarray(drive, dtype=float), jnp.asarray(force, dtype=float)
-    if volts.ndim != 1 or newtons.shape != volts.shape:
-        raise ValueError(
-            f"`drive` and `force` must be vectors of one length, but have shapes {volts.shape} "
-            f"and {newtons.shape}."
-        )
     n = volts.size
+    given: dict[str, tuple[Array, tuple[int, ...]]] = {
+        "`drive`": (volts, (n,)),
+        "`force`": (newtons, (n,)),
+    }
     if force_std is not None and force_covariance is not None:
         raise ValueError("`force_std` and `force_covariance` are both given; give one.")
     stated = force_std is not None or force_covariance is not None
-    root = jnp.eye(n)
+    std, covariance = jnp.ones(n), jnp.eye(n)
     if force_std is not None:
         std = jnp.asarray(force_std, dtype=float)
-        _require_finite("force_std", std, (n,), positive=True)
-        root = jnp.diag(std)
-    elif force_covariance is not None:
-        given = jnp.asarray(force_covariance, dtype=float)
-        _require_finite("force_covariance", given, (n, n))
-        root = jnp.linalg.cholesky(given)
-        if not isinstance(root, jax.core.Tracer) and not np.all(np.isfinite(root)):
-            raise ValueError("`force_covariance` must be positive definite, but is not.")
-    _require_finite("drive", volts, (n,))
-    _require_finite("force", newtons, (n,))
+        given["`force_std`"] = (std, (n,))
+    if force_covariance is not None:
+        covariance = jnp.asarray(force_covariance, dtype=float)
+        given["`force_covariance`"] = (covariance, (n, n))
+    for name, (value, shape) in given.items():
+        if value.shape != shape:
+            raise ValueError(f"{name} must have shape {shape}, but has {value.shape}.")
+        require(name, value, *([POSITIVE] if value is std else []))
+    root = jnp.diag(std) if force_covariance is None else jnp.linalg.cholesky(covariance)
+    if not isinstance(root, jax.core.Tracer) and not np.all(np.isfinite(root)):
+        raise ValueError("`force_covariance` must be positive definite, but is not.")
     if n < 2 or (not isinstance(volts, jax.core.Tracer) and np.unique(volts).size < 2):
         raise ValueError(
             f"`drive` must contain two different voltages at least, but is {np.asarray(volts)}."
@@ -125,21 +126,6 @@ def _line(
         residual_std=scatter,
         misfit=misfit if stated else jnp.array(jnp.nan),
     )
-
-
-def _require_finite(
-    name: str, value: Array, shape: tuple[int, ...], *, positive: bool = False
-) -> None:
-    if value.shape != shape:
-        raise ValueError(f"`{name}` must have shape {shape}, but has {value.shape}.")
-    if isinstance(value, jax.core.Tracer):
-        return
-    array = np.asarray(value)
-    bad = ~np.isfinite(array) | (positive & (array <= 0))
-    if bad.any():
-        index = tuple(int(k) for k in np.argwhere(bad)[0])
-        expected = "finite and positive" if positive else "finite"
-        raise ValueError(f"`{name}` must be {expected}, but entry {index} is {array[index]:g}.")
 
 
 def apply_calibration(data: SteadyStates, calibration: ForceCalibration) -> SteadyStates:

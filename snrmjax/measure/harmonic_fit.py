@@ -9,7 +9,10 @@ from jaxtyping import Array, Complex, Float, Int, Shaped
 from snrmjax.measure.signals import checked_amplitudes, require_orders
 from snrmjax.numerics.finite_slopes import safe_root
 from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
+from snrmjax.numerics.rules import POSITIVE, require
 from snrmjax.numerics.status import Status
+
+_LARGEST_CONDITION = 1e6  # above which harmonics are taken as not separable
 
 
 class HarmonicFitStatus(Status):
@@ -35,20 +38,20 @@ class HarmonicFit(AbstractResult):
     What belongs to a record is NaN where its `status` is not `HarmonicFitStatus.SUCCESSFUL`.
     """
 
+    covariance: Float[Array, "*batch parameter parameter"]  # unit of the record, squared
+    condition: Float[Array, ""]  # largest over smallest singular value of the fit
+    harmonic_order: tuple[int, ...] = eqx.field(static=True)
     amplitude: Complex[Array, "*batch harmonic"] = quantity(
         "record harmonic", "unit of the record", "amplitude"
     )  # peak
-    covariance: Float[Array, "*batch parameter parameter"]  # unit of the record, squared
     noise_std: Float[Array, "*batch"] = quantity(
         "record", "unit of the record", "noise of a sample"
     )  # from the residual
     residual_rms: Float[Array, "*batch"] = quantity("record", "unit of the record", "residual")
     status: Int[Array, "*batch"] = quantity("record", "", "how the fit ended", of=HarmonicFitStatus)
     frequency: Float[Array, ""] = quantity("", "Hz", "fundamental frequency")
-    condition: Float[Array, ""]  # largest over smallest singular value of the fit
     reference_time: Float[Array, ""] = quantity("", "s", "where phases count from")
     degrees_of_freedom: int = setting()
-    harmonic_order: tuple[int, ...] = eqx.field(static=True)
 
     def variables(self) -> dict[str, Variable]:
         """All records in one row, with their errors and the harmonics' orders."""
@@ -58,11 +61,11 @@ class HarmonicFit(AbstractResult):
             return np.asarray(values).reshape(-1, *dimensions)
 
         rows = eqx.tree_at(
-            lambda one: (one.amplitude, one.noise_std, one.residual_rms, one.status),
+            lambda fit: (fit.amplitude, fit.noise_std, fit.residual_rms, fit.status),
             self,
             (
                 in_a_row(self.amplitude, len(orders)),
-                *(in_a_row(one) for one in (self.noise_std, self.residual_rms, self.status)),
+                *(in_a_row(fit) for fit in (self.noise_std, self.residual_rms, self.status)),
             ),
         )
         std = in_a_row(self.complex_std, len(orders))
@@ -71,16 +74,6 @@ class HarmonicFit(AbstractResult):
             "harmonic": Variable(whole[1:], orders, "1", "harmonic order"),
             "complex_std": Variable(whole, std, "unit of the record", "rms of the complex error"),
         }
-
-    @property
-    def real_std(self) -> Float[Array, "*batch harmonic"]:
-        """1σ of the real parts, in the unit of the record."""
-        return safe_root(self._variance[..., : len(self.harmonic_order)])
-
-    @property
-    def imag_std(self) -> Float[Array, "*batch harmonic"]:
-        """1σ of the imaginary parts, in the unit of the record."""
-        return safe_root(self._variance[..., len(self.harmonic_order) :])
 
     @property
     def complex_std(self) -> Float[Array, "*batch harmonic"]:
@@ -118,7 +111,6 @@ def fit_harmonics(
     harmonic_order: tuple[int, ...],
     *,
     reference_time: float | Float[Array, ""] = 0.0,
-    max_condition: float = 1e6,
 ) -> HarmonicFit:
     """Least-squares fit of a mean and of harmonics to time records.
 
@@ -128,8 +120,7 @@ def fit_harmonics(
     Arguments: `time` in s, in any order and spacing; `signal` in any unit, one row a record;
     `frequency` Ω in rad/s (`stepped_sine_states` finds that of a record by itself);
     `harmonic_order`, the mean is always fitted and listed first as order 0; `reference_time` in s,
-    where the phases count from; `max_condition`, above which the harmonics are taken as not
-    separable.
+    where the phases count from.
     Returns `HarmonicFit`; `status` is RANK_DEFICIENT for too short or too coarse records,
     NOT_FINITE for NaN; the status's `message` says what to try.
     Raises `ValueError` for wrong shapes, orders or a frequency that is not positive.
@@ -160,10 +151,9 @@ def fit_harmonics(
     omega = jnp.asarray(frequency, dtype=float)
     if omega.ndim:
         raise ValueError(f"`frequency` must be one number, but has shape {omega.shape}.")
-    if not isinstance(omega, jax.core.Tracer) and not omega > 0:
-        raise ValueError(f"`frequency` must be positive, but is {frequency}.")
-    limits = (jnp.asarray(x, dtype=float) for x in (reference_time, max_condition))
-    return _fitted(times, records, omega, *limits, (0, *(k for k in orders if k)))
+    require("`frequency`", omega, POSITIVE)
+    reference = jnp.asarray(reference_time, dtype=float)
+    return _fitted(times, records, omega, reference, (0, *(k for k in orders if k)))
 
 
 @eqx.filter_jit
@@ -172,7 +162,6 @@ def _fitted(
     records: Float[Array, "*batch sample"],
     frequency: Float[Array, ""],
     reference_time: Float[Array, ""],
-    max_condition: Float[Array, ""],
     orders: tuple[int, ...],
 ) -> HarmonicFit:
     timed = jnp.all(jnp.isfinite(time)) & jnp.isfinite(frequency) & (frequency > 0)
@@ -201,7 +190,7 @@ def _fitted(
     parts, root = coefficients @ to_parts.T, to_parts @ inverse
     singular = jnp.linalg.svd(jax.lax.stop_gradient(upper), compute_uv=False)
     condition = jnp.where(singular[-1] > 0, singular[0] / singular[-1], jnp.inf)
-    separable = (condition <= max_condition) & (freedom >= 0)
+    separable = (condition <= _LARGEST_CONDITION) & (freedom >= 0)
     status = jnp.where(
         separable, int(HarmonicFitStatus.SUCCESSFUL), int(HarmonicFitStatus.RANK_DEFICIENT)
     )

@@ -31,7 +31,7 @@ class _Reading(NamedTuple):
     quarter_turns: int  # n
 
 
-_READINGS = tuple(_Reading(one, n) for one in (False, True) for n in (0, 1, -1, 2))
+_READINGS = tuple(_Reading(conjugated, n) for conjugated in (False, True) for n in (0, 1, -1, 2))
 
 
 class _NearResonance(NamedTuple):
@@ -76,7 +76,7 @@ def wrong_phases(data: SteadyStates, modes: LinearModes | Structure) -> tuple[Fa
     if near is None:
         return ()
     fits = [_fitted(near, reading) for reading in _READINGS]
-    misfit = np.array([fits[0].misfit, *(_of_a_damped_mode(one) for one in fits[1:])])
+    misfit = np.array([fits[0].misfit, *(_of_a_damped_mode(fit) for fit in fits[1:])])
     best = float(misfit.min())
     known = bool(np.any(np.isfinite(np.asarray(data.force))))
     if best > _RIGHT or misfit[0] < max(_WRONG, _BETTER * best):
@@ -172,8 +172,8 @@ def _least_squares(
 ) -> tuple[float, Float[np.ndarray, " state"]]:
     """The last column's coefficient and the values of the fit."""
     size = np.linalg.norm(columns, axis=0)
-    found = np.linalg.lstsq(columns / size, values, rcond=1e-10)[0] / size
-    return float(found[-1]), columns @ found
+    coefficients = np.linalg.lstsq(columns / size, values, rcond=1e-10)[0] / size
+    return float(coefficients[-1]), columns @ coefficients
 
 
 Arguments = ParamSpec("Arguments")
@@ -197,11 +197,11 @@ def naming_wrong_phases(verb: Callable[Arguments, Found]) -> Callable[Arguments,
     @functools.wraps(verb)
     def named(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Found:
         given: tuple[object, ...] = (*args, *kwargs.values())
-        data = [one for one in given if isinstance(one, SteadyStates)]
-        modes = [one for one in given if isinstance(one, LinearModes | Structure)]
+        data = [argument for argument in given if isinstance(argument, SteadyStates)]
+        modes = [argument for argument in given if isinstance(argument, LinearModes | Structure)]
         wrong = wrong_phases(data[0], modes[0]) if data and modes else ()
         try:
-            found: Any = verb(*args, **kwargs)
+            result: Any = verb(*args, **kwargs)
         except MisreadPhases:  # said by a verb within this one
             raise
         except ValueError as error:
@@ -209,7 +209,7 @@ def naming_wrong_phases(verb: Callable[Arguments, Found]) -> Callable[Arguments,
                 raise MisreadPhases(wrong, error) from error
             raise
         if wrong:
-            found = dataclasses.replace(found, notes=(*map(str, wrong), *found.notes))
-        return cast(Found, found)
+            result = dataclasses.replace(result, notes=(*wrong, *result.notes))
+        return cast(Found, result)
 
     return named

@@ -1,5 +1,7 @@
 """Steady states from time records of a force and of the velocities it drives."""
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Array, Shaped
 
@@ -64,7 +66,8 @@ def steady_state_from_records(
     first, higher = fit.harmonic_order.index(1), tuple(k for k in orders if k != 1)
     stored = [fit.harmonic_order.index(k) for k in higher]
     noisy = [k for k in stored if fit.harmonic_order[k] > 1] or stored  # the mean has half an error
-    amplitude, phase_std = np.asarray(fit.amplitude), np.asarray(fit.phase_std)[:, first]
+    amplitude: Any = np.asarray(fit.amplitude)
+    phase_std = np.asarray(fit.phase_std)[:, first]
     relative = np.asarray(
         phasor_relative_to_force(amplitude[1:], amplitude[0, first], fit.harmonic_order)
     )
@@ -73,8 +76,8 @@ def steady_state_from_records(
         squares = np.asarray(fit.complex_std)[1:, noisy] ** 2
         harmonic_std = np.sqrt(squares.mean(axis=1))
     return steady_states(
-        [level],
-        [frequency],
+        np.array([level]),
+        np.array([frequency]),
         np.abs(amplitude[:1, first]),
         np.where(good[1:], relative[:, first], 0.0)[None],
         sensors=sensors or tuple(f"sensor {k + 1}" for k in range(len(velocity))),

@@ -78,8 +78,8 @@ def _peak(
         start,
     )
     # Where the curve is too flat for Newton's method, the sample is the better peak.
-    found, sampled = derivative(fixed, angle, 0), derivative(fixed, start, 0)
-    angle = jnp.where(jnp.abs(found) >= jnp.abs(sampled), angle, start)
+    refined, sampled = derivative(fixed, angle, 0), derivative(fixed, start, 0)
+    angle = jnp.where(jnp.abs(refined) >= jnp.abs(sampled), angle, start)
     sign = jnp.where(sampled < 0, -1.0, 1.0)
     # One more step, now differentiated: it carries how the peak moves into second derivatives.
     return sign * derivative(values, angle - newton_step(values, angle), 0)
@@ -151,7 +151,7 @@ def require_orders(name: str, orders: Sequence[int] | Int[np.ndarray, " order"])
 
 def require_fundamental(name: str, orders: Sequence[int]) -> tuple[int, ...]:
     """As `require_orders`, of orders that must hold the fundamental, 1."""
-    found = require_orders(name, orders)
-    if 1 not in found:
-        raise ValueError(f"`{name}` must contain the fundamental, 1, but is {found}.")
-    return found
+    checked = require_orders(name, orders)
+    if 1 not in checked:
+        raise ValueError(f"`{name}` must contain the fundamental, 1, but is {checked}.")
+    return checked

@@ -51,7 +51,7 @@ class _Quantity(NamedTuple):
                 for key, part in parts
             }
         if self.of is not None:
-            names = [self.of(int(one)).name.lower() for one in values.ravel()]
+            names = [self.of(int(number)).name.lower() for number in values.ravel()]
             values = np.array(names, dtype=np.str_).reshape(values.shape)
         elif self.unit in _SIZES:
             values = values / _SIZES[self.unit]
@@ -97,19 +97,20 @@ class AbstractResult(eqx.Module):
     """Base of results: a repr of one screen, `to_xarray()`, `to_pandas()` and `plot()`.
 
     Fields say by `quantity` and `setting` what a data set has of them; a result with computed
-    quantities adds them to `variables`. Names in `coordinates` label the others.
+    quantities adds them to `variables`. Names in `coordinates` label the others; one that is a
+    dimension and no variable counts from 0.
     """
 
     coordinates: ClassVar[tuple[str, ...]] = ()
 
     def variables(self) -> Mapping[str, Variable]:
         """Quantities by name, in units of files (Hz, m/s)."""
-        found: dict[str, Variable] = {}
+        variables: dict[str, Variable] = {}
         for field in dataclasses.fields(self):
             if "quantity" in field.metadata:
                 values = getattr(self, field.name)
-                found |= field.metadata["quantity"].variables(field.name, values)
-        return found
+                variables |= field.metadata["quantity"].variables(field.name, values)
+        return variables
 
     def attributes(self) -> Mapping[str, str | float | int]:
         """What holds for the whole result: settings, statuses, notes."""
@@ -134,9 +135,14 @@ class AbstractResult(eqx.Module):
             attributes = {"units": of.unit, "long_name": of.meaning}
             return of.dimensions, np.asarray(of.values), attributes
 
-        every = {name: labelled(variable) for name, variable in self.variables().items()}
-        labels = {name: every.pop(name) for name in self.coordinates}
-        return xarray.Dataset(every, coords=labels, attrs=dict(self.attributes()))
+        variables = dict(self.variables())
+        for of in list(variables.values()):
+            for name, size in zip(of.dimensions, np.shape(of.values), strict=True):
+                if name in self.coordinates and name not in variables:
+                    variables[name] = Variable((name,), np.arange(size), "1", name)
+        arrays = {name: labelled(variable) for name, variable in variables.items()}
+        labels = {name: arrays.pop(name) for name in self.coordinates}
+        return xarray.Dataset(arrays, coords=labels, attrs=dict(self.attributes()))
 
     def to_pandas(self) -> "pandas.DataFrame":
         """The result as a table, one row a member of its dimension.
@@ -165,4 +171,4 @@ def _attribute(value: Any) -> str | float | int:
         return value
     if isinstance(value, Fact):
         return str(value)
-    return "\n".join(str(one) for one in value)
+    return "\n".join(str(entry) for entry in value)

@@ -48,16 +48,16 @@ def check_files(
 
 def files_of_test(folder: Path, files: TestFiles) -> FilesRead | None:
     """What the states of a folder were read from; None where nobody says how, or of both kinds."""
-    tables = tuple(one.table for one in files.states if one.table is not None)
-    records = [one.file.partition(": ")[0] for one in files.records]
-    read = [*(one.file for one in files.states if one.table is None), *records]
+    tables = tuple(state.table for state in files.states if state.table is not None)
+    records = [record.file.partition(": ")[0] for record in files.records]
+    read = [*(state.file for state in files.states if state.table is None), *records]
     if tables and not read:
         return FilesRead(tables)
     told = folder / MAP
     if tables or not told.is_file():
         return None
     return FilesRead(
-        tuple(folder / one for one in dict.fromkeys(read)), told, read_import_map(told)
+        tuple(folder / name for name in dict.fromkeys(read)), told, read_import_map(told)
     )
 
 
@@ -65,15 +65,19 @@ def with_imports(checkup: Checkup, read: FilesRead | None) -> Checkup:
     """The findings with the import that mends each; the first certain one with that of all."""
     if read is None:
         return checkup
-    certain = [one for one in checkup.findings if is_certain(one)]
+    certain = [finding for finding in checkup.findings if is_certain(finding)]
     told = []
-    for one in checkup.findings:
-        lines = [line for repair in one.repairs if (line := _command(repair, read))]
-        mend = str(one.mend)
+    for finding in checkup.findings:
+        lines = [line for repair in finding.repairs if (line := _command(repair, read))]
+        mend = str(finding.mend)
         mend = f"{mend.rstrip('.')}: {', or '.join(lines)}." if lines else mend
-        if len(certain) > 1 and one is certain[0] and (line := _command(_joined(certain), read)):
+        if (
+            len(certain) > 1
+            and finding is certain[0]
+            and (line := _command(_joined(certain), read))
+        ):
             mend = f"{' and '.join(each.name for each in certain)} at once: {line}. Alone, {mend}"
-        told.append(one._replace(mend=mend))
+        told.append(finding._replace(mend=mend))
     return Checkup(tuple(told), checkup.notes)
 
 
@@ -87,7 +91,7 @@ def is_certain(one: Finding) -> bool:
 
 def _joined(findings: Sequence[Finding]) -> Repair:
     """Several findings' repairs as one; each was found with the others' errors mended."""
-    every = [one.repairs[0] for one in findings]
+    every = [finding.repairs[0] for finding in findings]
     return Repair(
         response=math.prod(one.response for one in every),
         force=math.prod(one.force for one in every),
@@ -108,7 +112,7 @@ def _command(repair: Repair, read: FilesRead) -> str:
     to = ("--out", str(read.files[0].parent / "mended"))
     words = ("snrmjax", "import", *map(str, read.files), *told, *options, *to)
     # Double quotes, which every shell knows.
-    quoted = [one if shlex.quote(one) == one else f'"{one}"' for one in words]
+    quoted = [word if shlex.quote(word) == word else f'"{word}"' for word in words]
     return f"`{' '.join(quoted)}`"
 
 
@@ -127,7 +131,7 @@ def _options_of_own(repair: Repair) -> list[str]:
 
 def _options_of_laboratory(repair: Repair, told: ImportMap) -> list[str]:
     """Likewise of a laboratory's files by a map: where the units that a finding names are all."""
-    kinds = {one.quantity for one in told.responses}
+    kinds = {response.quantity for response in told.responses}
     named = (repair.response == 1 or repair.unit) and (repair.force == 1 or repair.force_unit)
     if repair.quantity or not named or len(kinds) != 1 or (repair.conjugate and told.record):
         return []

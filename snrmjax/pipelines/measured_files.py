@@ -37,7 +37,7 @@ def read_measured_test(path: FilePath, structure: Structure) -> list[SteadyState
             f"{file_name(path)} holds no time record (a CSV needs the column time_s) and no table "
             "of steady states (level, frequency_hz, …)."
         )
-    return [with_named_channels(one, file_name(path)) for one in held.recordings]
+    return [with_named_channels(recording, file_name(path)) for recording in held.recordings]
 
 
 def _header(path: Path) -> set[str]:

@@ -131,7 +131,12 @@ def _read(path: Path) -> FrequencyResponses | SteadyStates | tuple[TimeRecording
     if held.responses:
         return joined_responses(held.responses)
     if held.recordings:
-        forces = [c.name for one in held.recordings for c in one.channels if c.quantity == "force"]
+        forces = [
+            c.name
+            for recording in held.recordings
+            for c in recording.channels
+            if c.quantity == "force"
+        ]
         if forces:
             raise ValueError(
                 f"{file_name(path)} holds time records with a force ({forces[0]}): modes need "

@@ -103,9 +103,9 @@ def reduce_model(
 def _refuse_contradictions(source: ReductionSource, found: Condensation) -> None:
     if source.cases is None:
         return
-    for one in found.warnings:
-        if one.kind == "inconsistent_case":
-            raise ValueError(f"{one}; mend or remove it.")
+    for warning in found.warnings:
+        if warning.kind == "inconsistent_case":
+            raise ValueError(f"{warning}; mend or remove it.")
     ratio = found.quality.linear_stiffness_ratio
     worst = int(np.argmax(np.abs(np.nan_to_num(ratio, nan=1.0) - 1)))
     if abs(ratio[worst] - 1) > _REFUSED_LINEAR:

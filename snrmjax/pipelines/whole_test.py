@@ -167,9 +167,7 @@ def not_diagnosed(data: SteadyStates, model: Structure) -> tuple[Note, ...]:
 
 
 def _note_on_steps(record: SteppedRecord) -> Note:
-    counts = record.steps.counts
-    used = Fact("steps_used", used=counts.used, left_out=tuple(counts.left_out.items()))
-    return Fact("note_of_file", file=record.file, note=used)
+    return Fact("note_of_file", file=record.file, note=record.steps.counts.fact)
 
 
 def _taken_sensors(files: TestFiles, model: Structure) -> tuple[Note, ...]:

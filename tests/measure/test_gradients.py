@@ -46,7 +46,7 @@ def of_indicators(relative, data):
     changed = dataclasses.replace(data, velocity=velocity)
     return numbers(
         sj.measure.appropriation_of(changed),
-        sj.measure.mode_indicator(velocity),
+        sj.measure.nnm_appropriation(velocity[..., None], (1,)),
         sj.measure.nnm_appropriation(changed.harmonics * (1 + 1j * relative[6]), (2, 3)),
     )
 

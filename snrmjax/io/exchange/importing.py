@@ -137,8 +137,7 @@ def _records(
             parts.append(states)
     counted = joined_counts(steps) if steps else None
     if counted is not None:
-        reasons = tuple(counted.left_out.items())
-        notes.append(Fact("steps_used", used=counted.used, left_out=reasons))
+        notes.append(counted.fact)
     if not parts:
         return Imported(None, tuple(kept), used, assumed, tuple(notes))
     if mapping.level == "file" or (len(parts) > 1 and not mapping.level):

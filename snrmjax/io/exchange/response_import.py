@@ -1,6 +1,7 @@
 """Steady states of frequency responses and spectra (UFF 58 and its relatives)."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,6 +18,89 @@ _FREQUENCY, _FORCE, _SET = "frequency of the lines", "force behind the responses
 _RULES = ("force", "runs", "file")
 
 
+class _Sets(NamedTuple):
+    """Frequency responses of a file, one set a level, and what a map says of them."""
+
+    sets: Sequence[FrequencyResponses]
+    z: Sequence[float]
+    mapping: ImportMap
+    file: str
+
+    @property
+    def has_force(self) -> bool:
+        """Whether the force is among the responses: they are spectra, or over a generator."""
+        named = [self.mapping.force in _names(each.responses) for each in self.sets]
+        return bool(self.mapping.force) and all(named)
+
+    def references(self) -> list[int]:
+        """Which reference of each set the responses are over."""
+        force, file, places = self.mapping.force, self.file, []
+        for each in self.sets:
+            names = _names(each.references)
+            if force and not self.has_force:
+                what = f"responses {', '.join(_names(each.responses))}, and over the references"
+                require_name("--force", force, names, what, file)
+                places.append(names.index(force))
+            elif len(names) > 1:
+                listed = ", ".join(names)
+                raise ValueError(
+                    f"which reference of {file} is the force? --force names it, of {listed}."
+                )
+            else:
+                places.append(0)
+        return places
+
+    def column(self, name: str, unit: str, option: str) -> tuple[np.ndarray, Channel]:
+        """All lines of a response, in SI or, where its unit is stated, as the file has them."""
+        parts = []
+        for each, reference in zip(self.sets, self.references(), strict=True):
+            require_name(option, name, _names(each.responses), "responses", self.file)
+            row = _names(each.responses).index(name)
+            channel = each.responses[row]
+            values = each.values[row, reference]
+            parts.append(values / channel.calibration if unit else values)
+        return np.concatenate(parts), channel
+
+    def amplitudes(self) -> np.ndarray:
+        """The stated amplitude of the force of each set."""
+        stated, file, n = self.mapping.force_amplitude, self.file, len(self.sets)
+        has_z = bool(np.isfinite(self.z).all())
+        if not stated:
+            levels = ", ".join(f"{value:g}" for value in self.z)
+            way = f"z if they are the z axis' ({levels}), else N" if has_z else "N, one for all or"
+            raise ValueError(
+                f"which amplitude had the force of {file}, whose responses are over it? "
+                f"--force-amplitude {way} one a set ({n}); `snrmjax modes` takes frequency "
+                "responses as they are."
+            )
+        if stated == ("z",) and not (has_z and np.all(np.asarray(self.z) > 0)):
+            raise ValueError(
+                f"--force-amplitude z needs positive values on the z axis, which {file} lacks: "
+                "state N."
+            )
+        values = np.asarray(self.z if stated == ("z",) else [float(word) for word in stated])
+        if values.size not in (1, n):
+            raise ValueError(
+                f"--force-amplitude must be one for all or one for each of the {n} sets of "
+                f"{file}, but {values.size} are stated."
+            )
+        return np.broadcast_to(values, (n,))
+
+    def force_behind(self) -> tuple[Force, bool]:
+        """What the responses are over, and whether the file says in which unit."""
+        mapping, file = self.mapping, self.file
+        pairs = zip(self.sets, self.references(), strict=True)
+        for channel in [each.references[reference] for each, reference in pairs]:
+            if mapping.force_unit and channel.si_unit not in ("", mapping.force_unit):
+                raise ValueError(
+                    f"--force-unit says {mapping.force_unit}, but the responses of {file} are over "
+                    f"{channel.name} in {channel.si_unit}, in which --force-amplitude is stated "
+                    "too: leave --force-unit out."
+                )
+        force = force_meaning(mapping, channel.si_unit or "N", f"{channel.name} of {file}")
+        return force, bool(channel.si_unit)
+
+
 def import_responses(
     sets: Sequence[FrequencyResponses],
     z: Sequence[float],
@@ -31,7 +115,7 @@ def import_responses(
     Raises `ValueError` with a question that names the option for what cannot be told.
     """
     if not mapping.responses:
-        named = ", ".join(dict.fromkeys(c.name for level_set in sets for c in level_set.responses))
+        named = ", ".join(dict.fromkeys(name for each in sets for name in _names(each.responses)))
         raise ValueError(
             f"which channel of {file} is the response? --response CHANNEL names it, of {named}."
         )
@@ -41,57 +125,44 @@ def import_responses(
         )
     if mapping.level == "z" and not np.isfinite(z).all():
         raise ValueError(f"--level z: {file} states no value on the z axis: --level order.")
-    spectra = bool(mapping.force) and all(
-        mapping.force in _names(level_set.responses) for level_set in sets
-    )
-    keys = z if mapping.level == "z" else np.arange(1.0, len(sets) + 1)
-    columns = {_FREQUENCY: np.concatenate([_or_nothing(level_set.frequency) for level_set in sets])}
-    columns[_SET] = np.repeat(keys, [level_set.frequency.size for level_set in sets])
+    source = _Sets(sets, z, mapping, file)
+    sizes = [each.frequency.size for each in sets]
+    numbers = z if mapping.level == "z" else np.arange(1.0, len(sets) + 1)
+    columns = {
+        _FREQUENCY: _or_nothing(np.concatenate([each.frequency for each in sets])),
+        _SET: np.repeat(numbers, sizes),
+    }
     units = {_FREQUENCY: "rad/s"}
     rule = mapping.level if mapping.level in _RULES else _SET
     as_table = mapping._replace(frequency=_FREQUENCY, frequency_unit="", level=rule)
-    if not spectra:
-        amplitude = _amplitudes(sets, z, mapping, file)
-        pairs = zip(amplitude, sets, strict=True)
-        columns[_FORCE] = np.concatenate(
-            [np.full(level_set.frequency.size, size) for size, level_set in pairs]
-        )
-        units[_FORCE] = "V" if _reference_force(sets, mapping, file).is_voltage else "N"
+    if source.has_force:
+        name, unit = mapping.force, mapping.force_unit
+        values, channel = source.column(name, unit, "--force")
+        columns[name] = _or_nothing(values)
+        units[name] = channel.unit if unit else channel.si_unit
+        assumed.add("force_amplitude", Fact("spectra_of_one_reference"))
+    else:
+        force, is_stated = source.force_behind()
+        columns[_FORCE] = np.repeat(source.amplitudes(), sizes)
+        units[_FORCE] = "V" if force.is_voltage else "N"
         as_table = as_table._replace(
             force=_FORCE, force_unit="", force_amplitude=(), over_force=True
         )
-    asked = [(response.channel, response.unit, "--response") for response in mapping.responses]
-    for name, unit, option in [
-        *asked,
-        *([(mapping.force, mapping.force_unit, "--force")] * spectra),
-    ]:
-        parts = []
-        for level_set in sets:
-            names = _names(level_set.responses)
-            require_name(option, name, names, "responses", file)
-            row = names.index(name)
-            channel = level_set.responses[row]
-            # A known channel's values are in SI already: its own unit, or the one that is stated.
-            values = level_set.values[row, _reference(level_set, mapping, file, spectra=spectra)]
-            parts.append(values / channel.calibration if unit else values)
-        columns[name] = (
-            np.concatenate(parts) if option == "--response" else _or_nothing(np.concatenate(parts))
-        )
-        if channel.quantity not in ("unknown", "voltage") or option == "--force":
-            units[name] = channel.unit if unit else _si(channel)
+    for response in mapping.responses:
+        name = response.channel
+        columns[name], channel = source.column(name, response.unit, "--response")
+        if channel.quantity not in ("unknown", "voltage"):
+            units[name] = channel.unit if response.unit else channel.si_unit
     table = NumberTable(file, columns, {name: unit for name, unit in units.items() if unit})
-    part, found, force, notes = import_table(table, as_table, file, assumed)
+    part, used, force, notes = import_table(table, as_table, file, assumed)
     del assumed["frequency_unit"]
-    if spectra:
-        assumed.add("force_amplitude", Fact("spectra_of_one_reference"))
-    else:
+    if not source.has_force:
         del assumed["force_unit"]
-        reference = sets[0].references[_reference(sets[0], mapping, file, spectra=False)]
-        if not _si(reference) and not mapping.force_unit:
+        if not (is_stated or mapping.force_unit):
             assumed.add("force_unit", Fact("reference_without_unit"), "N")
     if not mapping.level:
         assumed.add("level", Fact("level_a_set"))
-    mapping = mapping._replace(responses=found.responses, level=mapping.level or "order")
+    mapping = mapping._replace(responses=used.responses, level=mapping.level or "order")
     return part, mapping, force, notes
 
 
@@ -100,67 +171,5 @@ def _or_nothing(values: np.ndarray) -> np.ndarray:
     return np.where(values == 0, np.nan, values)
 
 
-def _reference_force(sets: Sequence[FrequencyResponses], mapping: ImportMap, file: str) -> Force:
-    """What the responses are over."""
-    for level_set in sets:
-        channel = level_set.references[_reference(level_set, mapping, file, spectra=False)]
-        if mapping.force_unit and _si(channel) not in ("", mapping.force_unit):
-            raise ValueError(
-                f"--force-unit says {mapping.force_unit}, but the responses of {file} are over "
-                f"{channel.name} in {_si(channel)}, in which --force-amplitude is stated too: "
-                "leave --force-unit out."
-            )
-    return force_meaning(mapping, _si(channel) or "N", f"{channel.name} of {file}")
-
-
-def _amplitudes(
-    sets: Sequence[FrequencyResponses], z: Sequence[float], mapping: ImportMap, file: str
-) -> np.ndarray:
-    stated = mapping.force_amplitude
-    if not stated:
-        levels = ", ".join(f"{value:g}" for value in z)
-        has_z = bool(np.isfinite(z).all())
-        way = f"z if they are the z axis' ({levels}), else N" if has_z else "N, one for all or"
-        raise ValueError(
-            f"which amplitude had the force of {file}, whose responses are over it? "
-            f"--force-amplitude {way} one a set ({len(sets)}); `snrmjax modes` takes frequency "
-            "responses as they are."
-        )
-    if stated == ("z",):
-        if not (np.isfinite(z).all() and np.all(np.asarray(z) > 0)):
-            raise ValueError(
-                f"--force-amplitude z needs positive values on the z axis, which {file} lacks: "
-                "state N."
-            )
-        values = np.asarray(z, dtype=float)
-    else:
-        values = np.asarray([float(newtons) for newtons in stated])
-    if values.size not in (1, len(sets)):
-        raise ValueError(
-            f"--force-amplitude must be one for all or one for each of the {len(sets)} sets of "
-            f"{file}, but {values.size} are stated."
-        )
-    return np.broadcast_to(values, (len(sets),))
-
-
-def _si(channel: Channel) -> str:
-    return channel.si_unit if channel.quantity != "unknown" else ""
-
-
 def _names(channels: Sequence[Channel]) -> list[str]:
     return [channel.name for channel in channels]
-
-
-def _reference(
-    level_set: FrequencyResponses, mapping: ImportMap, file: str, *, spectra: bool
-) -> int:
-    names = _names(level_set.references)
-    if mapping.force and not spectra:
-        what = f"responses {', '.join(_names(level_set.responses))}, and over the references"
-        require_name("--force", mapping.force, names, what, file)
-        return names.index(mapping.force)
-    if len(names) > 1:
-        raise ValueError(
-            f"which reference of {file} is the force? --force names it, of {', '.join(names)}."
-        )
-    return 0

@@ -14,20 +14,20 @@ class StepCounts(NamedTuple):
     left_out: Mapping[str, int]
 
     @property
-    def words(self) -> str:
-        """The counts as part of a sentence: 44 of 104 steps used; left out: 58 unsettled."""
-        return str(Fact("steps_used", used=self.used, left_out=self.reasons))
+    def fact(self) -> Fact:
+        """The counts as a fact: 44 of 104 steps used; left out: 58 unsettled, 2 too short."""
+        return Fact("steps_used", used=self.used, left_out=self.reasons)
 
     @property
-    def reasons(self) -> dict[str, int]:
-        """How many were left out for each reason for which any was."""
-        return {reason: count for reason, count in self.left_out.items() if count}
+    def reasons(self) -> tuple[tuple[str, int], ...]:
+        """Reasons for which any step was left out, with their numbers."""
+        return tuple((reason, count) for reason, count in self.left_out.items() if count)
 
 
 def joined_counts(counts: Iterable[StepCounts]) -> StepCounts:
     """The counts of several records together."""
-    every = list(counts)
+    records = list(counts)
     left: Counter[str] = Counter()
-    for one in every:
-        left.update(one.left_out)
-    return StepCounts(sum(one.used for one in every), dict(left))
+    for record in records:
+        left.update(record.left_out)
+    return StepCounts(sum(record.used for record in records), dict(left))

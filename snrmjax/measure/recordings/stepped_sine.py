@@ -28,7 +28,7 @@ from snrmjax.measure.recordings.velocity_states import (
 from snrmjax.measure.signals import require_fundamental
 from snrmjax.measure.states import SteadyStates
 from snrmjax.numerics.facts import Fact
-from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
+from snrmjax.numerics.result import AbstractResult, quantity, setting
 from snrmjax.numerics.status import Status
 from snrmjax.numerics.units import HERTZ
 
@@ -89,15 +89,6 @@ class SteppedSineStates(AbstractResult):
             if kind is not StepStatus.SETTLED and np.any(self.status == int(kind))
         }
         return StepCounts(self.states.n_states, left)
-
-    def variables(self) -> dict[str, Variable]:
-        """The table of steps, with the reasons in words."""
-        reasons = np.array([StepStatus(int(k)).message for k in self.status], dtype=str)
-        return {
-            "step": Variable(("step",), np.arange(len(self.status)), "1", "step"),
-            **super().variables(),
-            "reason": Variable(("step",), reasons, "", "in words"),
-        }
 
 
 class _Measured(NamedTuple):
@@ -172,8 +163,8 @@ def stepped_sine_states(
         check_rate(recording, step.frequency, force)
     _check_highest(recording, steps, orders)
     measured = [
-        _measure(recording, chosen, one, orders, settle, tolerance, frequencies is not None)
-        for one in steps
+        _measure(recording, chosen, step, orders, settle, tolerance, frequencies is not None)
+        for step in steps
     ]
     measured = _without_pauses(measured)
     return _result(recording, chosen, measured, orders, level)
@@ -195,8 +186,8 @@ def _recognised(
         least_amplitude_step=amplitude_step,
         least_step=frequency_step,
     )
-    long = [one for one in steps if _cycles(recording, one) >= _FEWEST_CYCLES]
-    if sum(one.stop - one.start for one in long) < _COVERED * np.ptp(track.middle):
+    long = [step for step in steps if _cycles(recording, step) >= _FEWEST_CYCLES]
+    if sum(step.stop - step.start for step in long) < _COVERED * np.ptp(track.middle):
         raise ValueError(
             f"the record has no steps: the tone of channel {name} does not stay at one frequency "
             f"for {_FEWEST_CYCLES} cycles anywhere (a sweep? `sweep_states` reads it)."
@@ -248,7 +239,7 @@ def _of_table(
 def _check_highest(
     recording: TimeRecording, steps: Sequence[Step], orders: tuple[int, ...]
 ) -> None:
-    highest = max(one.frequency for one in steps) * max(orders)
+    highest = max(step.frequency for step in steps) * max(orders)
     if highest >= np.pi * recording.sampling_rate:
         raise ValueError(
             f"harmonic {max(orders)} of {highest / max(orders) / HERTZ:.6g} Hz lies above half "
@@ -341,14 +332,13 @@ def _rows(blocks: BlockPhasors, rows: slice) -> BlockPhasors:
 
 
 def _without_pauses(measured: list[_Measured]) -> list[_Measured]:
-    largest = max(
-        (one.step.amplitude for one in measured if np.isfinite(one.step.amplitude)), default=0.0
-    )
+    sizes = [fitted.step.amplitude for fitted in measured]
+    largest = max((size for size in sizes if np.isfinite(size)), default=0.0)
     return [
-        one._replace(status=StepStatus.NO_FORCE, settled_from=np.nan)
-        if one.means is not None and one.step.amplitude <= _QUIET * largest
-        else one
-        for one in measured
+        fitted._replace(status=StepStatus.NO_FORCE, settled_from=np.nan)
+        if fitted.means is not None and fitted.step.amplitude <= _QUIET * largest
+        else fitted
+        for fitted in measured
     ]
 
 
@@ -359,8 +349,8 @@ def _result(
     orders: tuple[int, ...],
     level: Levels | int,
 ) -> SteppedSineStates:
-    status = np.array([int(one.status) for one in measured])
-    good = [one for one in measured if one.status is StepStatus.SETTLED]
+    status = np.array([int(fitted.status) for fitted in measured])
+    good = [fitted for fitted in measured if fitted.status is StepStatus.SETTLED]
     if not good:
         reasons = "; ".join(
             f"{np.sum(status == int(kind))} because {kind.message}"
@@ -378,14 +368,16 @@ def _result(
     rate, begin = recording.sampling_rate, recording.start_time
     return SteppedSineStates(
         states,
-        begin + np.array([one.step.start for one in measured]) / rate,
-        begin + np.array([one.step.stop for one in measured]) / rate,
-        np.array([one.settled_from for one in measured]),
-        np.array([one.step.frequency for one in measured]),
-        np.array([one.step.amplitude for one in measured]),
-        np.array([one.decay_time for one in measured]),
-        np.array([one.moved for one in measured]),
-        np.array([np.nan if one.means is None else one.means.colour.max() for one in measured]),
+        begin + np.array([fitted.step.start for fitted in measured]) / rate,
+        begin + np.array([fitted.step.stop for fitted in measured]) / rate,
+        np.array([fitted.settled_from for fitted in measured]),
+        np.array([fitted.step.frequency for fitted in measured]),
+        np.array([fitted.step.amplitude for fitted in measured]),
+        np.array([fitted.decay_time for fitted in measured]),
+        np.array([fitted.moved for fitted in measured]),
+        np.array(
+            [np.nan if fitted.means is None else fitted.means.colour.max() for fitted in measured]
+        ),
         number,
         status,
         states.notes,
@@ -394,21 +386,21 @@ def _result(
 
 def _table(good: list[_Measured]) -> PhasorTable:
     """Phasors of the settled steps; what may be left of a transient is added to the errors."""
-    means = [one.means for one in good if one.means is not None]
-    left = np.array([one.left for one in good])
-    first = np.array([np.abs(one.phasors[:, 0]) for one in means])
-    amplitude_std = np.hypot([one.amplitude_std for one in means], left)
-    phase_std = np.hypot([one.phase_std for one in means], (left / first)[:, :])
-    drive = np.array([one.drive for one in good])
+    means = [fitted.means for fitted in good if fitted.means is not None]
+    left = np.array([fitted.left for fitted in good])
+    first = np.array([np.abs(fitted.phasors[:, 0]) for fitted in means])
+    amplitude_std = np.hypot([fitted.amplitude_std for fitted in means], left)
+    phase_std = np.hypot([fitted.phase_std for fitted in means], (left / first)[:, :])
+    drive = np.array([fitted.drive for fitted in good])
     return PhasorTable(
-        np.array([one.middle for one in good]),
-        np.array([one.step.frequency for one in good]),
+        np.array([fitted.middle for fitted in good]),
+        np.array([fitted.step.frequency for fitted in good]),
         first[:, 0],
         amplitude_std[:, 0],
-        np.array([one.phasors[1:] for one in means]),
-        np.array([one.mean[1:] for one in means]),
+        np.array([fitted.phasors[1:] for fitted in means]),
+        np.array([fitted.mean[1:] for fitted in means]),
         amplitude_std[:, 1:],
         phase_std[:, 1:],
-        np.array([one.harmonic_std[1:] for one in means]),
+        np.array([fitted.harmonic_std[1:] for fitted in means]),
         drive if np.isfinite(drive).all() else None,
     )

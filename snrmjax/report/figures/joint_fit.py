@@ -219,19 +219,25 @@ def next_measurements_figure(
     """
     if not responses:
         raise ValueError("there is no response to show: `responses` is empty.")
-    forces = sorted({one.force for one in responses})
-    largest = max(float(np.max(np.abs(one.velocity))) for one in responses)
+    forces = sorted({response.force for response in responses})
+    largest = max(float(np.max(np.abs(response.velocity))) for response in responses)
     unit = unit_for(largest, "m/s")
     figure, speeds, phases = amplitude_and_phase(PAGE, 5.0, sensor, unit)
     resonant = np.concatenate(
-        [one.velocity[[np.argmax(np.abs(one.velocity))]] for one in responses]
+        [response.velocity[[np.argmax(np.abs(response.velocity))]] for response in responses]
     )
     sign = 1.0 if np.sum(resonant.real) >= 0 else -1.0
-    drives = {one.force: one.drive for one in measurements if one.drive is not None}
+    drives = {
+        measurement.force: measurement.drive
+        for measurement in measurements
+        if measurement.drive is not None
+    }
     for curve in responses:
         colour = SERIES[forces.index(curve.force) % len(SERIES)]
         size = np.abs(curve.velocity)
-        mine = [one.velocity for one in measurements if one.force == curve.force]
+        mine = [
+            measurement.velocity for measurement in measurements if measurement.force == curve.force
+        ]
         near = size >= min([0.25 * size.max(), *(0.8 * v for v in mine)])
         drive = drives.get(curve.force)
         name = with_unit(curve.force, "N") if drive is None else with_unit(drive, "V")
@@ -240,10 +246,15 @@ def next_measurements_figure(
         for axes, y in ((speeds, size[near] / unit.size), (phases, turn)):
             pieces = (curve.stable[near], name, colour, LINE, curve.continued[near])
             response_line(axes, x, y, *pieces)
-    for one in measurements:
-        marks(speeds, one.frequency / HERTZ, one.velocity / unit.size, {**HOLLOW, "clip_on": True})
-        turn = np.angle(sign * np.exp(1j * one.phase)) / DEGREE
-        marks(phases, one.frequency / HERTZ, turn, HOLLOW)
+    for measurement in measurements:
+        marks(
+            speeds,
+            measurement.frequency / HERTZ,
+            measurement.velocity / unit.size,
+            {**HOLLOW, "clip_on": True},
+        )
+        turn = np.angle(sign * np.exp(1j * measurement.phase)) / DEGREE
+        marks(phases, measurement.frequency / HERTZ, turn, HOLLOW)
     for ranks, first in _together(measurements):
         at = (first.frequency / HERTZ, first.velocity / unit.size)
         text = ", ".join(map(str, ranks))
@@ -263,12 +274,12 @@ def next_measurements_figure(
 def _together(measurements: Sequence[NextMeasurement]) -> list[tuple[list[int], NextMeasurement]]:
     """Ranks whose marks would hide one another, with the first of them."""
     groups: list[tuple[list[int], NextMeasurement]] = []
-    for one in measurements:
+    for measurement in measurements:
         for ranks, first in groups:
-            near = abs(one.frequency / first.frequency - 1) < 0.005
-            if near and abs(one.velocity / first.velocity - 1) < 0.03:
-                ranks.append(one.rank)
+            near = abs(measurement.frequency / first.frequency - 1) < 0.005
+            if near and abs(measurement.velocity / first.velocity - 1) < 0.03:
+                ranks.append(measurement.rank)
                 break
         else:
-            groups.append(([one.rank], one))
+            groups.append(([measurement.rank], measurement))
     return groups

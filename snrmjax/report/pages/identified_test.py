@@ -48,12 +48,12 @@ def headline(found: IdentifiedTest) -> list[str]:
         for k in (0, -1)
     ]
     lines = [f"backbone: {ends[0]} to {ends[1]}"]
-    for one in found.predictions:
-        for each in one.resonances:
+    for prediction in found.predictions:
+        for each in prediction.resonances:
             place = f"{each.frequency / HERTZ:.5g} Hz, {each.velocity:.3g} m/s"
             damped = f"{100 * each.damping_ratio:.3g} % of critical damping"
-            lines.append(f"resonance at {one.load}: {place}, {damped}")
-        lines.append(f"resonance at {one.load} {where_in_words(one.further)}")
+            lines.append(f"resonance at {prediction.load}: {place}, {damped}")
+        lines.append(f"resonance at {prediction.load} {where_in_words(prediction.further)}")
     for advised in found.advice or ():
         force, drive = advised.force, advised.drive
         load = f"force {force:.4g} N" if drive is None else f"drive {drive:.4g} V"
@@ -183,8 +183,10 @@ def write(
     added = (shown.column, shown.power)
     results.write_points(folder / "points.csv", found.identification, added=added)
     if found.predictions:
-        drives = [one.drive for one in found.predictions for _ in one.responses]
-        stds = [b.velocity_std for one in found.predictions for b in one.banded]
+        drives = [
+            prediction.drive for prediction in found.predictions for _ in prediction.responses
+        ]
+        stds = [b.velocity_std for prediction in found.predictions for b in prediction.banded]
         given = (folder / "prediction.csv", found.responses)
         results.write_prediction(*given, drives=drives, velocity_stds=stds)
     summary: dict[str, object] = {"program": "snrmjax", "version": version("snrmjax"), **done}
@@ -192,19 +194,20 @@ def write(
         results.write_backbone(folder / "backbone.csv", found.identification, added=added)
     else:
         _write_fit(folder, found.joint, added)
-        banded = [response for one in found.predictions for response in one.banded]
+        banded = [response for prediction in found.predictions for response in prediction.banded]
         details = found.joint
         summary["joint_fit"] = joint_results.summarise_fit(details.fit, banded, details.shares)
     summary |= results.summarise(found.identification, found.values)
     summary["resonances"] = [
-        results.summarise_resonance(each) | ({} if one.drive is None else {"drive_v": one.drive})
-        for one in found.predictions
-        for each in one.resonances
+        results.summarise_resonance(each)
+        | ({} if prediction.drive is None else {"drive_v": prediction.drive})
+        for prediction in found.predictions
+        for each in prediction.resonances
     ]
     summary["resonance_distributions"] = [
-        results.summarise_distribution(one.further)
-        | ({} if one.drive is None else {"drive_v": one.drive})
-        for one in found.predictions
+        results.summarise_distribution(prediction.further)
+        | ({} if prediction.drive is None else {"drive_v": prediction.drive})
+        for prediction in found.predictions
     ]
     summary["notes"] = [str(note) for note in found.notes]
     write_summary(folder / "summary.json", summary)

@@ -1,6 +1,6 @@
 """What measured states and records have to tell."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 
 from snrmjax.report.sentences import Wording, number_of
 
@@ -68,10 +68,9 @@ _LEVELS_BY = {
 }
 
 
-def _steps_used(used: int, left_out: Mapping[str, int] | Iterable[tuple[str, int]]) -> str:
-    counts = dict(left_out)
-    reasons = ", ".join(f"{count} {reason}" for reason, count in counts.items() if count)
-    steps = f"{used} of {used + sum(counts.values())} steps used"
+def _steps_used(used: int, left_out: Iterable[tuple[str, int]]) -> str:
+    reasons = ", ".join(f"{count} {reason}" for reason, count in left_out)
+    steps = f"{used} of {used + sum(count for _, count in left_out)} steps used"
     return f"{steps}; left out: {reasons}" if reasons else steps
 
 

@@ -29,7 +29,7 @@ def _some(words: Sequence[str]) -> str:
 
 
 def _outputs(outputs: Sequence[tuple[str, float | None]]) -> str:
-    return _some([readable(*one) for one in outputs])
+    return _some([readable(*output) for output in outputs])
 
 
 def _missing(outputs: Sequence[tuple[str, float | None, int, int]]) -> str:
