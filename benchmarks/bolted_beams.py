@@ -24,10 +24,8 @@ pointwise curve are judged there: shares inside 95 % bands, bias over their half
 that neither holds, with and without a warning. One JSON line for every kind.
 """
 
-import argparse
 import csv
 import itertools
-import json
 import tempfile
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
@@ -36,6 +34,9 @@ from typing import NamedTuple
 
 import numpy as np
 import slip_integration as si
+from harness import options, teller
+
+tell = teller(__file__)
 
 KINDS = ("slip", "drift", "dropout", "all")
 SLIDERS, STATES = 30, 25
@@ -43,8 +44,8 @@ SCALE = 1e-4  # m, of the sliders' limits
 SETTLED = 300  # cycles a step
 TIMES = 1.96  # standard deviations of a 95 % band
 WAYS = ("joint", "pointwise")
-WARNINGS = ("systematic error", "levels differ", "modal mass", "not converged", "cannot be told")
-"""What a note has that says that bands may be wrong; noise that is not stated is no warning."""
+WARNINGS = {"residuals_correlated", "levels_differ", "modal_mass_moved", "fit_not_converged"}
+"""Kinds of notes that say that bands may be wrong; noise that is not stated is no warning."""
 
 
 class Test(NamedTuple):
@@ -183,10 +184,7 @@ def integrated_job(job: tuple[list[tuple[str, int]], Path]) -> None:
 
 def judged(job: tuple[Path, str]) -> dict[str, object]:
     """Errors over 1σ at every true resonance, by both ways, and what the fits warn of."""
-    # The integration needs none of it.
-    from discrepancy_coverage import scores
-
-    import snrmjax as sj
+    import snrmjax as sj  # the integration needs none of it
 
     folder, name = job
     model = sj.read_model(folder / f"{name}.toml")
@@ -199,11 +197,41 @@ def judged(job: tuple[Path, str]) -> dict[str, object]:
     return {
         **errors,
         "bands": bands,
-        "notes": {"joint": fit.notes, "pointwise": points.notes},
+        "notes": {
+            way: [note.kind for note in found.notes]
+            for way, found in zip(WAYS, (fit, points), strict=True)
+        },
         "families": [fit.unknowns.squared_frequency.label, fit.unknowns.modal_damping.label],
         "converged": fit.converged,
         "missed": len(_last_column(folder / f"{name}.truth")) - len(rows),
     }
+
+
+def scores(
+    fit: object,
+    points: object,
+    speed: np.ndarray,
+    natural: np.ndarray,
+    ratio: np.ndarray,
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Errors over 1σ of frequency and damping by both ways at true phase resonances, and their 1σ.
+
+    Arguments: `speed` in m/s, `natural` in rad/s and the damping `ratio` of the truths, relative to
+    the model's modal mass. The 1σ are relative to the truth. Rows: frequency, damping.
+    """
+    import snrmjax as sj
+
+    joint = sj.identify.fitted_values(fit, speed)
+    # Damping of both is relative to the modal mass that a fit found: compared by its force.
+    found = float(fit.problem.modal_mass_of(fit.unknowns) * abs(fit.problem.modal_constant))
+    curve = points.backbone.values(speed / natural)
+    errors, bands = {}, {}
+    for way, values in (("joint", joint), ("pointwise", curve)):
+        std = np.array([values.natural_frequency_std, found * values.damping_ratio_std])
+        given = np.array([values.natural_frequency, found * values.damping_ratio])
+        errors[way] = (given - [natural, ratio]) / std
+        bands[way] = std / [natural, ratio]
+    return errors, bands
 
 
 def _last_column(path: Path) -> list[str]:
@@ -236,20 +264,12 @@ def summary(mine: list[dict]) -> dict[str, object]:
 
 def warned(row: dict) -> dict[str, bool]:
     """Whether a way warned."""
-    return {
-        way: any(word in note for note in row["notes"][way] for word in WARNINGS) for way in WAYS
-    }
+    return {way: not WARNINGS.isdisjoint(row["notes"][way]) for way in WAYS}
 
 
 def main() -> None:
     """Integrate the beams, identify them and print one line for every kind."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--beams", type=int, default=40)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--unsettled", action="store_true", help="steps too short to settle")
-    parser.add_argument("--out", type=Path, help="keep the tables, models and truths here")
-    chosen = parser.parse_args()
+    chosen = options(__doc__, beams=40, seed=0, workers=2, unsettled=False, out=Path)
     kinds = ("unsettled",) if chosen.unsettled else KINDS
     named = [(kinds[k % len(kinds)], chosen.seed + k) for k in range(chosen.beams)]
     with (
@@ -263,10 +283,7 @@ def main() -> None:
         rows = list(pool.map(judged, [(folder, f"{kind}_{seed}") for kind, seed in named]))
     for kind in (*kinds, "every kind"):
         mine = [r for (own, _), r in zip(named, rows, strict=True) if kind in (own, "every kind")]
-        print(json.dumps({"benchmark": "bolted_beams", "kind": kind, **summary(mine)}), flush=True)
-    if chosen.out:
-        told = [{"name": f"{k}_{s}", **row} for (k, s), row in zip(named, rows, strict=True)]
-        (chosen.out / "rows.json").write_text(json.dumps(told, default=np.ndarray.tolist))
+        tell(kind=kind, **summary(mine))
 
 
 if __name__ == "__main__":

@@ -1,12 +1,11 @@
 """Each method against its own source: data, claims or formulas that its authors published.
 
-Run: python benchmarks/methods_sources.py [--pff FOLDER] [--pyvib FOLDER] [--nltest FOLDER]
+Run: python benchmarks/methods_sources.py [--pff FOLDER] [--nltest FOLDER]
          [--only METHOD ...]
 
-The folders are copies of github.com/JustinPorter88/pff-analysis, github.com/pawsen/pyvib and
-github.com/maltekrack/NLtest, whose programs and data are used where they lie (they are not part of
-this project); NLtest needs Octave. pyvib takes some minutes. One JSON line a method, `kind`
-says what it was held against:
+The folders are copies of github.com/JustinPorter88/pff-analysis and github.com/maltekrack/NLtest,
+whose programs and data are used where they lie (they are not part of this project); NLtest needs
+Octave. One JSON line a method, `kind` says what it was held against:
 
 - own_result: the authors' own numbers for the authors' own record (their Python program, run
   beside, and the stored result of their MATLAB program, which are also held against each other);
@@ -25,31 +24,37 @@ in itself; the response-controlled tests of the Tribomechadynamics challenge tha
 (40 GB, not in its repository).
 """
 
-import argparse
 import importlib.util
-import json
 import shutil
 import subprocess
 import tempfile
 from pathlib import Path
 
-import methods_state_space
 import numpy as np
 from contourpy import contour_generator
+from harness import options, teller
 from scipy.integrate import solve_ivp
 from scipy.linalg import eigh
 
 import snrmjax as sj
 from snrmjax.methods.one_sensor import sensor_states
+from snrmjax.methods.steady.arslan_ozguven import describing_function
+
+tell = teller(__file__)
+
+METHODS = (
+    *("resonant_decay", "pll", "cbc", "rct", "harmonic_force_surface"),
+    *("concerto", "arslan_ozguven"),
+)
+
+
+def said(method: str, kind: str, source: str, **numbers: object) -> None:
+    """One line."""
+    tell(method=method, kind=kind, source=source, **numbers)
+
 
 HERTZ = 2 * np.pi
 REST, RATIO, MASS, CUBIC = 40 * HERTZ, 0.01, 0.8, 3e9  # cubic per modal mass, 1/(m² s²)
-
-
-def tell(method: str, kind: str, source: str, **numbers) -> None:
-    """One line."""
-    line = {"benchmark": "methods_sources", "method": method, "kind": kind, "source": source}
-    print(json.dumps({**line, **numbers}), flush=True)
 
 
 def duffing() -> sj.model.Structure:
@@ -64,7 +69,7 @@ def resonant_decay(folder: Path | None) -> None:
     """The authors' record of a bolted beam, band of their settings, against their result."""
     source = "Jin et al., J. Vib. Acoust. 142 (2020) 051111, doi:10.1115/1.4047416"
     if folder is None:
-        tell("resonant_decay", "own_result", source, not_run="--pff FOLDER is missing")
+        said("resonant_decay", "own_result", source, not_run="--pff FOLDER is missing")
         return
     from scipy.io import loadmat
 
@@ -103,7 +108,7 @@ def resonant_decay(folder: Path | None) -> None:
                 off = np.abs(answer[k][inside] / expected - 1)
                 numbers[f"{quantity}_from_{other}_median"] = float(np.median(off))
                 numbers[f"{quantity}_from_{other}_90"] = float(np.percentile(off, 90))
-        tell("resonant_decay", "own_result", source, reading=name, **numbers)
+        said("resonant_decay", "own_result", source, reading=name, **numbers)
 
 
 def _answer(result) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -119,14 +124,14 @@ def _answer(result) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def phase_locked_loop() -> None:
     """A clamped beam, 20 % up from its linear frequency with gains of the linear regime."""
     model = sj.model.flat_beam()
-    shaker = sj.methods.Shaker(3.0, 0.005, mass=1e-7, damping=1e-7, stiffness=1e-3)
-    laboratory = sj.methods.Laboratory(
-        model, shaker, sj.methods.Instruments(velocity_noise=1e-4), 10000.0, substeps=4
+    shaker = sj.simulate.Shaker(3.0, 0.005, mass=1e-7, damping=1e-7, stiffness=1e-3)
+    laboratory = sj.simulate.Laboratory(
+        model, shaker, sj.simulate.Instruments(velocity_noise=1e-4), 10000.0, substeps=4
     )
     voltages = np.linspace(0.5, 8.5, 15)
     found = sj.methods.phase_locked_loop(
         *(laboratory, voltages),
-        gains=sj.methods.LoopGains(100.0, 40.0),
+        gains=sj.simulate.LoopGains(100.0, 40.0),
         settle_cycles=70,
         record_cycles=30,
     )
@@ -136,7 +141,7 @@ def phase_locked_loop() -> None:
     good = found.found
     true = np.interp(found.velocity[good], speed[order], truth.frequency[order])
     omega = np.asarray(found.natural_frequency)[good]
-    tell(
+    said(
         *("pll", "own_claim"),
         "Hippold et al., Mech. Syst. Signal Process. 220 (2024) 111670, arXiv:2403.06639: fixed "
         "gains of the linear regime, a shift of 20 %, about 100 periods a point",
@@ -152,12 +157,12 @@ def continuation() -> None:
     """x'' + 0.1 x' + x + 0.04 x³ = cos ωt, tracked through its unstable branch."""
     modes = sj.model.linear_modes([1.0], [0.05], [[1.0]], [1.0])
     model = sj.model.structure(modes, sj.model.polynomial_potential({"1111": 0.01}, 1))
-    shaker = sj.methods.Shaker(1.0, 1e-3)
-    laboratory = sj.methods.Laboratory(model, shaker, sj.methods.Instruments(), 40.0)
-    settings = sj.methods.FeedbackSettings(1500.0)
+    shaker = sj.simulate.Shaker(1.0, 1e-3)
+    laboratory = sj.simulate.Laboratory(model, shaker, sj.simulate.Instruments(), 40.0)
+    settings = sj.simulate.FeedbackSettings(1500.0)
     errors, exact, falling = [], [], 0
     for omega in (1.3, 1.5, 1.7):
-        curve = sj.methods.s_curve(laboratory, omega, omega * np.linspace(0.5, 7.5, 15), settings)
+        curve = sj.simulate.s_curve(laboratory, omega, omega * np.linspace(0.5, 7.5, 15), settings)
         held = np.isfinite(curve.force)
         size = curve.velocity[held] / omega
         needed = size * np.hypot(1 + 0.03 * size**2 - omega**2, 0.1 * omega)
@@ -167,7 +172,7 @@ def continuation() -> None:
             law = sj.simulate.response_controlled(model, speed, 0.9 * omega, 1.1 * omega)
             true = np.interp(omega, law.frequency, np.abs(law.force))
             exact.append(abs(force - true) / needed.max())
-    tell(
+    said(
         *("cbc", "public_example"),
         "a public script of control-based continuation: forced Duffing equation with α = γ = 1, "
         "β = 0.04, δ = 0.1 and its one-term amplitudes; method of Sieber & Krauskopf 2008",
@@ -181,17 +186,17 @@ def continuation() -> None:
 
 def held_displacements(model, sizes, frequencies=None):
     """Response-controlled stepped sines in the laboratory, one level a displacement."""
-    shaker = sj.methods.Shaker(30.0, 8.0, mass=0.05, damping=1.0, stiffness=500.0)
-    laboratory = sj.methods.Laboratory(model, shaker, sj.methods.Instruments(), 4000.0)
+    shaker = sj.simulate.Shaker(30.0, 8.0, mass=0.05, damping=1.0, stiffness=500.0)
+    laboratory = sj.simulate.Laboratory(model, shaker, sj.simulate.Instruments(), 4000.0)
     tables = []
     for level, size in enumerate(sizes, 1):
         middle = np.sqrt(REST**2 + 0.75 * CUBIC * size**2)
-        test = sj.methods.stepped_sine_test(
+        test = sj.simulate.stepped_sine_test(
             *(laboratory, size),
             middle * np.linspace(0.975, 1.025, 13) if frequencies is None else frequencies,
             held="displacement",
         )
-        tables.append(sj.methods.steady_states_of(laboratory, test, level=level))
+        tables.append(sj.simulate.steady_states_of(laboratory, test, level=level))
     return sj.measure.join_steady_states(tables)
 
 
@@ -205,7 +210,7 @@ def response_controlled(nltest: Path | None) -> None:
     true = np.sqrt(REST**2 + 0.75 * CUBIC * size**2)
     ratios = np.array([_circle(data, level) for level in np.asarray(found.level)[good]])
     ours = np.asarray(found.damping_ratio)[good]
-    tell(
+    said(
         *("rct", "own_formula"),
         "Karaağaçlı & Özgüven, Vibration 3 (2020) 266, doi:10.3390/vibration3030019; circle fit of "
         "Maia & Silva (1997), which NLtest uses for such tests, written out here",
@@ -221,14 +226,14 @@ def response_controlled(nltest: Path | None) -> None:
     octave = shutil.which("octave-cli") or shutil.which("octave")
     if nltest is None or octave is None:
         why = "--nltest FOLDER is missing" if nltest is None else "Octave is not installed"
-        tell("rct", "independent_program", source, not_run=why)
+        said("rct", "independent_program", source, not_run=why)
         return
     theirs = np.array(
         [_their_circle(octave, nltest, data, level) for level in np.asarray(found.level)[good]]
     )
     # Theirs answers with the frequency of the state next to resonance: to the test's step at best.
     middle = theirs[:, 0] * HERTZ
-    tell(
+    said(
         *("rct", "independent_program", source),
         levels=len(theirs),
         step_of_frequency=float(np.ptp(np.asarray(data.frequency)[:13]) / 12 / REST),
@@ -267,11 +272,11 @@ def _their_circle(octave: str, folder: Path, data, level: int) -> tuple[float, f
             f"addpath('{folder / 'SRC'}'); t = load('states.txt');"
             "[f, d, s] = circleFit(t(:, 1), t(:, 2) + 1i * t(:, 3)); printf('%.17g\\n', f, d, s);"
         )
-        said = subprocess.run(
+        answer = subprocess.run(
             *([octave, "--no-gui", "--quiet", "--eval", script],),
             **{"cwd": place, "capture_output": True, "text": True, "check": True},
         )
-    frequency, ratio, scatter = (float(one) for one in said.stdout.split())
+    frequency, ratio, scatter = (float(one) for one in answer.stdout.split())
     return frequency, ratio, scatter
 
 
@@ -293,7 +298,7 @@ def harmonic_force_surface() -> None:
         nearest = int(np.argmin(np.abs(each - one)))
         distance.append(abs(each[nearest] - one) / height.max())
         unstable += bool(exact.is_unstable[k[nearest]])
-    tell(
+    said(
         *("harmonic_force_surface", "physics_only"),
         "Karaağaçlı & Özgüven, Vibration 3 (2020) 266: unstable branches are ordinary points of "
         "the surface (no table of their structures was found)",
@@ -307,7 +312,7 @@ def harmonic_force_surface() -> None:
     drawn = contour_generator(surface.frequency, surface.amplitude, np.abs(surface.force))
     lines = [one / unit for one in drawn.lines(force)]
     apart = [min(_distance(at, line) for line in lines) for at in np.stack([omega, cut], 1) / unit]
-    tell(
+    said(
         *("harmonic_force_surface", "independent_program"),
         "ContourPy: contour lines of the sizes of the forces, on the same levels; distances in "
         "half-power widths and peak heights",
@@ -383,7 +388,7 @@ def concerto() -> None:
     theirs = np.array(theirs)
     true = np.sqrt(REST**2 + 0.75 * CUBIC * size**2)
     ours = np.asarray(found.natural_frequency)[good], np.asarray(found.damping_ratio)[good]
-    tell(
+    said(
         *("concerto", "own_formula"),
         "Carrella & Ewins, Mech. Syst. Signal Process. 25 (2011) 1011, "
         "doi:10.1016/j.ymssp.2010.09.011: their real formulas, written out here (their example's "
@@ -422,7 +427,7 @@ def spring_in_a_chain() -> None:
     data = sj.measure.steady_states(
         *(level, omega, force, 1j * omega[:, None] * motion), sensors=names
     )
-    v = sj.methods.describing_function(sensor_states(data, modes, "arslan_ozguven"), modes)
+    v = describing_function(sensor_states(data, modes), modes)
     theirs, elsewhere, mode = [], [], []
     end = np.eye(count)[tip]
     for at, push, moved in zip(omega, force, motion, strict=True):
@@ -440,7 +445,7 @@ def spring_in_a_chain() -> None:
     ours = np.stack([result.natural_frequency, result.damping_ratio], axis=1)
     apart = np.abs(ours / mode - 1).max(axis=0)
     fitted = [float(np.sum(one.real * size**2) / np.sum(0.75 * size**4)) for one in (v, theirs)]
-    tell(
+    said(
         *("arslan_ozguven", "own_formula"),
         "Arslan, Aykan & Özgüven, Mech. Syst. Signal Process. 25 (2011) 1112, "
         "doi:10.1016/j.ymssp.2010.10.010: nonlinearity matrix and describing function, written out "
@@ -476,24 +481,10 @@ def _steady_motion(stiffness, damping, mass, cubic, force, omega) -> np.ndarray:
     return np.fft.fft(found.y[:count], axis=1)[:, 1] / 32
 
 
-def state_space(folder: Path | None) -> None:
-    """The same multisine records by two programs."""
-    source = (
-        "pyvib (github.com/pawsen/pyvib), after the authors' PNLSS toolbox; method of Paduart et "
-        "al., Automatica 46 (2010) 647, doi:10.1016/j.automatica.2010.01.001"
-    )
-    if folder is None:
-        tell("pnlss", "independent_program", source, not_run="--pyvib FOLDER is missing")
-        return
-    for numbers in methods_state_space.compared(folder):
-        tell("pnlss", "independent_program", source, **numbers)
-
-
 def main() -> None:
     """All methods in turn."""
-    parser = argparse.ArgumentParser()
-    for name in ("--pff", "--pyvib", "--nltest"):
-        parser.add_argument(name, type=lambda given: Path(given).resolve())
+    folders = dict.fromkeys(("pff", "nltest"), Path)
+    given = options(__doc__, only=METHODS, **folders)
     runs = {
         "resonant_decay": lambda: resonant_decay(given.pff),
         "pll": phase_locked_loop,
@@ -502,10 +493,7 @@ def main() -> None:
         "harmonic_force_surface": harmonic_force_surface,
         "concerto": concerto,
         "arslan_ozguven": spring_in_a_chain,
-        "pnlss": lambda: state_space(given.pyvib),
     }
-    parser.add_argument("--only", nargs="*", choices=list(runs), default=list(runs))
-    given = parser.parse_args()
     for name in given.only:
         runs[name]()
 

@@ -13,15 +13,16 @@ mean in standard deviations, its standard deviation, the ends of its 95 % range 
 second order predicts it. One JSON line each.
 """
 
-import argparse
-import json
 import time
 from typing import NamedTuple
 
 import numpy as np
+from harness import options, teller
 
 import snrmjax as sj
-from snrmjax.study.uncertainty.moments import STATISTICS
+from snrmjax.study.uncertainty.propagation import STATISTICS
+
+tell = teller(__file__)
 
 HERTZ = 2 * np.pi
 SCALES = {"small": 0.5, "large": 5.0}
@@ -46,22 +47,6 @@ CASES = {
 }
 
 
-def tell(**fields: object) -> None:
-    """One JSON line with numbers of five digits."""
-
-    def short(value: object) -> object:
-        if isinstance(value, float):
-            return float(f"{value:.5g}") if np.isfinite(value) else str(value)
-        if isinstance(value, list):
-            return [short(one) for one in value]
-        if isinstance(value, dict):
-            return {name: short(one) for name, one in value.items()}
-        return value
-
-    rounded = {name: short(value) for name, value in fields.items()}
-    print(json.dumps({"benchmark": "uncertainty_propagation", **rounded}), flush=True)
-
-
 def varied_of(case: Case, scale: float) -> tuple:
     """What is uncertain, with its scatter times a scale."""
     own = sj.model.parameters.parameter_values(case.model)
@@ -75,7 +60,7 @@ def varied_of(case: Case, scale: float) -> tuple:
     }
     numbers["force_n"] = case.force, scale * 0.01 * case.force
     return tuple(
-        (sj.study.lognormal if name.endswith("damping_ratio") else sj.study.normal)(name, *number)
+        (sj.study.LogNormal if name.endswith("damping_ratio") else sj.study.Normal)(name, *number)
         for name, number in numbers.items()
     )
 
@@ -101,7 +86,7 @@ def propagated(name: str, case: Case, members: int) -> None:
         middle = time.perf_counter()
         sampling = sj.study.Sampling("sobol", members)
         study = study_of(case, varied, sampling)
-        rows = sj.study.planned(study).rows(range(members))
+        rows = study.ensemble().rows(range(members))
         end = time.perf_counter()
         for q, quantity in enumerate(found.quantities.names):
             by = dict(zip(("first order", "second order"), found.statistics[:, :, q], strict=True))
@@ -127,17 +112,14 @@ def propagated(name: str, case: Case, members: int) -> None:
             other_number_of_folds=f"{int(np.sum(rows['n_folds'] != folds))} of {members}",
             derivative_seconds=middle - begin,
             members_seconds=end - middle,
-            notes=list(found.notes),
+            notes=[str(note) for note in found.notes],
         )
 
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--members", type=int, default=2048, help="of each study")
-    parser.add_argument("--case", choices=CASES, action="append", help="all by default")
-    asked = parser.parse_args()
-    for name in asked.case or CASES:
+    asked = options(__doc__, members=2048, case=list(CASES))
+    for name in asked.case:
         propagated(name, CASES[name], asked.members)
 
 

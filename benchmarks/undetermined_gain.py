@@ -13,18 +13,20 @@ the largest velocity measured, and natural frequencies within three of their sta
 0.2 % (what this benchmark is not about).
 """
 
-import argparse
-import json
 import time
 from collections import Counter
 from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+from harness import options, teller
 from scipy.optimize import brentq
 
 import snrmjax as sj
 from snrmjax.identify.inference.fitted_curves import values_to_the_largest
+from snrmjax.numerics.facts import Fact
+
+tell = teller(__file__)
 
 HERTZ = 2 * np.pi
 NOISE = {"amplitude": 0.004, "phase": np.radians(0.3), "force": 0.001}
@@ -178,11 +180,16 @@ class Outcome(NamedTuple):
     words: str = ""
 
 
-def about_gain(sentences: tuple[str, ...]) -> str:
-    """The sentence that says that the gain is not known, if any does."""
-    words = ("cannot be determined", "cannot determine", "hardly determine", "not determined")
-    found = (s for s in sentences if "gain" in s and any(word in s for word in words))
-    return next(found, "")
+OF_GAIN = {
+    *("force_gain_undetermined", "force_gain_near_resonance", "force_gain_in_answer"),
+    *("force_gain_far", "force_gain_moved", "level_errors_at_limit"),
+}
+"""Kinds of notes that say that the gain is not known."""
+
+
+def about_gain(notes: tuple[Fact, ...]) -> str:
+    """The note that says that the gain is not known, if any does."""
+    return next((str(note) for note in notes if note.kind in OF_GAIN), "")
 
 
 def largest_velocity(data: sj.measure.SteadyStates) -> float:
@@ -242,13 +249,8 @@ def one_test(verb: str, plant: Plant, plan: Plan, seed: int) -> Outcome:
 
 def main() -> None:
     """All structures under all plans."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--verb", choices=[*VERBS], action="append")
-    parser.add_argument("--only", default="")
-    parser.add_argument("--each", action="store_true")
-    chosen = parser.parse_args()
-    for verb in chosen.verb or VERBS:
+    chosen = options(__doc__, seed=0, verb=list(VERBS), only="", each=False)
+    for verb in chosen.verb:
         counts: Counter[str] = Counter()
         seconds, wrong = [], []
         for number, (name, plant) in enumerate(PLANTS.items()):
@@ -261,15 +263,11 @@ def main() -> None:
                 seconds.append(found.seconds)
                 wrong += [label] if found.kind == "silent_and_wrong" else []
                 if chosen.each:
-                    numbers = {
-                        k: (round(v, 4) if isinstance(v, float) else v)
-                        for k, v in found._asdict().items()
-                    }
-                    print(json.dumps({"test": label, **numbers}), flush=True)
-        line = {"benchmark": "undetermined_gain", "verb": verb, "tests": sum(counts.values())}
+                    tell(test=label, **found._asdict())
+        line = {"verb": verb, "tests": sum(counts.values())}
         names = ("refused", "bounded", "said", "silent_and_right", "silent_and_wrong")
         line |= {key: counts[key] for key in (*names, "refused_otherwise")}
-        print(json.dumps({**line, "seconds": round(float(np.median(seconds)), 2), "wrong": wrong}))
+        tell(**line, seconds=np.median(seconds), wrong=wrong)
 
 
 if __name__ == "__main__":

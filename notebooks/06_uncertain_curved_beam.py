@@ -42,7 +42,7 @@ import numpy as np
 import snrmjax as sj
 from snrmjax import plot
 from snrmjax.plot import style as drawing
-from snrmjax.report.study.main_effects import main_effect
+from snrmjax.study.uncertainty.sensitivity import main_effect
 
 HERTZ = 2 * np.pi
 FIGURES = Path(sys.argv[1]) if len(sys.argv) > 1 and sys.argv[0].endswith(".py") else None
@@ -142,13 +142,13 @@ study = sj.study.Study(
     nominal,
     sj.study.Peaks(
         sj.study.ResponseRange(*ENDS, harmonic_order=7, stability=False),
-        sj.study.OfForces(np.array([FORCE])),
+        [FORCE],
         grid_points=241,
     ),
     (
-        sj.study.normal("thickness_m", MEAN["thickness_m"], std["thickness_m"]),
-        sj.study.normal("rise_m", MEAN["rise_m"], std["rise_m"]),
-        sj.study.lognormal("damping_ratio", MEAN["damping_ratio"], std["damping_ratio"]),
+        sj.study.Normal("thickness_m", MEAN["thickness_m"], std["thickness_m"]),
+        sj.study.Normal("rise_m", MEAN["rise_m"], std["rise_m"]),
+        sj.study.LogNormal("damping_ratio", MEAN["damping_ratio"], std["damping_ratio"]),
     ),
     sj.study.Sampling("latin_hypercube", MEMBERS),
     model_of=beam_of,

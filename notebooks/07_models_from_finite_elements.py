@@ -79,7 +79,7 @@ headline["linear frequencies are the printed ones within 0.7 %"] = bool(worst < 
 
 # %%
 loads = fe.modal_loads(basis, 0.25 * 0.787e-3)
-condensed = fe.condense(basis, fe.static_cases(flat, basis, loads.force))
+condensed = fe.reduced_model(basis, fe.static_cases(flat, basis, loads.force))
 print(condensed)
 
 # %% [markdown]
@@ -148,7 +148,7 @@ rise = fe.rise_of_radius(0.3048, 11.43)
 curved = fe.Beam(0.3048, 0.0127, THICKNESS, rise=rise, young=204e9, density=7860.0, elements=40)
 arch = fe.beam_modes(curved, (1,))
 small = fe.modal_loads(arch, 0.05 * THICKNESS)
-arch_model = fe.condense(arch, fe.static_cases(curved, arch, small.force))
+arch_model = fe.reduced_model(arch, fe.static_cases(curved, arch, small.force))
 alpha, beta = np.asarray(arch_model.potential.coefficient) * np.array([3.0, 4.0])
 ALPHA, BETA = -3.4380e9, 6.2183e12  # Tab. 4; the positive direction there is inwards
 hertz = float(arch.frequency[0]) / HERTZ
@@ -251,7 +251,7 @@ else:
         modes = sj.io.calculix.modes_of_deck(deck, (1,), folder)
         single = fe.modal_loads(modes.basis, 0.25 * 0.787e-3)
         run = sj.io.calculix.run_static_cases(modes, single.force, folder)
-        by_calculix = fe.condense(modes.basis, run.cases, expand=False)
+        by_calculix = fe.reduced_model(modes.basis, run.cases, expand=False)
     there = 4 * float(by_calculix.potential.coefficient[1])
     print(f"{modes.basis.frequency[0] / HERTZ:.2f} Hz, β {there:.4g}, {there / first:.4f} of ours")
     print(f"{np.sum(run.seconds):.1f} s for {len(run.status)} load cases")

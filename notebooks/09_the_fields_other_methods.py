@@ -41,10 +41,10 @@ HERE = Path(sys.argv[0]).resolve() if FIGURES else Path.cwd()
 MEASURED = next(
     (up / "shared" / "data" for up in HERE.parents if (up / "shared/data").is_dir()), None
 )
-TABLE = next(
-    up / "benchmarks/results/methods_table.jsonl"
+BENCHMARKS = next(
+    up / "benchmarks"
     for up in (HERE, *HERE.parents)
-    if (up / "benchmarks/results/methods_table.jsonl").is_file()
+    if (up / "benchmarks/methods_table.jsonl").is_file()
 )
 OF_RECORDS = {
     "pll": "phase-locked loop",
@@ -171,34 +171,34 @@ headline |= {
 modes = sj.model.linear_modes([50 * HERTZ], [0.01], [[1.0]], [1.0])
 contact = sj.model.EFFECTS["one_sided_stop"](stiffness=2 * (50 * HERTZ) ** 2, gap=1e-4)
 stop = sj.model.structure(modes, effects=[contact])
-bench = sj.methods.Laboratory(
+bench = sj.simulate.Laboratory(
     stop,
-    sj.methods.Shaker(300.0, 8.0, mass=0.02, damping=0.2, stiffness=300.0),
-    sj.methods.Instruments(force_noise=1e-3, velocity_noise=1e-4),
+    sj.simulate.Shaker(300.0, 8.0, mass=0.02, damping=0.2, stiffness=300.0),
+    sj.simulate.Instruments(force_noise=1e-3, velocity_noise=1e-4),
     4000.0,
     substeps=4,
 )
 steps = HERTZ * np.linspace(49, 63, 29)
 sines = {}
 for way, at in (("up", steps), ("down", steps[::-1])):
-    swept = sj.methods.stepped_sine_test(bench, 30.0, at, settle_cycles=400)
-    states = sj.methods.steady_states_of(bench, swept)
+    swept = sj.simulate.stepped_sine_test(bench, 30.0, at, settle_cycles=400)
+    states = sj.simulate.steady_states_of(bench, swept)
     sines[way] = at / HERTZ, np.abs(np.asarray(states.velocity)[:, 0]), swept.seconds
 loop = sj.methods.phase_locked_loop(
     bench,
     np.array([6.0, 10.0, 15.0, 20.0, 25.0, 30.0, 40.0]),
-    gains=sj.methods.LoopGains(120.0, 16.0),
+    gains=sj.simulate.LoopGains(120.0, 16.0),
     settle_cycles=400,
 )
 phases = np.radians([55, 40, 25, 10, 0, -15, -30, -40, -50, -60, -70, -78])
-around = sj.methods.phase_sweep(
-    bench, 30.0, phases, gains=sj.methods.LoopGains(120.0, 16.0), settle_cycles=400
+around = sj.simulate.phase_sweep(
+    bench, 30.0, phases, gains=sj.simulate.LoopGains(120.0, 16.0), settle_cycles=400
 )
-curve = sj.methods.s_curve(
+curve = sj.simulate.s_curve(
     bench,
     56 * HERTZ,
     np.linspace(0.01, 0.12, 14),
-    sj.methods.FeedbackSettings(3000.0, filter_rate=200.0),
+    sj.simulate.FeedbackSettings(3000.0, filter_rate=200.0),
 )
 resonances = sj.simulate.phase_controlled(stop, 1.5)
 print(loop)
@@ -259,7 +259,7 @@ print(
 headline |= {
     "open loop: two answers at some frequency": bool(np.max(speed_up / speed_down) > 1.5),
     "phase-locked loop within 0.05 % of the exact resonances": bool(misses_loop.max() < 5e-4),
-    "every phase around the fold is held": all(status == 0 for status in around.status),
+    "every phase around the fold is held": bool(around.held.all()),
     "the S-curve's falling part is held": falling >= 1,
 }
 
@@ -278,14 +278,14 @@ duffing = sj.model.structure(
     sj.model.polynomial_potential({"1111": 2.5e8}, 1),
     effects=[sj.model.EFFECTS["quadratic_damping"](coefficient=10.0)],
 )
-bench = sj.methods.Laboratory(
+bench = sj.simulate.Laboratory(
     duffing,
-    sj.methods.Shaker(3.0, 15.0, mass=0.01, damping=0.1, stiffness=10.0),
-    sj.methods.Instruments(force_noise=2e-3, velocity_noise=2e-4, filter_corner_hz=1500.0),
+    sj.simulate.Shaker(3.0, 15.0, mass=0.01, damping=0.1, stiffness=10.0),
+    sj.simulate.Instruments(force_noise=2e-3, velocity_noise=2e-4, filter_corner_hz=1500.0),
     6000.0,
     substeps=2,
 )
-decay = sj.methods.decay_test(bench, 10.0, 4.0)
+decay = sj.simulate.decay_test(bench, 10.0, 4.0)
 time, velocity = np.asarray(decay.record.time), np.asarray(decay.record.velocity)
 least = 0.02  # m/s, above the noise
 read = {
@@ -301,8 +301,8 @@ read = {
 found = []
 for level, volts in enumerate((1.0, 2.5, 5.0, 10.0), start=1):
     at = HERTZ * np.linspace(47.5, 54.5, 15)
-    one = sj.methods.stepped_sine_test(bench, volts, at, settle_cycles=150)
-    found.append(sj.methods.steady_states_of(bench, one, level=level))
+    one = sj.simulate.stepped_sine_test(bench, volts, at, settle_cycles=150)
+    found.append(sj.simulate.steady_states_of(bench, one, level=level))
 states = sj.measure.join_steady_states(found)
 near = np.abs(np.angle(np.asarray(states.velocity)[:, 0], deg=True)) < 75
 read["stepped sine, inverse SNRM"] = sj.methods.snrm(states.select(near), modes)
@@ -395,7 +395,12 @@ else:
 # over all steps.
 
 # %%
-every = [json.loads(line) for line in TABLE.read_text(encoding="utf-8").splitlines()]
+lines = [
+    line
+    for name in ("methods_table", "methods_loops_and_decays")
+    for line in (BENCHMARKS / f"{name}.jsonl").read_text(encoding="utf-8").splitlines()
+]
+every = [json.loads(line) for line in lines]
 rows = [row for row in every if row["method"] in NAMES]
 structures = list(dict.fromkeys(row["structure"] for row in rows))
 figure, grid = drawing.panels(drawing.PAGE, 3.6, 1, 2)

@@ -20,7 +20,6 @@ from snrmjax.report.figures.joint_fit import (
     contributions_figure,
     fitted_curves_figure,
     next_measurements_figure,
-    profile_figure,
     residuals_figure,
 )
 from snrmjax.report.figures.modes import (
@@ -59,7 +58,6 @@ __all__ = [
     "motions_figure",
     "next_measurements_figure",
     "normal_mode_figure",
-    "profile_figure",
     "propagation_figure",
     "residuals_figure",
     "response_figure",

@@ -188,7 +188,7 @@ def test_simulate_and_nnm_write_what_the_contract_says(files, tmp_path):
 
 
 BAD_DATA = {
-    "missing column": (HEADER.replace("force_n,", ""), "force_n"),
+    "missing column": (HEADER.replace("force_n,", "") + "1,60.0,0.1,0.0\n", "force_n"),
     "text in a number": (HEADER + "1,64,abc,0.01,0\n", "abc"),
     "negative frequency": (HEADER + "1,-64,1e-5,0.01,0\n", "-64"),
     "empty file": ("", "empty"),
@@ -351,7 +351,6 @@ def test_each_command_starts_in_a_process_of_its_own(files, tmp_path, command, w
     ("options", "named"),
     [
         (("--robust",), ("--robust", "--fit auto")),
-        (("--fit", "auto", "--anchor"), ("--anchor", "--fit")),
         (("--fit", "auto", "--knots", "5"), ("--knots", "--fit spline:5")),
         (("--free", "force_gain", "--knots", "5"), ("--knots", "--free", "--fit spline:5")),
         (("--next", "2", "--amplitude", "velocity"), ("--amplitude", "--next", "@velocity")),
@@ -380,7 +379,7 @@ def test_every_option_of_identify_is_joined_to_the_others_or_tried_here(files, t
     command = typer.main.get_command(app).commands["identify"]
     both = {"data", "model", "out", "predict_force", "predict_drive", "extrapolate", "help"}
     both |= {"axis", "day_std", "self_excited"}
-    points = {"amplitude", "measure", "knots", "anchor"}
+    points = {"amplitude", "measure", "knots"}
     joint = {"fit", "free", "robust", "further"}
     assert {one.name for one in command.params} - {"help"} == (both | points | joint) - {"help"}
 
@@ -646,7 +645,7 @@ def test_predictions_go_as_far_as_asked(files, tmp_path):
 def test_every_writer_takes_the_path_first():
     writers = [getattr(sj.io, name) for name in sj.io.__all__ if name.startswith("write_")]
     writers.append(sj.plot.save_figure)
-    assert len(writers) >= 10
+    assert len(writers) >= 5
     for writer in writers:
         first, second, *others = inspect.signature(writer).parameters.values()
         assert first.name == "path", writer

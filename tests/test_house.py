@@ -48,7 +48,7 @@ SUB_ROOMS = {
         *("model.effect_base", "model.effect_metadata", "model.modes", "model.potential"),
     },
     "measure.recordings": {"measure.signals", "measure.states"},
-    "measure.sweeps": {"measure.recordings", "measure.states"},
+    "measure.sweeps": {"measure.recordings", "measure.signals", "measure.states"},
     "simulate.balance": set(),
     "simulate.continuation": {"simulate.balance"},
     "simulate.solutions": {"simulate.balance", "simulate.continuation"},
@@ -73,7 +73,6 @@ SUB_ROOMS = {
     "identify.scaling": {"identify.modal"},
     "methods.steady": {"methods.result", "methods.one_sensor"},
     "methods.records": {"methods.result", "methods.one_sensor"},
-    "methods.bench": {"methods.result", "methods.one_sensor"},
     "identify.test_model": {"identify.checks", "identify.curves"},
     "diagnose.misfit": {"diagnose.priors"},
     "diagnose.search": {"diagnose.misfit", "diagnose.priors"},
@@ -84,9 +83,10 @@ SUB_ROOMS = {
         *("diagnose.misfit", "diagnose.search", "diagnose.checks", "diagnose.priors"),
     },
     "io.calculix": {"io.files", "io.reduction"},
-    "io.laboratory": {"io.files", "io.units"},
+    "io.laboratory": {"io.files", "io.rows", "io.units"},
     "io.exchange": {
-        *("io.files", "io.units", "io.columns", "io.tables", "io.toml_table", "io.laboratory"),
+        *("io.files", "io.units", "io.columns", "io.rows", "io.tables", "io.toml_table"),
+        "io.laboratory",
     },
     "report.figures": {
         *("report.style", "report.html", "report.sampling", "report.sentences"),
@@ -96,7 +96,7 @@ SUB_ROOMS = {
         "report.sentences",
     },
     "report.sentences": set(),
-    "report.study": {"report.style", "report.html"},
+    "report.study": {"report.style", "report.html", "report.sentences"},
     "io.reduction": {
         *("io.columns", "io.files", "io.rows", "io.tables", "io.toml_table", "io.units"),
     },
@@ -105,6 +105,7 @@ SUB_ROOMS = {
     # A study is made of computations, which know nothing of where and how often they run.
     "study.computations": set(),
     "study.uncertainty": {"study.variations"},
+    "study.analysis": {"study.computations", "study.uncertainty"},
 }
 NUMERICAL = set(ROOMS) - {"io", "study", "pipelines", "report"}
 MOST_MODULES = 13

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from snrmjax.cli.console import say, warn
+from snrmjax.cli.console import say, tell
 from snrmjax.cli.options import FILES, with_options
 from snrmjax.io.exchange.import_map import KEYS, RESPONSE_KEYS, ImportMap, MapKey
 from snrmjax.pipelines.options import option
@@ -49,30 +49,20 @@ def import_(
     them it writes measured.csv, and map.toml with all that was stated, found and assumed, for the
     next test. Records of free decays and broadband tests are written as record.csv.
     """
-    from snrmjax.io.exchange.exports import write_import
-    from snrmjax.io.exchange.import_options import map_of_options
-    from snrmjax.io.exchange.importing import import_files
-    from snrmjax.io.exchange.listing import listed_contents, suggested_command
-    from snrmjax.io.laboratory.reading import read_laboratory_file
+    from snrmjax.io.exchange.import_map import map_of_options
+    from snrmjax.pipelines.imports import import_test, list_contents
+    from snrmjax.report.pages import imports as page
 
-    told = map_of_options(map_file, options)
-    if told.is_empty and (map_file is None) and out is None:
+    if map_file is None and out is None and map_of_options(None, options).is_empty:
         for path in files:
-            held = read_laboratory_file(path, told.text_format)
-            typer.echo("\n".join((*listed_contents(held), *suggested_command([path], held))))
+            typer.echo("\n".join(list_contents(path, **options)))
         return
     if out is None:
         raise ValueError("where shall measured.csv be written? --out DIR.")
-    found = import_files(files, told)
+    found = import_test(files, map_file, **options)
     with staged(out) as folder:
-        written = write_import(folder, found, [os.path.relpath(one, out) for one in files])
-    for note in dict.fromkeys(found.notes):
-        warn(note)
-    for key, why in found.assumed.items():
-        warn(f"assumed {key}: {why}")
-    if found.states is not None:
-        for line in found.states.summary()[:3]:
-            say(line)
+        written = page.write(folder, found, files=[os.path.relpath(file, out) for file in files])
+    tell(found, dict.fromkeys(found.notes))
     say(f"written to {out}: {', '.join(written)}")
 
 

@@ -60,7 +60,11 @@ def with_options(command: Callable[..., None], *of: Any) -> None:
     A switch that is off by default has no `--no-` form; a tuple is an option to be repeated.
     """
     signature = inspect.signature(command)
-    own = [one for one in signature.parameters.values() if one.kind is not one.VAR_KEYWORD]
+    own = [
+        parameter
+        for parameter in signature.parameters.values()
+        if parameter.kind is not parameter.VAR_KEYWORD
+    ]
     made = [_parameter(kind, field) for kind in of for field in dataclasses.fields(kind)]
     command.__signature__ = signature.replace(parameters=[*own, *made])  # type: ignore[attr-defined]
 

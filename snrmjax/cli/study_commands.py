@@ -18,9 +18,8 @@ from snrmjax.report.writing import staged
 if TYPE_CHECKING:
     import xarray
 
-    from snrmjax.report.study.summary import ScalarSummary
-    from snrmjax.study.compute import Progress, ProgressReport
-    from snrmjax.study.run import Shard, StudyRun
+    from snrmjax.study.analysis.outputs import ScalarSummary
+    from snrmjax.study.run import Progress, ProgressReport, StudyRun
     from snrmjax.study.study import Study
 
 _QUIET_SECONDS = 30.0  # between lines of progress in a log
@@ -89,20 +88,25 @@ def run(
 
     Writes the data set OUT. Stopped at any moment, it loses only what was being computed then.
     """
-    from snrmjax.study.run import RunSettings, run_study
+    from snrmjax.study.execution import ClusterGone
+    from snrmjax.study.run import run_study
     from snrmjax.study.study_file import read_study
-    from snrmjax.study.workers import ClusterGone
 
     asked = asked_for(StudyOptions, options)
     quiet = asked.quiet
-    part = None if asked.shard is None else _shard(asked.shard)
+    part = (1, 1) if asked.shard is None else _shard(asked.shard)
     study = read_study(file)
     if not quiet:
         _say_study(study)
     try:
         with _progress(quiet) as progress:
-            settings = RunSettings(asked.processes, asked.scheduler, part, progress)
-            done = run_study(study, out, settings)
+            done = run_study(
+                *(study, out),
+                processes=asked.processes,
+                scheduler=asked.scheduler,
+                shard=part,
+                progress=progress,
+            )
     except KeyboardInterrupt:
         warn("stopped; the same command continues.")
         sys.exit(_INTERRUPTED)
@@ -129,23 +133,21 @@ def report(
 
     Writes summary.csv, main_effects.csv, figures (PNG) and report.html.
     """
-    from snrmjax.report.study.study_report import write_study_report
+    from snrmjax.report.study.study_report import members_ended, write_study_report
     from snrmjax.study.run import open_study
 
     data = open_study(store)
     with staged(out) as folder:
         found = write_study_report(folder, data)
-    _say_summary(found.headline, found.summaries)
+    _say_summary(members_ended(found), found.summaries)
     say(f"written to {out}")
 
 
-def _shard(text: str) -> "Shard":
-    from snrmjax.study.run import Shard
-
+def _shard(text: str) -> tuple[int, int]:
     part, slash, parts = text.partition("/")
     if not (slash and part.isdecimal() and parts.isdecimal()):
         raise ValueError(f"`--shard` must be I/N, such as 2/8, but is {text!r}.")
-    return Shard(int(part), int(parts))
+    return int(part), int(parts)
 
 
 def _say_study(study: "Study") -> None:
@@ -164,11 +166,11 @@ def _say_done(done: "StudyRun", out: Path) -> None:
     if not done.complete:
         say(f"this shard is done; {done.missing_chunks} chunks are left to other shards.")
     elif done.computed:
-        from snrmjax.report.study.digest import output_summaries
+        from snrmjax.study.analysis.outputs import scalars, summarized
 
         data = done.open()
         _say_failures(data)
-        _say_summary(f"{done.members} members", output_summaries(data))
+        _say_summary(f"{done.members} members", list(map(summarized, scalars(data))))
         say(f"{done.computed} members in {_duration(done.seconds)}; written to {out}")
         say(f"figures and tables of it: snrmjax study report {out} --out report")
     else:
@@ -177,14 +179,14 @@ def _say_done(done: "StudyRun", out: Path) -> None:
 
 def _say_failures(data: "xarray.Dataset") -> None:
     """How many members have no whole result, by status, and what to do about it."""
-    from snrmjax.report.study.failures import failures_of, range_notes
+    from snrmjax.study.analysis.failures import failures_of
 
     found = failures_of(data)
     if found.n_failed:
         each = ", ".join(f"{count} {status}" for status, count in found.failed_counts.items())
         warn(f"{found.n_failed} of {len(found.failed)} members have no whole result: {each}.")
-    for note in range_notes(found):
-        say(note)
+    for fact in found.facts:
+        say(str(fact))
 
 
 def _say_summary(title: str, summaries: "Sequence[ScalarSummary]") -> None:
@@ -192,7 +194,7 @@ def _say_summary(title: str, summaries: "Sequence[ScalarSummary]") -> None:
     from rich.table import Table
     from rich.text import Text
 
-    from snrmjax.report.study.summary import summary_table
+    from snrmjax.report.study.study_report import summary_table
 
     rows = [row for row in summaries if row.varies and not row.scalar.is_count]
     shown = summary_table(rows[:_ROWS_SAID], "")

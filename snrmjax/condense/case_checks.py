@@ -1,6 +1,6 @@
-"""What is wrong with static load cases: which of them, or all, and how a reader mends it."""
+"""What is wrong with static load cases: which of them, or all."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Array, Float
@@ -14,6 +14,7 @@ from snrmjax.condense.potential_fit import (
     solve_scaled,
 )
 from snrmjax.model.potential import PolynomialPotential
+from snrmjax.numerics.facts import Fact
 
 _GOOD = 0.01  # residual over nonlinear force that needs no word
 _EXPLAINED = 0.3  # of the residual, left by two more degrees: then the polynomial was too short
@@ -24,18 +25,6 @@ _LINEAR = 0.02  # of the linear stiffness, that the load cases may say otherwise
 _ENERGY = 0.01
 _UNIT = 5.0  # times the linear displacement beyond which a unit is wrong
 _SHOWN = 4
-
-
-class CaseWarning(NamedTuple):
-    """Something about the load cases that a reader should know before the model is used.
-
-    Kinds: `not_converged`, `repeated_case`, `inconsistent_case`, `linear_part`, `too_small`,
-    `too_large`, `other_regime`, `not_checked`, `energy`.
-    """
-
-    kind: str
-    message: str
-    cases: tuple[int, ...] = ()  # rows
 
 
 class FitView(NamedTuple):
@@ -66,56 +55,44 @@ def case_names(cases: StaticCases, rows: np.ndarray | tuple[int, ...]) -> str:
     return ", ".join(listed[:_SHOWN]) + more
 
 
-def case_warnings(every: StaticCases, fit: FitView) -> tuple[CaseWarning, ...]:
-    """All that the load cases show against themselves.
+def case_warnings(all_cases: StaticCases, fit: FitView) -> tuple[Fact, ...]:
+    """All that the load cases show against themselves, to be known before the model is used.
 
-    Arguments: `every` the load cases as they came, those without a solution included.
+    Facts on some cases have their rows in `cases`, and names of the first few.
+    Arguments: `all_cases` as they came, those without a solution included.
     """
-    used = np.flatnonzero(every.usable)
-    failed = np.flatnonzero(~every.usable)
+    used, failed = np.flatnonzero(all_cases.usable), np.flatnonzero(~all_cases.usable)
+
+    def of(rows: np.ndarray) -> dict[str, Any]:
+        cases = tuple(int(row) for row in rows)
+        return {"cases": cases, "names": case_names(all_cases, cases)}
+
     found = []
     if failed.size:
-        text = f"{failed.size} of {len(every.force)} load cases have no solution and are left out: "
-        found.append(_warning("not_converged", text + case_names(every, failed), failed))
-    found += _repeated(every, used)
+        found.append(Fact("not_converged", n_all=len(all_cases.force), **of(failed)))
+    twice = _repeated(np.asarray(all_cases.force)[used])
+    if twice:
+        found.append(Fact("repeated_case", **of(used[list(twice)])))
     strange = _inconsistent(fit)
     if strange.size:
-        rows = used[strange]
-        text = f"the other load cases contradict {case_names(every, rows)}{_reason(fit, strange)}"
-        found.append(_warning("inconsistent_case", text, rows))
+        against, times = _against_the_linear_structure(fit, strange)
+        found.append(
+            Fact("inconsistent_case", against_force=against, times=times, **of(used[strange]))
+        )
     else:
-        found += _linear_part(fit)
-        found += _sizes(fit)
+        found += [*_linear_part(fit), *_sizes(fit)]
     turned = _softened(fit)
     if turned.size:
-        rows = used[turned]
-        text = (
-            f"the tangent stiffness is no longer positive at {case_names(every, rows)}: beyond a "
-            "snap-through the potential mixes two regimes; take a smaller load scale"
-        )
-        found.append(_warning("other_regime", text, rows))
+        found.append(Fact("other_regime", **of(used[turned])))
     if not np.all(np.isfinite(fit.left_out.held_out)):
-        text = (
-            "some coefficients rest on a single load case each: their standard deviation and the "
-            "cross-validated error are not known; add load levels"
-        )
-        found.append(_warning("not_checked", text))
+        found.append(Fact("not_checked"))
     if fit.cases.energy is not None and not strange.size:
         error = energy_error(fit.basis, fit.cases, fit.potential)
         off = np.flatnonzero(~(np.abs(error) < _ENERGY))
         if off.size:
-            rows = used[off]
-            text = (
-                f"the strain energy of the reduced model is off by up to "
-                f"{100 * np.max(np.abs(error[off])):.2g} % from the finite elements' at "
-                f"{case_names(every, rows)}"
-            )
-            found.append(_warning("energy", text, rows))
+            largest = float(np.max(np.abs(error[off])))
+            found.append(Fact("energy", largest=largest, **of(used[off])))
     return tuple(found)
-
-
-def _warning(kind: str, message: str, rows: np.ndarray | tuple[int, ...] = ()) -> CaseWarning:
-    return CaseWarning(kind, message, tuple(int(row) for row in rows))
 
 
 def linear_stiffness_ratio(fit: FitView) -> Float[np.ndarray, " mode"]:
@@ -129,8 +106,8 @@ def linear_stiffness_ratio(fit: FitView) -> Float[np.ndarray, " mode"]:
         return np.full(n, np.nan)
     system = fit_system(fit.basis, fit.cases, monomials)
     values = np.asarray(solve_scaled(system) * system.column_scale)
-    own = np.array([values[monomials.index((m, m))] for m in range(n)])
-    return 1.0 + 2.0 * own / np.asarray(fit.basis.frequency) ** 2
+    quadratic = np.array([values[monomials.index((m, m))] for m in range(n)])
+    return 1.0 + 2.0 * quadratic / np.asarray(fit.basis.frequency) ** 2
 
 
 def energy_error(
@@ -143,16 +120,14 @@ def energy_error(
     return (linear + np.asarray(potential.energy(q)) - energy) / energy
 
 
-def _repeated(every: StaticCases, used: np.ndarray) -> list[CaseWarning]:
-    force = np.asarray(every.force)[used]
+def _repeated(force: Float[np.ndarray, "case mode"]) -> tuple[int, int] | None:
+    """The first two rows with the same load."""
     size = np.max(np.abs(force), initial=0.0)
-    for k in range(1, len(used)):
+    for k in range(1, len(force)):
         same = np.flatnonzero(np.all(np.abs(force[:k] - force[k]) <= 1e-9 * size, axis=1))
         if same.size:
-            rows = (int(used[same[0]]), int(used[k]))
-            text = f"the same load twice: {case_names(every, rows)}"
-            return [_warning("repeated_case", text, rows)]
-    return []
+            return int(same[0]), k
+    return None
 
 
 def _inconsistent(fit: FitView) -> np.ndarray:
@@ -188,17 +163,19 @@ def _inconsistent(fit: FitView) -> np.ndarray:
     return nobody
 
 
-def _reason(fit: FitView, rows: np.ndarray) -> str:
-    """A guess at what is wrong with contradicting cases, ready to end a message, or nothing."""
+def _against_the_linear_structure(fit: FitView, rows: np.ndarray) -> tuple[bool, float | None]:
+    """A guess at what is wrong with contradicting cases.
+
+    Whether all move against their force, and how many times the linear displacement they move where
+    that is far from one.
+    """
     force = np.asarray(fit.cases.force)[rows]
     linear = np.asarray(fit.cases.modal_displacement)[rows] * np.asarray(fit.basis.frequency) ** 2
     if np.all(np.sum(force * linear, axis=1) < 0):
-        return " (against their force: is the sign wrong?)"
+        return True, None
     ratio = _linear_size(fit.basis, force, fit.cases.modal_displacement[rows])
-    if np.all(ratio > _UNIT) or np.all(ratio < 1 / _UNIT):
-        times = f"{np.median(ratio):.3g} times the linear ones"
-        return f" (displacements {times}: another unit, or a snap-through?)"
-    return ""
+    far = np.all(ratio > _UNIT) or np.all(ratio < 1 / _UNIT)
+    return False, float(np.median(ratio)) if far else None
 
 
 def _linear_size(basis: ReductionBasis, force: Array, moved: Array) -> np.ndarray:
@@ -207,33 +184,23 @@ def _linear_size(basis: ReductionBasis, force: Array, moved: Array) -> np.ndarra
     return np.linalg.norm(np.asarray(moved), axis=1) / np.linalg.norm(force / squared, axis=1)
 
 
-def _linear_part(fit: FitView) -> list[CaseWarning]:
+def _linear_part(fit: FitView) -> list[Fact]:
     ratio = linear_stiffness_ratio(fit)
-    off = np.flatnonzero(np.abs(ratio - 1) > _LINEAR)
-    if not off.size:
-        return []
-    said = ", ".join(f"{ratio[m]:.4g} (mode {fit.basis.numbers[m]})" for m in off)
-    text = (
-        f"the load cases show a linear stiffness of {said} times the squared natural frequency: "
-        "shapes, units, loads and frequencies do not belong together, or the loads are too large "
-        "for a polynomial of this degree"
-    )
-    return [_warning("linear_part", text)]
+    off = np.flatnonzero(np.abs(ratio - 1) > _LINEAR).tolist()
+    modes = tuple(fit.basis.numbers[m] for m in off)
+    ratios = tuple(float(ratio[m]) for m in off)
+    return [Fact("linear_part", modes=modes, ratios=ratios)] if off else []
 
 
-def _sizes(fit: FitView) -> list[CaseWarning]:
+def _sizes(fit: FitView) -> list[Fact]:
     """Whether the cases are too small, or too large for the degree."""
     if fit.misfit < _GOOD:
         return []
     n_cases, n_modes = fit.system.target.shape
     share = rms(fit.system.target)
-    said = f"the potential leaves {100 * fit.misfit:.2g} % of the nonlinear force"
-    small = (
-        f"{said}, which is only {share:.2g} of the linear force: round-off of the displacements "
-        "dominates; take a larger load scale or write more digits"
-    )
+    small = [Fact("too_small", misfit=fit.misfit, nonlinear=share)]
     if rms(fit.left_out.residual) < _ROUND_OFF:
-        return [_warning("too_small", small)]
+        return small
     higher = fit_system(fit.basis, fit.cases, monomials_of(n_modes, fit.degree + 2))
     design = np.asarray(higher.design).reshape(n_cases * n_modes, -1)
     spare = design.shape[0] - design.shape[1]
@@ -241,15 +208,12 @@ def _sizes(fit: FitView) -> list[CaseWarning]:
         values = np.linalg.lstsq(design, np.asarray(higher.target).reshape(-1), rcond=1e-12)[0]
         left = rms(design @ values - np.asarray(higher.target).reshape(-1))
         left *= np.sqrt(design.shape[0] / spare)
-        longer = left < _EXPLAINED * rms(fit.left_out.residual)
+        longer = bool(left < _EXPLAINED * rms(fit.left_out.residual))
     else:
         longer = share > _SMALL
-    if longer:
-        text = f"{said}: the loads are too large for degree {fit.degree}"
-        return [_warning("too_large", f"{text}; take a smaller load scale or a higher degree")]
-    if share < _SMALL:
-        return [_warning("too_small", small)]
-    return [_warning("too_large", f"{said}: no polynomial of this degree fits the load cases")]
+    if share < _SMALL and not longer:
+        return small
+    return [Fact("too_large", misfit=fit.misfit, degree=fit.degree, longer=longer)]
 
 
 def _softened(fit: FitView) -> np.ndarray:

@@ -11,17 +11,15 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from snrmjax.condense.case_checks import (
-    CaseWarning,
     FitView,
     case_warnings,
     energy_error,
     linear_stiffness_ratio,
     rms,
 )
-from snrmjax.condense.expansion import MembraneExpansion, fit_expansion
 from snrmjax.condense.load_cases import ReductionBasis, StaticCases
-from snrmjax.condense.load_set import check_degree
 from snrmjax.condense.potential_fit import (
+    check_degree,
     fit_potential,
     fit_system,
     leave_out,
@@ -29,9 +27,10 @@ from snrmjax.condense.potential_fit import (
     require_determined,
 )
 from snrmjax.model.modes import linear_modes
-from snrmjax.model.potential import PolynomialPotential, monomial_key
+from snrmjax.model.potential import Monomial, PolynomialPotential, monomial_key
 from snrmjax.model.structures import Structure, structure
-from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.result import AbstractResult, Variable, setting
 
 
 class FitQuality(eqx.Module):
@@ -54,6 +53,25 @@ class FitQuality(eqx.Module):
     energy_error: Float[np.ndarray, " case"] | None  # relative
 
 
+class MembraneExpansion(eqx.Module):
+    """u(q) = Φq + Σ_k s_k p_k(q), with products p_k of modal displacements as coordinates.
+
+    The shapes s_k are fitted to what static load cases left of u − Φq: the quadratic ones are the
+    membrane basis of a flat structure, the cubic ones the bending that the modes kept do not have.
+    """
+
+    shapes: Float[Array, "dof mode"]  # Φ, kg^-1/2
+    static_shapes: Float[Array, "dof product"]  # s_k, kg^-1 m^-1 and kg^-3/2 m^-2
+    misfit: float  # rms of what is left of u − Φq, over its rms
+    products: tuple[Monomial, ...] = eqx.field(static=True)
+
+    def expand(self, displacement: Float[Array, "*batch mode"]) -> Float[Array, "*batch dof"]:
+        """The displacement of all degrees of freedom (m, rad) at modal displacements."""
+        q = jnp.asarray(displacement)
+        products = [jnp.prod(q[..., list(modes)], axis=-1) for modes in self.products]
+        return q @ self.shapes.T + jnp.stack(products, axis=-1) @ self.static_shapes.T
+
+
 class Condensation(AbstractResult):
     """A reduced-order model out of static load cases: ω²q + ∂V/∂q = f, and how good it is.
 
@@ -61,57 +79,28 @@ class Condensation(AbstractResult):
     the choice of cases. `warnings` say what a reader should know before the model is used.
     """
 
+    coordinates: ClassVar[tuple[str, ...]] = ("monomial",)
+
     basis: ReductionBasis
     cases: StaticCases
     potential: PolynomialPotential
     quality: FitQuality
     expansion: MembraneExpansion | None  # None where the cases have no displacements
-    warnings: tuple[CaseWarning, ...] = eqx.field(static=True)
-    degree: int = eqx.field(static=True)
-
-    coordinates: ClassVar[tuple[str, ...]] = ("monomial",)
-
-    def summary(self) -> tuple[str, ...]:
-        """What was condensed, how well it fits, and the warnings."""
-        numbers = ", ".join(str(number) for number in self.basis.numbers)
-        q = self.quality
-        first = (
-            f"Condensation: modes {numbers}, force of degree {self.degree}, "
-            f"{len(self.potential.monomials)} coefficients of one potential"
-        )
-        if np.isnan(q.misfit):
-            return first, "not checked: made within `jit` or a derivative"
-        count, used = len(self.cases.force), int(self.cases.usable.sum())
-        return (
-            first,
-            f"{used} of {count} load cases, nonlinear up to {np.nanmax(q.nonlinear_ratio):.3g} of "
-            "the linear force",
-            f"misfit {q.misfit:.2g} of the nonlinear force, cross-validated "
-            f"{q.cross_validated:.2g}; condition {q.condition:.2g}",
-            *(f"{one.kind}: {one.message}" for one in self.warnings),
-        )
+    warnings: tuple[Fact, ...] = setting()
+    degree: int = setting()
 
     def variables(self) -> Mapping[str, Variable]:
         """The coefficients, one a monomial."""
         keys = np.array([monomial_key(m) for m in self.potential.monomials])
-        unit = "kg, m, s"
+        at, unit, found = ("monomial",), "kg, m, s", self.potential
         return {
-            "monomial": Variable(("monomial",), keys, "", "modes of the monomial of V"),
-            "coefficient": Variable(
-                ("monomial",), self.potential.coefficient, unit, "coefficient of the potential"
+            "monomial": Variable(at, keys, "", "modes of the monomial of V"),
+            "coefficient": Variable(at, found.coefficient, unit, "coefficient of the potential"),
+            "coefficient_std": Variable(at, found.coefficient_std, unit, "1σ over load cases"),
+            "misfit": Variable((), self.quality.misfit, "1", "residual over nonlinear force"),
+            "cross_validated": Variable(
+                (), self.quality.cross_validated, "1", "the same of cases that were left out"
             ),
-            "coefficient_std": Variable(
-                ("monomial",), self.potential.coefficient_std, unit, "1σ over load cases"
-            ),
-        }
-
-    def attributes(self) -> Mapping[str, str | float | int]:
-        """Quality of the whole fit."""
-        return {
-            "misfit": self.quality.misfit,
-            "cross_validated": self.quality.cross_validated,
-            "condition": self.quality.condition,
-            "degree": self.degree,
         }
 
     def force(self, displacement: Float[Array, "*batch mode"]) -> Float[Array, "*batch mode"]:
@@ -157,7 +146,7 @@ class Condensation(AbstractResult):
         return structure(modes, self.potential, name=name)
 
 
-def condense(
+def reduced_model(
     basis: ReductionBasis, cases: StaticCases, *, degree: int = 3, expand: bool = True
 ) -> Condensation:
     """Fit one potential V to static load cases, f = ω²q + ∂V/∂q, and check both.
@@ -175,7 +164,7 @@ def condense(
     >>> basis = ReductionBasis(np.array([2.0]), np.eye(1), np.eye(1), (1,))
     >>> q = np.array([[-1.0], [-0.5], [0.5], [1.0]])
     >>> cases = StaticCases(4 * q + 3 * q**2 + q**3, q, np.ones(4, dtype=bool))
-    >>> condense(basis, cases).potential.coefficient.round(9)
+    >>> reduced_model(basis, cases).potential.coefficient.round(9)
     Array([1.  , 0.25], dtype=float64)
     """
     check_degree(degree)
@@ -191,9 +180,15 @@ def condense(
         raise ValueError(
             f"none of the {len(cases.force)} load cases has a solution: smaller loads are needed."
         )
-    solved = _subset(cases, used)
+    arrays = dataclasses.replace(cases, names=())
+    solved: StaticCases = jax.tree.map(lambda values: np.asarray(values)[used], arrays)
     monomials = monomials_of(n_modes, degree)
-    require_loaded(basis, solved)
+    for what, rows in (("force", solved.force), ("modal displacement", solved.modal_displacement)):
+        still = np.flatnonzero(~np.any(np.asarray(rows) != 0, axis=0))
+        if still.size:
+            raise ValueError(
+                f"the {what} of mode {basis.numbers[still[0]]} is zero in every load case."
+            )
     system = fit_system(basis, solved, monomials)
     require_determined(system, monomials, used.size)
     left_out = leave_out(system)
@@ -210,7 +205,7 @@ def condense(
         cases=cases,
         potential=potential,
         quality=_quality(view, used, len(cases.force)),
-        expansion=fit_expansion(basis, cases) if has_shapes else None,
+        expansion=_membrane(basis, cases) if has_shapes else None,
         warnings=case_warnings(cases, view),
         degree=degree,
     )
@@ -228,21 +223,29 @@ def _unchecked(basis: ReductionBasis, cases: StaticCases, degree: int) -> Conden
     return Condensation(basis, cases, potential, nothing, None, (), degree)
 
 
-def require_loaded(basis: ReductionBasis, cases: StaticCases) -> None:
-    """Raises `ValueError` where a mode is never loaded, or never moves."""
-    for what, rows in (("force", cases.force), ("modal displacement", cases.modal_displacement)):
-        still = np.flatnonzero(~np.any(np.asarray(rows) != 0, axis=0))
-        if still.size:
-            raise ValueError(
-                f"the {what} of mode {basis.numbers[still[0]]} is zero in every load case."
-            )
+def _membrane(basis: ReductionBasis, cases: StaticCases) -> MembraneExpansion:
+    """The static part of the displacement, as products of two or three modal displacements.
 
-
-def _subset(cases: StaticCases, rows: np.ndarray) -> StaticCases:
-    names = tuple(cases.names[k] for k in rows) if cases.names else ()
-    arrays = dataclasses.replace(cases, names=())
-    subset: StaticCases = jax.tree.map(lambda values: np.asarray(values)[rows], arrays)
-    return dataclasses.replace(subset, names=names)
+    Of two alone where there are not twice as many load cases.
+    Reference: Hollkamp & Gordon, J. Sound Vib. 318 (2008) 1139, doi:10.1016/j.jsv.2008.04.035
+    (expansion by quadratic products).
+    """
+    used = cases.usable
+    q = np.asarray(cases.modal_displacement)[used]
+    products = monomials_of(q.shape[1], 2, 1)
+    if 2 * len(products) > len(q):
+        products = monomials_of(q.shape[1], 1, 1)
+    scale = np.sqrt(np.mean(q**2, axis=0))
+    left = np.asarray(cases.displacement)[used] - q @ np.asarray(basis.shapes).T
+    columns = np.stack([np.prod(q[:, list(m)] / scale[list(m)], axis=1) for m in products], axis=1)
+    # The smallest shapes that fit, where the cases do not tell all products apart.
+    found = np.linalg.pinv(columns, rcond=1e-10) @ left
+    unit = np.array([np.prod(scale[list(m)]) for m in products])
+    size = float(np.sum(left**2))
+    misfit = float(np.sqrt(np.sum((left - columns @ found) ** 2) / size)) if size else 0.0
+    return MembraneExpansion(
+        jnp.asarray(basis.shapes), jnp.asarray((found / unit[:, None]).T), misfit, products
+    )
 
 
 def _quality(fit: FitView, used: np.ndarray, n_cases: int) -> FitQuality:
@@ -251,24 +254,24 @@ def _quality(fit: FitView, used: np.ndarray, n_cases: int) -> FitQuality:
     linear = np.linalg.norm(force - target, axis=1)
     size = np.sqrt(np.mean(force**2, axis=0))
 
-    def every(values: np.ndarray) -> np.ndarray:
+    def by_case(values: np.ndarray) -> np.ndarray:
         rows = np.full(n_cases, np.nan)
         rows[used] = values
         return rows
 
     known = np.all(np.isfinite(left_out.held_out))
     held_out = left_out.held_out if known else np.full(target.shape, np.nan)
-    own = np.linalg.norm(target, axis=1)
+    nonlinear = np.linalg.norm(target, axis=1)
     energy = None
     if fit.cases.energy is not None:
-        energy = every(energy_error(fit.basis, fit.cases, fit.potential))
+        energy = by_case(energy_error(fit.basis, fit.cases, fit.potential))
     return FitQuality(
         misfit=fit.misfit,
         cross_validated=rms(held_out) / rms(target),
         equation_residual=np.sqrt(np.mean(left_out.residual**2, axis=0)) / size,
         equation_cross_validated=np.sqrt(np.mean(held_out**2, axis=0)) / size,
-        case_error=every(np.linalg.norm(left_out.held_out, axis=1) / own),
-        nonlinear_ratio=every(own / linear),
+        case_error=by_case(np.linalg.norm(left_out.held_out, axis=1) / nonlinear),
+        nonlinear_ratio=by_case(nonlinear / linear),
         linear_stiffness_ratio=linear_stiffness_ratio(fit),
         condition=left_out.condition,
         energy_error=energy,

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from snrmjax.condense.load_cases import ReductionBasis, StaticCases
+from snrmjax.condense.potential_fit import check_degree
 from snrmjax.model.modes import have_values
 
 NONLINEAR_RATIO = 0.02
@@ -101,12 +102,6 @@ def default_levels(n_modes: int, degree: int) -> tuple[float, ...]:
     """
     count = max(degree // 2, 1) + (n_modes <= 2)
     return tuple(float(level) for level in np.arange(1, count + 1) / count)
-
-
-def check_degree(degree: int) -> None:
-    """Raises `ValueError` for a degree of the force that is not from 2 to 7."""
-    if isinstance(degree, bool) or not isinstance(degree, int) or not 2 <= degree <= 7:
-        raise ValueError(f"`degree` of the force must be a whole number from 2 to 7, not {degree}.")
 
 
 def displacement_for_ratio(

@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from snrmjax.condense.load_cases import ReductionBasis, StaticCases
-from snrmjax.condense.load_set import check_degree
 from snrmjax.model.potential import Monomial, PolynomialPotential, monomial_key
 
 _NOT_SEEN = 1e-7  # of a unit column: a monomial that no load case moves
@@ -43,6 +42,12 @@ def monomials_of(n_modes: int, degree: int, lowest: int = 2) -> tuple[Monomial, 
         for size in range(lowest + 1, degree + 2)
         for modes in itertools.combinations_with_replacement(range(n_modes), size)
     )
+
+
+def check_degree(degree: int) -> None:
+    """Raises `ValueError` for a degree of the force that is not from 2 to 7."""
+    if isinstance(degree, bool) or not isinstance(degree, int) or not 2 <= degree <= 7:
+        raise ValueError(f"`degree` of the force must be a whole number from 2 to 7, not {degree}.")
 
 
 def fit_system(

@@ -12,7 +12,7 @@ from snrmjax.condense.load_cases import ReductionBasis, StaticCases
 from snrmjax.condense.load_set import StaticSolver, modal_loads
 from snrmjax.condense.potential_fit import fit_system, monomials_of, solve_scaled
 from snrmjax.model.potential import Monomial, monomial_key
-from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.result import AbstractResult, Variable, quantity
 
 SCALES = tuple(float(scale) for scale in np.logspace(-2.0, 0.75, 12))
 """Default multiples of the displacement: two decades below and three quarters of one above."""
@@ -32,15 +32,24 @@ class LoadScaleStudy(AbstractResult):
     of its degree at scale 1. None: there is no plateau of two scales.
     """
 
-    scale: Float[np.ndarray, " scale"]  # times the displacement that was asked for
-    coefficient: Float[np.ndarray, "scale monomial"]  # NaN where load cases failed
-    misfit: Float[np.ndarray, " scale"]  # residual over nonlinear force
-    nonlinear_ratio: Float[np.ndarray, " scale"]  # nonlinear over linear force, the largest
-    leading: tuple[bool, ...] = eqx.field(static=True)
-    plateau: tuple[float, float] | None = eqx.field(static=True)
-    monomials: tuple[Monomial, ...] = eqx.field(static=True)
-
     coordinates: ClassVar[tuple[str, ...]] = ("load_scale", "monomial")
+
+    leading: tuple[bool, ...] = eqx.field(static=True)
+    monomials: tuple[Monomial, ...] = eqx.field(static=True)
+    scale: Float[np.ndarray, " scale"] = quantity(
+        "load_scale", "1", "times the displacement that was asked for", name="load_scale"
+    )
+    # NaN where load cases failed.
+    coefficient: Float[np.ndarray, "scale monomial"] = quantity(
+        "load_scale monomial", "kg, m, s", "coefficient of V"
+    )
+    misfit: Float[np.ndarray, " scale"] = quantity(
+        "load_scale", "1", "residual over nonlinear force"
+    )
+    nonlinear_ratio: Float[np.ndarray, " scale"] = quantity(
+        "load_scale", "1", "nonlinear over linear force, the largest"
+    )
+    plateau: tuple[float, float] | None = eqx.field(static=True, default=None)
 
     @property
     def decades(self) -> float:
@@ -66,20 +75,10 @@ class LoadScaleStudy(AbstractResult):
         )
 
     def variables(self) -> Mapping[str, Variable]:
-        """Coefficients and quality over scale."""
+        """Coefficients and quality over scale, by monomial."""
         keys = np.array([monomial_key(m) for m in self.monomials])
-        over = ("load_scale",)
-        return {
-            "load_scale": Variable(over, self.scale, "1", "times the default displacement"),
-            "monomial": Variable(("monomial",), keys, "", "modes of the monomial of V"),
-            "coefficient": Variable(
-                ("load_scale", "monomial"), self.coefficient, "kg, m, s", "coefficient of V"
-            ),
-            "misfit": Variable(over, self.misfit, "1", "residual over nonlinear force"),
-            "nonlinear_ratio": Variable(
-                over, self.nonlinear_ratio, "1", "nonlinear over linear force"
-            ),
-        }
+        named = Variable(("monomial",), keys, "", "modes of the monomial of V")
+        return {**super().variables(), "monomial": named}
 
 
 def load_scale_study(
@@ -106,11 +105,11 @@ def load_scale_study(
     misfit, ratio = np.full(scale.size, np.nan), np.full(scale.size, np.nan)
     typical = np.ones(len(basis.numbers))
     nearest = int(np.argmin(np.abs(np.log(scale))))
-    for k, one in enumerate(scale):
-        loads = modal_loads(basis, one * np.asarray(displacement), degree=degree)
+    for k, factor in enumerate(scale):
+        loads = modal_loads(basis, factor * np.asarray(displacement), degree=degree)
         cases = solve(np.asarray(loads.force))
         if k == nearest:
-            typical = typical_displacement(cases) / one
+            typical = typical_displacement(cases) / factor
         if cases.usable.all():
             coefficient[k], misfit[k], ratio[k] = _fitted(basis, cases, monomials)
         if report is not None:
@@ -121,7 +120,7 @@ def load_scale_study(
         coefficient=coefficient,
         misfit=misfit,
         nonlinear_ratio=ratio,
-        leading=tuple(bool(one) for one in leading),
+        leading=tuple(bool(leads) for leads in leading),
         plateau=plateau_of(scale, coefficient[:, leading]),
         monomials=monomials,
     )
@@ -176,7 +175,7 @@ def leading_terms(
     """The coefficients whose terms have a tenth of the energy of the largest of their degree."""
     size = np.array([np.prod(typical[list(m)]) for m in monomials]) * np.abs(coefficient)
     degree = np.array([len(m) for m in monomials])
-    every = np.nan_to_num(size)
-    largest = np.array([every[degree == d].max() for d in degree])
+    known = np.nan_to_num(size)
+    largest = np.array([known[degree == d].max() for d in degree])
     # An odd term of a flat structure is rounding: no term of a degree that hardly acts leads.
-    return (every >= _LEADING * largest) & (largest >= _LEADING**2 * every.max())
+    return (known >= _LEADING * largest) & (largest >= _LEADING**2 * known.max())

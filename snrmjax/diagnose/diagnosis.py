@@ -353,7 +353,7 @@ def _notes_on_answer(checked: _Checked, completed: _Completed) -> Iterator[Fact]
     if completed.refused:
         yield Fact("not_physical_without", levels=completed.refused)
     if not (fit.status.found_minimum or fit.status is MinimisationStatus.NOT_FITTED):
-        yield Fact("fit_not_converged")
+        yield Fact("answer_not_converged")
     rows = [row for step in checked.found.table for row in step]
     lost = {row.kind for row in rows if row.status is MinimisationStatus.NOT_FINITE}
     if lost:

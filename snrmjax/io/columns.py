@@ -1,58 +1,58 @@
-"""The header of a steady-state table: which column is what, and what is wrong with it."""
+"""The columns of a steady-state table: which is what, and what is wrong with a header."""
 
 import re
+from collections.abc import Iterable
 from typing import NamedTuple
 
-from snrmjax.io.files import near_miss, shown, suggestion
-
-REQUIRED = ("level", "frequency_hz", "velocity_re_m_s", "velocity_im_m_s")
-"""Columns that every table has, beside `force_n` or `drive_v`."""
+from snrmjax.io.files import near_miss
+from snrmjax.io.rows import Cells, shortened_name
+from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import FRACTION, IN_RANGE_HZ, NOT_NEGATIVE, POSITIVE, SHORT, WHOLE, Rule
 
 PHASOR = ("velocity_re_m_s", "velocity_im_m_s")
-"""Those of the fundamental."""
+"""Of the fundamental."""
 
 AMPLITUDE = "velocity_m_s"
 """The amplitude of the fundamental: in place of both parts of the phasor, and only then."""
 
-FORCES = ("force_n", "drive_v")
+REQUIRED: dict[str, tuple[Rule, ...]] = {
+    "level": (WHOLE, SHORT),
+    "frequency_hz": (POSITIVE, IN_RANGE_HZ),
+    **dict.fromkeys(PHASOR, ()),
+}
+"""Columns that every table has, beside `force_n` or `drive_v`, and the rules of their numbers."""
+
+FORCES: dict[str, tuple[Rule, ...]] = {"force_n": (POSITIVE,), "drive_v": (POSITIVE,)}
 """Columns of which a table has exactly one."""
 
-OPTIONAL = ("velocity_std_m_s", "phase_std_deg", "force_std_n", "order", "harmonic_std_m_s")
+OPTIONAL: dict[str, tuple[Rule, ...]] = {
+    "velocity_std_m_s": (NOT_NEGATIVE,),
+    "phase_std_deg": (NOT_NEGATIVE,),
+    "force_std_n": (NOT_NEGATIVE,),
+    "order": (FRACTION,),
+    "harmonic_std_m_s": (NOT_NEGATIVE,),
+}
 """Columns of numbers that a table may have, and in which a field may be empty."""
 
-KNOWN = frozenset((*REQUIRED, *FORCES, *OPTIONAL, "sensor"))
-"""All columns but those of the harmonics."""
-
+_KNOWN = frozenset((*REQUIRED, *FORCES, *OPTIONAL, "sensor"))  # all but those of the harmonics
 _STEMS = {
-    "frequency": "frequency_hz",
-    "force": "force_n",
-    "drive": "drive_v",
-    "velocity_re": "velocity_re_m_s",
-    "velocity_im": "velocity_im_m_s",
-    "velocity_std": "velocity_std_m_s",
-    "phase_std": "phase_std_deg",
-    "force_std": "force_std_n",
-    "harmonic_std": "harmonic_std_m_s",
+    stem: name for name in _KNOWN if (stem := re.sub(r"_(hz|n|v|m_s|deg)$", "", name)) != name
 }
-
 # What stands behind a stem when someone meant the column, but in another unit or in none.
 _UNIT = re.compile(
     r"[kmg]?hz|(?:m?rad|deg(?:rees?)?)(?:_?s|_per_s)?|[rc]pm|[kmun]?n|newtons?|lbf?|kgf|[kmu]?v|"
     r"volts?|(?:[kcmun]?m|in|ft)(?:_s2?|_h|_per_s)?|ips|g|m?s|percent|pct|db|rel|rms(?:_m_s)?"
 )
-
 _HARMONIC = re.compile(r"velocity_h(?:0|([2-9]|[1-9][0-9]{1,3})_(?:re|im))_m_s")
 _LIKE_HARMONIC = re.compile(r"velocity_h([0-9]+)(.*)")
-_PLAIN_NUMBER = re.compile(r"[+-]?[0-9.]+(?:[eE][+-]?[0-9]+)?")
 
 
 class Header(NamedTuple):
-    """Where each used column stands (from zero), the harmonics present, and notes."""
+    """The columns that are used, the harmonics among them, and notes."""
 
-    position: dict[str, int]
-    n_columns: int
+    used: frozenset[str]
     harmonic_order: tuple[int, ...]
-    notes: tuple[str, ...]
+    notes: tuple[Fact, ...]
 
     @property
     def harmonics(self) -> tuple[str, ...]:
@@ -71,65 +71,57 @@ def harmonic_columns(order: int) -> tuple[str, ...]:
     return (f"velocity_h{order}_re_m_s", f"velocity_h{order}_im_m_s")
 
 
-def read_header(names: list[str], file: str) -> Header:
-    """Find the columns of a steady-state table.
+def is_ours(names: Iterable[str]) -> bool:
+    """Whether columns are meant as ours: the reader of our tables then says what is amiss."""
+    return {"frequency_hz", "velocity_re_m_s"} <= {*names} or {
+        *("frequency_hz", AMPLITUDE, "level")
+    } <= {*names}
 
-    Arguments: `names` from the header row, without spaces around them; `file` as messages name
-    it. Raises `ValueError` for a missing, doubled or wrongly suffixed column.
 
-    >>> names = ["force_n", "level", "frequency_hz", "velocity_re_m_s", "velocity_im_m_s"]
-    >>> read_header(names, "beam.csv").position["level"]
-    1
+def read_header(cells: Cells) -> Header:
+    """The columns of a steady-state table.
+
+    Raises `ValueError` for a missing or wrongly suffixed column.
     """
-    if len(names) == 1 and re.search(r"[;\t]", names[0]):
-        mark = "semicolons" if ";" in names[0] else "tabs"
-        raise ValueError(
-            f"the fields of {file} must be separated by commas, but its header row has {mark}."
-        )
-    if all(_PLAIN_NUMBER.fullmatch(name) for name in names):
-        raise ValueError(
-            f"row 1 of {file} must be a header row with the names of the columns, "
-            f"but has {shown(names[0])}."
-        )
-    position: dict[str, int] = {}
-    notes: list[str] = []
-    for k, name in enumerate(names):
-        if name == "":
-            notes.append(f"column {k + 1} of {file} has no name and is not used.")
-        elif name in position:
-            raise ValueError(
-                f"each column must stand once, but {file} has the column `{_short(name)}` twice "
-                f"(columns {position[name] + 1} and {k + 1})."
-            )
-        else:
-            position[name] = k
-    used = {name: k for name, k in position.items() if name in KNOWN or _HARMONIC.fullmatch(name)}
-    if AMPLITUDE in position and not any(name in position for name in PHASOR):
-        used[AMPLITUDE] = position[AMPLITUDE]
-    further = [name for name in position if name not in used]
+    names, file = [name for name in cells.names if name], cells.file
+    notes = [
+        Fact("column_without_name", number=k + 1, file=file)
+        for k, name in enumerate(cells.names)
+        if not name
+    ]
+    used = {name for name in names if name in _KNOWN or _HARMONIC.fullmatch(name)}
+    if AMPLITUDE in names and used.isdisjoint(PHASOR):
+        used.add(AMPLITUDE)
+    further = [name for name in names if name not in used]
     for name in further:
         expected = _misnamed(name)
-        other_force_known = expected in FORCES and any(force in used for force in FORCES)
+        other_force_known = expected in FORCES and not used.isdisjoint(FORCES)
         if expected is not None and (expected in used or not other_force_known):
             raise ValueError(
-                f"the column `{_short(name)}` of {file} is not one of the format: "
+                f"the column `{shortened_name(name)}` of {file} is not one of the format: "
                 f"expected `{expected}`."
             )
     _require(used, further, file)
     for name in further:
-        near = suggestion(name, KNOWN - set(used), cutoff=0.8)
-        notes.append(f"the column `{_short(name)}` of {file} is not used{near}.")
-    return Header(used, len(names), _harmonic_orders(used, file), tuple(notes))
+        near = near_miss(name, sorted(_KNOWN - used), cutoff=0.8) or ""
+        notes.append(Fact("column_not_used", name=shortened_name(name), file=file, near=near))
+    return Header(frozenset(used), _harmonic_orders(used, file), tuple(notes))
 
 
-def _require(used: dict[str, int], further: list[str], file: str) -> None:
+def _require(used: set[str], further: list[str], file: str) -> None:
     """Refuse a header that lacks a column or has both force and drive."""
+
+    def instead(name: str) -> str:
+        """The column that may stand for a missing one."""
+        near = near_miss(name, further)
+        return "" if near is None else f" (is it `{shortened_name(near)}`?)"
+
     for name in REQUIRED:
         if name not in used and not (name in PHASOR and AMPLITUDE in used):
-            raise ValueError(f"{file} lacks the column `{name}`{_instead(name, further)}.")
-    forces = [name for name in FORCES if name in used]
+            raise ValueError(f"{file} lacks the column `{name}`{instead(name)}.")
+    forces = used.intersection(FORCES)
     if not forces:
-        near = _instead("force_n", further) or _instead("drive_v", further)
+        near = instead("force_n") or instead("drive_v")
         raise ValueError(f"{file} lacks the column `force_n` or `drive_v`{near}.")
     if len(forces) == 2:
         raise ValueError(
@@ -138,17 +130,14 @@ def _require(used: dict[str, int], further: list[str], file: str) -> None:
         )
 
 
-def _harmonic_orders(used: dict[str, int], file: str) -> tuple[int, ...]:
+def _harmonic_orders(used: set[str], file: str) -> tuple[int, ...]:
     """The harmonics of a table, each complete."""
     orders = set()
-    for name in used:
-        if name in KNOWN or name == AMPLITUDE:
-            continue
-        match = _HARMONIC.fullmatch(name)
-        order = 0 if match is None or match[1] is None else int(match[1])
+    for match in filter(None, map(_HARMONIC.fullmatch, sorted(used))):
+        order = int(match[1] or 0)
         for partner in harmonic_columns(order):
             if partner not in used:
-                raise ValueError(f"{file} has the column `{name}`, but lacks `{partner}`.")
+                raise ValueError(f"{file} has the column `{match[0]}`, but lacks `{partner}`.")
         orders.add(order)
     return tuple(sorted(orders))
 
@@ -156,7 +145,7 @@ def _harmonic_orders(used: dict[str, int], file: str) -> tuple[int, ...]:
 def _misnamed(name: str) -> str | None:
     """The column that an unknown name must have meant, or nothing."""
     plain = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
-    if plain in KNOWN:
+    if plain in _KNOWN:
         return plain
     harmonic = _LIKE_HARMONIC.fullmatch(plain)
     if harmonic is not None:
@@ -171,15 +160,3 @@ def _misnamed(name: str) -> str | None:
         ):
             return column
     return None
-
-
-def _instead(name: str, further: list[str]) -> str:
-    """The column that may stand for a missing one, ready to end a message, or nothing."""
-    near = near_miss(name, further)
-    return "" if near is None else f" (is it `{_short(near)}`?)"
-
-
-def _short(name: str) -> str:
-    """A column's name on one line and not too long."""
-    text = name if name.isprintable() else ascii(name)
-    return text if len(text) <= 40 else f"{text[:37]}..."

@@ -14,20 +14,28 @@ from snrmjax.numerics.facts import Fact
 FilePath = str | os.PathLike[str]
 
 
-def read_text(path: FilePath) -> str:
-    """The text of a UTF-8 file, without a byte-order mark and with its line ends as they are.
+def read_bytes(path: FilePath, most: int = -1) -> bytes:
+    """The content of a file, or its first bytes.
 
-    Returns the text. Raises `ValueError` when the file is missing, a folder, unreadable or not
-    text.
+    Raises `ValueError` when the file is missing, a folder or unreadable.
     """
     try:
-        content = Path(path).read_bytes()
+        with open(path, "rb") as file:
+            return file.read(most)
     except FileNotFoundError as error:
         raise ValueError(f"{os.fspath(path)} does not exist.") from error
     except IsADirectoryError as error:
         raise ValueError(f"{os.fspath(path)} is a folder, but a file is expected.") from error
     except OSError as error:
         raise ValueError(f"{os.fspath(path)} cannot be read: {error.strerror}.") from error
+
+
+def read_text(path: FilePath) -> str:
+    """The text of a UTF-8 file, without a byte-order mark and with its line ends as they are.
+
+    Raises `ValueError` as `read_bytes` does, and for what is not text.
+    """
+    content = read_bytes(path)
     if b"\0" in content:
         raise ValueError(f"{file_name(path)} is not a UTF-8 text file (it has NUL bytes).")
     try:
@@ -38,36 +46,13 @@ def read_text(path: FilePath) -> str:
         ) from error
 
 
-def write_atomically(path: FilePath, content: str | bytes) -> None:
-    """Write a whole file or nothing: to a temporary file beside it, which then takes its name.
-
-    Arguments: `content` as bytes, or as a text that is written in UTF-8 with its line ends as
-    they are. Raises `ValueError` when the folder does not exist or cannot be written.
-    """
-    target = Path(os.path.realpath(path))  # a link stays a link
-    temporary = target.with_name(f".{uuid.uuid4().hex}.tmp")
-    data = content.encode("utf-8") if isinstance(content, str) else content
-    try:
-        temporary.write_bytes(data)
-        os.replace(temporary, target)
-    except FileNotFoundError as error:
-        raise ValueError(
-            f"{os.fspath(path)} cannot be written: its folder does not exist."
-        ) from error
-    except OSError as error:
-        raise ValueError(f"{os.fspath(path)} cannot be written: {error.strerror}.") from error
-    finally:
-        if temporary.exists():
-            temporary.unlink()
-
-
 @contextmanager
 def written_whole(path: FilePath) -> Iterator[Path]:
     """A temporary file beside `path` to write into, which then takes its name, or nothing is left.
 
     Raises `ValueError` when the folder does not exist or cannot be written.
     """
-    target = Path(os.path.realpath(path))
+    target = Path(os.path.realpath(path))  # a link stays a link
     temporary = target.with_name(f".{uuid.uuid4().hex}.tmp")
     if not target.parent.is_dir():
         raise ValueError(f"{os.fspath(path)} cannot be written: its folder does not exist.")
@@ -77,8 +62,16 @@ def written_whole(path: FilePath) -> Iterator[Path]:
     except OSError as error:
         raise ValueError(f"{os.fspath(path)} cannot be written: {error.strerror}.") from error
     finally:
-        if temporary.exists():
-            temporary.unlink()
+        temporary.unlink(missing_ok=True)
+
+
+def write_atomically(path: FilePath, content: str | bytes) -> None:
+    """Write a whole file or nothing; a text in UTF-8 with its line ends as they are.
+
+    Raises `ValueError` as `written_whole` does.
+    """
+    with written_whole(path) as temporary:
+        temporary.write_bytes(content.encode("utf-8") if isinstance(content, str) else content)
 
 
 def write_summary(path: Path, summary: dict) -> None:

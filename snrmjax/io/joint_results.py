@@ -1,43 +1,41 @@
 """A joint fit as tables, as part of a summary, and as a file that gives it back."""
 
+import importlib
 import json
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from snrmjax.identify.curves.families import FAMILIES
-from snrmjax.identify.curves.family_base import AbstractFamily
 from snrmjax.identify.inference.contributions import Contribution
 from snrmjax.identify.inference.fitted_curves import values_to_the_largest
 from snrmjax.identify.inference.fitted_response import FittedResponse
 from snrmjax.identify.inference.located_points import FittedPoint
 from snrmjax.identify.inference.optimal_design import NextMeasurement, NextMeasurements
-from snrmjax.identify.joint.family_fit import FitStatus
-from snrmjax.identify.joint.force_balance import (
-    BalanceData,
-    BalanceProblem,
-    PriorStd,
-    Unknowns,
-)
 from snrmjax.identify.joint.joint_fit import JointFit
-from snrmjax.identify.joint.notes import NoiseEstimate
 from snrmjax.identify.test_model.states import LEVEL_ERRORS
 from snrmjax.io.files import FilePath, read_text, write_atomically
 from snrmjax.io.results import write_values
 from snrmjax.io.tables import write_table
 from snrmjax.io.units import HERTZ
-from snrmjax.model.modes import LinearModes, LinearModesStd, RigidBodyModes, linear_modes
+from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.status import Status
 
 BAND_POINTS = 200
-_FORMAT = 3
+_FORMAT = 4
 
 
-def write_fitted_backbone(path: Path, fit: JointFit) -> None:
-    """Write both fitted curves with 1σ from zero to the largest measured velocity."""
-    write_values(path, values_to_the_largest(fit, BAND_POINTS))
+def write_fitted_backbone(
+    path: FilePath, fit: JointFit, *, added: tuple[str, int] | None = None
+) -> None:
+    """Write both fitted curves with 1σ from zero to the largest measured velocity.
+
+    Arguments: `added` as for `write_values`.
+    """
+    write_values(path, values_to_the_largest(fit, BAND_POINTS), added=added)
 
 
 def write_next(path: FilePath, advice: Sequence[NextMeasurement] | NextMeasurements) -> None:
@@ -47,13 +45,15 @@ def write_next(path: FilePath, advice: Sequence[NextMeasurement] | NextMeasureme
     fit found.
     """
     columns: dict[str, Sequence[object]] = {
-        "rank": [one.rank for one in advice],
-        "force_n": [one.force for one in advice],
-        "frequency_hz": [one.frequency / HERTZ for one in advice],
-        "expected_band_ratio": [one.expected_band_ratio for one in advice],
-        "reason": [f"expected {one.expected}: {one.reason}" for one in advice],
+        "rank": [measurement.rank for measurement in advice],
+        "force_n": [measurement.force for measurement in advice],
+        "frequency_hz": [measurement.frequency / HERTZ for measurement in advice],
+        "expected_band_ratio": [measurement.expected_band_ratio for measurement in advice],
+        "reason": [
+            f"expected {measurement.expected}: {measurement.reason}" for measurement in advice
+        ],
     }
-    drives = [one.drive for one in advice if one.drive is not None]
+    drives = [measurement.drive for measurement in advice if measurement.drive is not None]
     if drives or (isinstance(advice, NextMeasurements) and advice.drive_known_only):
         columns["drive_v"] = drives
     write_table(path, columns)
@@ -71,8 +71,8 @@ def summarise_fit(
     return {
         "converged": fit.converged,
         "status": fit.status.name.lower(),
-        "backbone": described(fit.unknowns.squared_frequency),
-        "damping": described(fit.unknowns.modal_damping),
+        "backbone": fit.unknowns.squared_frequency.label,
+        "damping": fit.unknowns.modal_damping.label,
         "parameters": {
             name: {"value": float(value), "std": float(spread), "unit": unit}
             for name, value, spread, unit in list(
@@ -94,7 +94,7 @@ def summarise_fit(
             "damping_std_relative": level["damping"],
         },
         "modal_mass": _modal_mass(fit),
-        "contributions": [one._asdict() for one in shares],
+        "contributions": [share._asdict() for share in shares],
         "resonances": [_point(p) for r in responses for p in r.resonances],
         "folds": [_point(p) for r in responses for p in r.folds],
         "not_located": [
@@ -102,7 +102,7 @@ def summarise_fit(
             for r in responses
             for p in r.not_located
         ],
-        "notes": list(fit.notes),
+        "notes": [str(note) for note in fit.notes],
     }
 
 
@@ -118,11 +118,6 @@ def _modal_mass(fit: JointFit) -> dict:
     }
 
 
-def described(family: AbstractFamily) -> str:
-    """A family as the command takes it."""
-    return family.label
-
-
 def _point(point: FittedPoint) -> dict:
     return {
         "force_n": point.force,
@@ -136,38 +131,9 @@ def _point(point: FittedPoint) -> dict:
 
 def write_joint_fit(path: FilePath, fit: JointFit) -> None:
     """Write a joint fit, its data and covariance included, as JSON that `read_joint_fit` reads."""
-    write_atomically(Path(path), json.dumps(_encoded(_content(fit)), allow_nan=True) + "\n")
-
-
-def _content(fit: JointFit) -> dict:
-    unknowns = fit.unknowns
-    return {
-        "format": _FORMAT,
-        "names": list(fit.names()),
-        "units": list(fit.units()),
-        "covariance": fit.covariance,
-        "squared_frequency": _family_entry(unknowns.squared_frequency),
-        "modal_damping": _family_entry(unknowns.modal_damping),
-        "unknowns": {
-            name: getattr(unknowns, name)
-            for name in ("log_force_gain", "force_offset", "instrument_phase", "level", "linear")
-        },
-        "spread": vars(fit.prior),
-        "data": vars(fit.data),
-        "modes": vars(fit.modes),
-        "residuals": fit.residuals,
-        "level_std": fit.noise.level_std,
-        "neighbour_correlation": fit.noise.autocorrelation,
-        "noise_scale": fit.noise.scale,
-        "noise_scale_std": fit.noise.scale_std,
-        "noise_stated": fit.noise.stated,
-        "drive_known_only": fit.drive_known_only,
-        "free": fit.free,
-        "notes": fit.notes,
-        "converged": fit.converged,
-        "status": fit.status,
-        "level_numbers": fit.level_numbers,
-    }
+    content = {"format": _FORMAT, "names": fit.names(), "units": fit.units(), "fit": fit}
+    text = json.dumps({name: _encoded(value) for name, value in content.items()}, allow_nan=True)
+    write_atomically(path, text + "\n")
 
 
 def read_joint_fit(path: FilePath) -> JointFit:
@@ -176,90 +142,70 @@ def read_joint_fit(path: FilePath) -> JointFit:
     Raises `ValueError` when the file is none, and what opening it raises.
     """
     try:
-        content = _decoded(json.loads(read_text(path)))
+        content = json.loads(read_text(path))
     except json.JSONDecodeError as error:
         raise ValueError(f"{path} is no joint fit: {error}.") from error
     if not isinstance(content, dict) or content.get("format") != _FORMAT:
         raise ValueError(f"{path} is no joint fit of format {_FORMAT}.")
-    return _rebuilt(content)
+    fit = _decoded(content.get("fit"))
+    if not isinstance(fit, JointFit):
+        raise ValueError(f"{path} is no joint fit: it holds another thing.")
+    return fit
 
 
-def _rebuilt(content: dict[str, Any]) -> JointFit:
-    data, modes = content["data"], content["modes"]
-    keys = ("natural_frequency", "damping_ratio", "mode_shape", "participation")
-    rebuilt: LinearModes = linear_modes(
-        *(modes[key] for key in keys),
-        sensors=tuple(modes["sensors"]),
-        mode_of_interest=modes["mode_of_interest"],
-        rigid_body=RigidBodyModes(modes["rigid_body_shape"], modes["rigid_body_participation"]),
-        std=LinearModesStd(*(modes.get(f"{name}_std") for name in LinearModesStd._fields)),
-    )
-    squared, damping = (
-        _family(content["squared_frequency"]),
-        _family(content["modal_damping"]),
-    )
-    arrays = {k: jnp.asarray(v) for k, v in content["unknowns"].items()}
-    prior = PriorStd(**{name: jnp.asarray(std) for name, std in content["spread"].items()})
-    # Files written before a fit had a status know only whether it converged.
-    known = FitStatus.CONVERGED if content["converged"] else FitStatus.NOT_SETTLED
-    return JointFit(
-        unknowns=Unknowns(squared_frequency=squared, modal_damping=damping, **arrays),
-        covariance=np.asarray(content["covariance"]),
-        problem=BalanceProblem(BalanceData(**_on_device(data)), rebuilt, prior),
-        noise=NoiseEstimate(
-            scale=content["noise_scale"],
-            scale_std=content["noise_scale_std"],
-            level_std=np.asarray(content["level_std"]),
-            autocorrelation=np.asarray(content.get("neighbour_correlation", [0.0, 0.0])),
-            stated=content["noise_stated"],
-        ),
-        residuals=np.asarray(content["residuals"]),
-        drive_known_only=content["drive_known_only"],
-        free=tuple(content["free"]),
-        notes=tuple(content["notes"]),
-        status=FitStatus(content.get("status", known)),
-        level_numbers=tuple(content.get("level_numbers", range(data["n_levels"]))),
-    )
-
-
-def _family_entry(family: AbstractFamily) -> dict:
-    return {"kind": family.kind, **vars(family)}
-
-
-def _family(entry: dict[str, Any]) -> AbstractFamily:
-    return FAMILIES[entry["kind"]](**_on_device({k: v for k, v in entry.items() if k != "kind"}))
-
-
-def _on_device(fields: dict[str, Any]) -> dict[str, Any]:
-    return {k: jnp.asarray(v) if isinstance(v, np.ndarray) else v for k, v in fields.items()}
-
-
-def _encoded(value: object) -> object:
-    """Arrays as objects that say their type and shape; everything else as JSON has it."""
-    if isinstance(value, dict):
-        return {key: _encoded(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_encoded(item) for item in value]
-    if isinstance(value, np.generic):
-        return value.item()
-    if hasattr(value, "dtype"):
+def _encoded(value: Any) -> Any:
+    """What JSON lacks as an object with one key that says what it is."""
+    if isinstance(value, Fact):
+        return {"fact": str(value)}
+    if isinstance(value, Status):
+        return {"status": _class_name(value), "value": int(value)}
+    if isinstance(value, np.ndarray | np.generic | jax.Array):
         array = np.asarray(value)
         parts = [array.real, array.imag] if np.iscomplexobj(array) else [array]
         return {
             "array": [part.reshape(-1).tolist() for part in parts],
             "shape": list(array.shape),
             "type": array.dtype.name,
+            "on_device": isinstance(value, jax.Array),
         }
+    if isinstance(value, eqx.Module) or hasattr(value, "_fields"):
+        fields = value._fields if hasattr(value, "_fields") else vars(value)
+        held = {name: _encoded(getattr(value, name)) for name in fields}
+        return {"class": _class_name(value), "fields": held}
+    if isinstance(value, list | tuple):
+        return {"list": [_encoded(item) for item in value]}
     return value
 
 
+def _class_name(value: Any) -> str:
+    return f"{type(value).__module__}:{type(value).__qualname__}"
+
+
 def _decoded(value: Any) -> Any:
-    if isinstance(value, list):
-        return [_decoded(item) for item in value]
     if not isinstance(value, dict):
         return value
-    if set(value) != {"array", "shape", "type"}:
-        return {key: _decoded(item) for key, item in value.items()}
+    if "fact" in value:
+        return Fact("as_in_file", text=value["fact"])
+    if "status" in value:
+        return _class(value["status"])(value["value"])
+    if "list" in value:
+        return tuple(_decoded(item) for item in value["list"])
+    if "class" in value:
+        fields = {name: _decoded(item) for name, item in value["fields"].items()}
+        return _class(value["class"])(**fields)
     parts = [np.asarray(part, dtype=np.float64) for part in value["array"]]
     array = parts[0] + 1j * parts[1] if len(parts) == 2 else parts[0]
-    return array.astype(value["type"]).reshape(value["shape"])
+    array = array.astype(value["type"]).reshape(value["shape"])
+    return jnp.asarray(array) if value["on_device"] else array
+
+
+def _class(name: str) -> Any:
+    """A class of this package: nothing else is made from a file."""
+    module, _, qualified = name.partition(":")
+    if not module.startswith("snrmjax.") or not qualified.isidentifier():
+        raise ValueError(f"a joint fit is not made of {name}.")
+    named = getattr(importlib.import_module(module), qualified, None)
+    holds = isinstance(named, type) and issubclass(named, tuple | Status | eqx.Module)
+    if not holds:
+        raise ValueError(f"a joint fit is not made of {name}.")
+    return named

@@ -8,7 +8,7 @@ from snrmjax.diagnose.diagnosis_result import FormerAnswer
 from snrmjax.diagnose.measurement_plan import MeasurementPlan
 from snrmjax.io.columns import PHASOR, harmonic_columns, read_header
 from snrmjax.io.files import FilePath, file_name, read_text, shown
-from snrmjax.io.rows import Cells, split_rows
+from snrmjax.io.rows import read_cells
 from snrmjax.io.tables import read_steady_states, write_table
 from snrmjax.io.units import DEGREE, HERTZ
 from snrmjax.measure.states import SteadyStates, join_steady_states
@@ -79,17 +79,13 @@ def read_further_states(path: FilePath, model: Structure, first: SteadyStates) -
 
 def _check_filled(path: FilePath) -> None:
     """Refuse a table with an empty field where something was to be measured."""
-    file = file_name(path)
-    rows = split_rows(read_text(path), file)
-    header = read_header(rows[0].fields, file)
-    cells = Cells(rows[1:], header, file)
-    measured = [name for name in (*PHASOR, *header.harmonics) if name in header.position]
-    if header.harmonics and "harmonic_std_m_s" in header.position:
-        measured.append("harmonic_std_m_s")
-    for name in measured:
-        place = header.position[name]
-        for number, row in enumerate(cells.rows):
-            if len(row.fields) == header.n_columns and row.fields[place] == "":
+    cells = read_cells(path)
+    header = read_header(cells)
+    cells.require_rows()
+    std = ("harmonic_std_m_s",) if header.harmonics else ()
+    for name in (*PHASOR, *header.harmonics, *std):
+        for number, text in enumerate(cells.texts(name) if name in header.used else ()):
+            if text == "":
                 raise cells.refusal(name, "filled in with what was measured", number)
 
 
@@ -100,18 +96,18 @@ def read_former_answer(path: FilePath) -> FormerAnswer:
     """
     file = file_name(path)
     try:
-        told = json.loads(read_text(path))
-        every = {row["effect"]: row for step in told["tried"] for row in step}
+        answer = json.loads(read_text(path))
+        rows = {row["effect"]: row for step in answer["tried"] for row in step}
         starts = {
             kind: tuple(
                 float(value)
                 for name, value in row["parameters"].items()
                 if name.startswith(f"{kind}.")
             )
-            for kind, row in every.items()
+            for kind, row in rows.items()
         }
-        probabilities = {str(name): float(p) for name, p in told["probabilities"].items()}
-        return FormerAnswer(str(told["verdict"]), tuple(told["effects"]), probabilities, starts)
+        probabilities = {str(name): float(p) for name, p in answer["probabilities"].items()}
+        return FormerAnswer(str(answer["verdict"]), tuple(answer["effects"]), probabilities, starts)
     except (json.JSONDecodeError, KeyError, TypeError, AttributeError, ValueError) as error:
         if isinstance(error, ValueError) and not isinstance(error, json.JSONDecodeError):
             raise

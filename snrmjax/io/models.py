@@ -1,6 +1,5 @@
 """Models: a structure in and out, as TOML."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import jax
@@ -36,23 +35,34 @@ from snrmjax.model.potential import (
     polynomial_potential,
 )
 from snrmjax.model.structures import Structure, structure
-from snrmjax.numerics.rules import BELOW_ONE, IN_RANGE_HZ, NOT_NEGATIVE, NOT_ZERO, POSITIVE
+from snrmjax.numerics.rules import BELOW_ONE, IN_RANGE_HZ, NOT_NEGATIVE, NOT_ZERO, POSITIVE, Rule
 
-_MODE_KEYS = ("frequency_hz", "damping_ratio", "shape", "participation")
-_MODE_STD_KEYS = ("frequency_std_hz", "damping_ratio_std", "modal_mass_std")
-_RIGID_BODY_KEYS = ("shape", "participation")
-_MEASUREMENT_KEYS = (
-    *("level_gain_std", "level_phase_std_deg"),
-    *("level_frequency_std_hz", "level_damping_ratio_std"),
-)
 _TOP_KEYS = (
-    "name",
-    "mode_of_interest",
-    "mode",
-    "rigid_body_mode",
-    "potential",
-    "effect",
-    "measurement",
+    *("name", "mode_of_interest", "mode", "rigid_body_mode"),
+    *("potential", "effect", "measurement"),
+)
+
+
+_Rules = dict[str, tuple[Rule, ...]]
+# The keys of numbers of each table with their rules; standard deviations may be missing.
+_MODE: _Rules = {
+    "frequency_hz": (POSITIVE, IN_RANGE_HZ),
+    "damping_ratio": (BELOW_ONE,),
+    "shape": (),
+    "participation": (NOT_ZERO,),
+}
+_MODE_STD: _Rules = {
+    "frequency_std_hz": (NOT_NEGATIVE, IN_RANGE_HZ),
+    "damping_ratio_std": (NOT_NEGATIVE,),
+    "modal_mass_std": (NOT_NEGATIVE,),
+}
+_RIGID_BODY_MODE: _Rules = {"shape": (), "participation": (NOT_ZERO,)}
+_MEASUREMENT: _Rules = dict.fromkeys(
+    (
+        *("level_gain_std", "level_phase_std_deg"),
+        *("level_frequency_std_hz", "level_damping_ratio_std"),
+    ),
+    (NOT_NEGATIVE,),
 )
 
 
@@ -72,146 +82,139 @@ def read_model(path: FilePath) -> Structure:
 
 def _read(text: str, file: str, stem: str) -> Structure:
     top = parsed_toml(text, file)
-    entries = top.entries
     top.check_keys((), _TOP_KEYS)
-    name = entries.get("name", stem)
-    if not isinstance(name, str):
-        raise top.refusal("name", "a text", name)
     modes = _modes(top, file)
-    measurement = top.table("measurement", f"[measurement] of {file}")
-    measurement.check_keys((), _MEASUREMENT_KEYS)
+    errors = _numbers(top.table("measurement", f"[measurement] of {file}"), {}, _MEASUREMENT)
     return structure(
         modes,
         _potential(top.table("potential", f"[potential] of {file}"), modes.n_modes),
         effects=tuple(_effect(table) for table in top.tables("effect", file)),
-        level_gain_std=measurement.number("level_gain_std", NOT_NEGATIVE, default=0.0),
-        level_phase_std=measurement.number("level_phase_std_deg", NOT_NEGATIVE, default=0.0)
-        * DEGREE,
-        level_frequency_std=measurement.number("level_frequency_std_hz", NOT_NEGATIVE, default=0.0)
-        * HERTZ,
-        level_damping_std=measurement.number("level_damping_ratio_std", NOT_NEGATIVE, default=0.0),
-        name=name,
+        level_gain_std=errors.get("level_gain_std", 0.0),
+        level_phase_std=errors.get("level_phase_std_deg", 0.0) * DEGREE,
+        level_frequency_std=errors.get("level_frequency_std_hz", 0.0) * HERTZ,
+        level_damping_std=errors.get("level_damping_ratio_std", 0.0),
+        name=top.text("name", stem),
     )
 
 
+def _numbers(table: TomlTable, required: _Rules, optional: _Rules) -> dict[str, float]:
+    """The numbers of a table that are there, checked."""
+    table.check_keys(required, optional)
+    rules = {key: rule for key, rule in (required | optional).items() if key != "shape"}
+    return {key: table.number(key, *rules[key]) for key in rules if key in table.entries}
+
+
 def _modes(top: TomlTable, file: str) -> LinearModes:
-    flexible, rigid = top.tables("mode", file), top.tables("rigid_body_mode", file)
+    tables, rigid_tables = top.tables("mode", file), top.tables("rigid_body_mode", file)
+    flexible = [_numbers(table, _MODE, _MODE_STD) for table in tables]
+    rigid = [_numbers(table, _RIGID_BODY_MODE, {}) for table in rigid_tables]
     if not flexible:
         raise ValueError(f"{file} must have at least one mode with a shape, under [[mode]].")
-    of_interest = top.entries.get("mode_of_interest", 1)
-    if isinstance(of_interest, bool) or not isinstance(of_interest, int):
-        raise top.refusal("mode_of_interest", "a whole number", of_interest)
-    if not 1 <= of_interest <= len(flexible):
+    of_interest = top.whole("mode_of_interest", 1, 1)
+    if of_interest > len(flexible):
         expected = f"from 1 to the number of modes ({len(flexible)})"
         raise top.refusal("mode_of_interest", expected, of_interest)
-    for table in flexible:
-        table.check_keys(_MODE_KEYS, _MODE_STD_KEYS)
-    for table in rigid:
-        table.check_keys(_RIGID_BODY_KEYS)
-    shapes = [_shape(table) for table in (*flexible, *rigid)]
-    sensors = tuple(shapes[0])
-    for table, shape in zip((*flexible, *rigid), shapes, strict=True):
+    shapes = [_shape(table) for table in (*tables, *rigid_tables)]
+    sensors = tuple(shapes[0].entries)
+    for shape in shapes:
         for sensor in sensors:
-            if sensor not in shape:
-                near = near_miss(sensor, set(shape) - set(sensors))
+            if sensor not in shape.entries:
+                near = near_miss(sensor, set(shape.entries) - set(sensors))
                 raise ValueError(
-                    f"the shape of {table.place} lacks the sensor {shown(sensor)}, which mode 1 "
+                    f"{shape.place} lacks the sensor {shown(sensor)}, which mode 1 "
                     f"has{'' if near is None else f' (is it {shown(near)}?)'}."
                 )
-        for sensor in shape:
+        for sensor in shape.entries:
             if sensor not in sensors:
                 raise ValueError(
-                    f"the shape of {table.place} has the sensor {shown(sensor)}, which mode 1 "
-                    "lacks."
+                    f"{shape.place} has the sensor {shown(sensor)}, which mode 1 lacks."
                 )
-    if not any(shapes[of_interest - 1].values()):
+    mode_shape = np.array([[shape.number(name) for shape in shapes] for name in sensors])
+    if not np.any(mode_shape[:, of_interest - 1]):
         raise ValueError(
             f"{file} must have at least one mode with a shape, but the mode of interest "
             f"({of_interest}) is zero at every sensor."
         )
-    mode_shape = np.array([[shape[name] for shape in shapes] for name in sensors])
+
+    def stds(key: str, default: float = 0.0) -> list[float]:
+        return [mode.get(key, default) for mode in flexible]
+
+    known_mass = any("modal_mass_std" in mode for mode in flexible)
     return linear_modes(
-        [table.number("frequency_hz", POSITIVE, IN_RANGE_HZ) * HERTZ for table in flexible],
-        [table.number("damping_ratio", BELOW_ONE) for table in flexible],
+        [mode["frequency_hz"] * HERTZ for mode in flexible],
+        [mode["damping_ratio"] for mode in flexible],
         mode_shape[:, : len(flexible)],
-        [table.number("participation", NOT_ZERO) for table in flexible],
+        [mode["participation"] for mode in flexible],
         sensors=sensors,
         mode_of_interest=of_interest - 1,
         rigid_body=RigidBodyModes(
-            mode_shape[:, len(flexible) :],
-            np.array([table.number("participation", NOT_ZERO) for table in rigid]),
+            mode_shape[:, len(flexible) :], np.array([mode["participation"] for mode in rigid])
         ),
         std=LinearModesStd(
-            [
-                table.number("frequency_std_hz", NOT_NEGATIVE, IN_RANGE_HZ, default=0.0) * HERTZ
-                for table in flexible
-            ],
-            [table.number("damping_ratio_std", NOT_NEGATIVE, default=0.0) for table in flexible],
-            _modal_mass_std(flexible),
+            [std * HERTZ for std in stds("frequency_std_hz")],
+            stds("damping_ratio_std"),
+            stds("modal_mass_std", UNSTATED_MODAL_MASS_STD) if known_mass else None,
         ),
     )
 
 
-def _shape(mode: TomlTable) -> dict[str, float]:
-    """The shape of one mode: its value at each sensor."""
+def _shape(mode: TomlTable) -> TomlTable:
+    """The shape of one mode, its value at each sensor, checked."""
     table = mode.table("shape", f"the shape of {mode.place}")
     if not table.entries:
-        raise ValueError(f"the shape of {mode.place} must have at least one sensor.")
+        raise ValueError(f"{table.place} must have at least one sensor.")
     for sensor in table.entries:
         if sensor != sensor.strip() or sensor == "" or not sensor.isprintable():
             raise ValueError(
                 f"the name of a sensor must be a text without spaces around it, "
                 f"but {table.place} has {sensor!r}."
             )
-    return {sensor: table.number(sensor) for sensor in table.entries}
+        table.number(sensor)
+    return table
 
 
 def _potential(table: TomlTable, n_modes: int) -> PolynomialPotential:
     coefficients: dict[Monomial, float] = {}
     spread: dict[Monomial, float] = {}
-    for key, value in table.entries.items():
+    for name, value in table.entries.items():
         try:
-            monomial = parse_monomial(key, n_modes)
+            monomial = parse_monomial(name, n_modes)
         except ValueError as error:
             raise ValueError(f"{table.place} cannot be read: {error}") from error
         if monomial in coefficients:
             raise ValueError(
-                f"{table.place} has the monomial {key!r} twice (the order of the modes is free)."
+                f"{table.place} has the monomial {name!r} twice (the order of the modes is free)."
             )
         if isinstance(value, dict):
-            entry = TomlTable(value, f"monomial {key!r} in {table.place}")
+            entry = TomlTable(value, f"monomial {name!r} in {table.place}")
             entry.check_keys(("coefficient",), ("std",))
             coefficients[monomial] = entry.number("coefficient")
             spread[monomial] = entry.number("std", NOT_NEGATIVE, default=0.0)
         else:
-            coefficients[monomial] = table.number(key)
+            coefficients[monomial] = table.number(name)
     return polynomial_potential(coefficients, n_modes, coefficient_std=spread)
 
 
 def _effect(table: TomlTable) -> AbstractEffect:
     if "kind" not in table.entries:
         raise ValueError(f"{table.place} lacks the key `kind`.")
-    kind = table.entries["kind"]
-    if not isinstance(kind, str):
-        raise table.refusal("kind", "a text", kind)
-    every = (*EFFECTS, *LAWS)
-    if kind in every:
-        wanted = effect_class(kind).parameters()
-        table = TomlTable(table.entries, f"{table.place} ({kind})")
-        table.check_keys(("kind", *wanted))
-        values: dict[str, float | np.ndarray] = {
-            name: table.number(name, *one.rules)
-            if one.entries is Entries.ONE
-            else np.array(table.numbers(name, *one.rules))
-            for name, one in wanted.items()
-        }
-        try:
-            return make_effect(kind, values)
-        except ValueError as error:
-            raise ValueError(f"{table.place} cannot be read: {error}") from error
-    near = suggestion(kind, every)
-    known = "" if near else f" (known are {', '.join(sorted(every))})"
-    raise ValueError(f"{table.place} has the unknown kind {shown(kind)}{near}{known}.")
+    kind, known_kinds = table.text("kind"), (*EFFECTS, *LAWS)
+    if kind not in known_kinds:
+        near = suggestion(kind, known_kinds) or f" (known are {', '.join(sorted(known_kinds))})"
+        raise ValueError(f"{table.place} has the unknown kind {shown(kind)}{near}.")
+    wanted = effect_class(kind).parameters()
+    table = TomlTable(table.entries, f"{table.place} ({kind})")
+    table.check_keys(("kind", *wanted))
+    values: dict[str, float | np.ndarray] = {
+        name: table.number(name, *parameter.rules)
+        if parameter.entries is Entries.ONE
+        else np.array(table.numbers(name, *parameter.rules))
+        for name, parameter in wanted.items()
+    }
+    try:
+        return make_effect(kind, values)
+    except ValueError as error:
+        raise ValueError(f"{table.place} cannot be read: {error}") from error
 
 
 def write_model(path: FilePath, model: Structure) -> None:
@@ -230,52 +233,42 @@ def write_model(path: FilePath, model: Structure) -> None:
     write_atomically(path, text)
 
 
-def _modal_mass_std(flexible: Sequence[TomlTable]) -> list[float] | None:
-    """As stated, for a mode without it as where nobody stated any; None if no mode has one."""
-    if not any("modal_mass_std" in table.entries for table in flexible):
-        return None
-    default = UNSTATED_MODAL_MASS_STD
-    return [table.number("modal_mass_std", NOT_NEGATIVE, default=default) for table in flexible]
-
-
 def _entries(model: Structure) -> dict[str, object]:
-    modes = model.modes
-    flexible = []
+    modes, potential = model.modes, model.potential
+
+    def shape(of: object) -> dict[str, float]:
+        return dict(zip(modes.sensors, np.asarray(of).tolist(), strict=True))
+
+    flexible: list[dict[str, object]] = []
     for k in range(modes.n_modes):
-        entry: dict[str, object] = {
+        stds = {
+            "frequency_std_hz": in_unit(float(modes.natural_frequency_std[k]), HERTZ),
+            "damping_ratio_std": float(modes.damping_ratio_std[k]),
+        }
+        entry = {
             "frequency_hz": in_unit(float(modes.natural_frequency[k]), HERTZ),
             "damping_ratio": float(modes.damping_ratio[k]),
             "participation": float(modes.participation[k]),
+            **{key: value for key, value in stds.items() if value},
         }
-        if modes.natural_frequency_std[k] != 0:
-            entry["frequency_std_hz"] = in_unit(float(modes.natural_frequency_std[k]), HERTZ)
-        if modes.damping_ratio_std[k] != 0:
-            entry["damping_ratio_std"] = float(modes.damping_ratio_std[k])
         if modes.modal_mass_std is not None:
             entry["modal_mass_std"] = float(modes.modal_mass_std[k])
-        entry["shape"] = _shape_entry(modes, modes.mode_shape[:, k])
-        flexible.append(entry)
+        flexible.append({**entry, "shape": shape(modes.mode_shape[:, k])})
     rigid = [
-        {
-            "participation": float(modes.rigid_body_participation[k]),
-            "shape": _shape_entry(modes, modes.rigid_body_shape[:, k]),
-        }
-        for k in range(modes.rigid_body_participation.shape[0])
+        {"participation": float(participation), "shape": shape(modes.rigid_body_shape[:, k])}
+        for k, participation in enumerate(modes.rigid_body_participation)
     ]
-    potential: dict[str, object] = {}
-    for monomial, value, std in zip(
-        model.potential.monomials,
-        model.potential.coefficient.tolist(),
-        model.potential.coefficient_std.tolist(),
+    coefficients = zip(
+        potential.monomials,
+        potential.coefficient.tolist(),
+        potential.coefficient_std.tolist(),
         strict=True,
-    ):
-        potential[monomial_key(monomial)] = {"coefficient": value, "std": std} if std else value
-    measurement = {
+    )
+    frequency_std = _one("level_frequency_std", model.level_frequency_std)
+    errors = {
         "level_gain_std": _one("level_gain_std", model.level_gain_std),
         "level_phase_std_deg": in_unit(_one("level_phase_std", model.level_phase_std), DEGREE),
-        "level_frequency_std_hz": in_unit(
-            _one("level_frequency_std", model.level_frequency_std), HERTZ
-        ),
+        "level_frequency_std_hz": in_unit(frequency_std, HERTZ),
         "level_damping_ratio_std": _one("level_damping_std", model.level_damping_std),
     }
     parts: dict[str, object] = {
@@ -283,24 +276,25 @@ def _entries(model: Structure) -> dict[str, object]:
         "mode_of_interest": modes.mode_of_interest + 1,
         "mode": flexible,
         "rigid_body_mode": rigid,
-        "potential": potential,
+        "potential": {
+            monomial_key(monomial): {"coefficient": value, "std": std} if std else value
+            for monomial, value, std in coefficients
+        },
         "effect": [_effect_entry(effect) for effect in model.effects],
-        "measurement": {key: value for key, value in measurement.items() if value != 0},
+        "measurement": {key: value for key, value in errors.items() if value},
     }
-    return {key: value for key, value in parts.items() if value not in ([], {})}
-
-
-def _shape_entry(modes: LinearModes, shape: object) -> dict[str, float]:
-    return dict(zip(modes.sensors, np.asarray(shape).tolist(), strict=True))
+    return {name: value for name, value in parts.items() if value not in ([], {})}
 
 
 def _effect_entry(effect: AbstractEffect) -> dict[str, object]:
     if effect.kind not in (*EFFECTS, *LAWS):
         raise ValueError(f"an effect to be written must be of a known kind, not {effect.kind!r}.")
     entry: dict[str, object] = {"kind": effect.kind}
-    for name, one in effect_class(effect.kind).parameters().items():
+    for name, parameter in effect_class(effect.kind).parameters().items():
         value = getattr(effect, name)
-        entry[name] = _one(name, value) if one.entries is Entries.ONE else np.ravel(value).tolist()
+        entry[name] = (
+            _one(name, value) if parameter.entries is Entries.ONE else np.ravel(value).tolist()
+        )
     return entry
 
 

@@ -1,7 +1,6 @@
 """Results as tables and as one summary: what the commands write."""
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import jax
 import numpy as np
@@ -11,7 +10,7 @@ from snrmjax.identify.pointwise.backbone import BackboneValues
 from snrmjax.identify.pointwise.inversion_result import PointStatus
 from snrmjax.identify.pointwise.prediction import PredictedResponse, Resonance
 from snrmjax.identify.prediction.resonance_distribution import QUANTILES, ResonanceDistribution
-from snrmjax.io.files import FilePath, write_atomically
+from snrmjax.io.files import FilePath
 from snrmjax.io.tables import write_table
 from snrmjax.io.units import HERTZ
 from snrmjax.measure.signals import peak_amplitude
@@ -20,6 +19,15 @@ from snrmjax.simulate.continuation.stability import Stability
 from snrmjax.simulate.solutions.normal_modes import NormalModeBranch
 
 BACKBONE_POINTS = 200
+# What other programs rely on: the columns of backbone.csv and points.csv, in their order.
+_CURVES = (
+    *("natural_frequency_hz", "natural_frequency_std_hz", "damping_ratio", "damping_ratio_std"),
+)
+_VALUES = ("velocity_m_s", *_CURVES)
+_POINTS = (
+    *("level", "frequency_hz", "force_n", "velocity_m_s", "phase_deg", "nnmai", *_CURVES),
+    *("backbone_velocity_m_s", "status"),
+)
 
 
 def write_response(
@@ -81,65 +89,49 @@ def write_normal_mode(
     )
 
 
-def write_points(path: FilePath, identification: Identification) -> None:
-    """Write the identified points, one row a steady state."""
-    points = identification.points
-    write_table(
-        path,
-        {
-            "level": points.level,
-            "frequency_hz": np.asarray(points.frequency) / HERTZ,
-            "force_n": points.force,
-            "velocity_m_s": np.abs(np.asarray(points.velocity)),
-            "phase_deg": np.degrees(np.angle(np.asarray(points.velocity))),
-            "nnmai": points.appropriation,
-            "natural_frequency_hz": np.asarray(points.natural_frequency) / HERTZ,
-            "natural_frequency_std_hz": np.asarray(points.natural_frequency_std) / HERTZ,
-            "damping_ratio": points.damping_ratio,
-            "damping_ratio_std": points.damping_ratio_std,
-            "backbone_velocity_m_s": points.backbone_velocity,
-            "status": [PointStatus(int(s)).name.lower() for s in np.asarray(points.status)],
-        },
-    )
+def write_points(
+    path: FilePath, identification: Identification, *, added: tuple[str, int] | None = None
+) -> None:
+    """Write the identified points, one row a steady state.
 
-
-def with_amplitude(path: FilePath, of: str, name: str, power: int) -> None:
-    """Add a column at the end of a written table: another amplitude of the motion.
-
-    Arguments: `of` is the column of the velocity (m/s) on the backbone, which times the natural
-    angular frequency to `power` is the column `name`.
+    Arguments: `added` as for `write_values`.
     """
-    rows = [line.split(",") for line in Path(path).read_text(encoding="utf-8").splitlines()]
-    header, *values = rows
-    speed, hertz = header.index(of), header.index("natural_frequency_hz")
-    lines = [",".join([*header, name])]
-    for row in values:
-        known = row[speed] and row[hertz]
-        number = f"{float(row[speed]) * (float(row[hertz]) * HERTZ) ** power:.12g}" if known else ""
-        lines.append(",".join([*row, number]))
-    write_atomically(path, "\n".join(lines) + "\n")
+    held = identification.points.variables()
+    columns = {name: held[name].values for name in _POINTS}
+    write_table(path, _with_amplitude(columns, "backbone_velocity_m_s", added))
 
 
-def write_backbone(path: FilePath, identification: Identification) -> None:
+def write_backbone(
+    path: FilePath, identification: Identification, *, added: tuple[str, int] | None = None
+) -> None:
     """Write the backbone with its 1σ between the smallest and the largest point used.
 
-    An anchored backbone starts at zero amplitude.
+    Arguments: `added` as for `write_values`.
     """
-    write_values(path, identification.backbone.sampled(BACKBONE_POINTS))
+    write_values(path, identification.backbone.sampled(BACKBONE_POINTS), added=added)
 
 
-def write_values(path: FilePath, values: BackboneValues) -> None:
-    """Write natural frequency and damping against velocity, with 1σ."""
-    write_table(
-        path,
-        {
-            "velocity_m_s": values.velocity,
-            "natural_frequency_hz": np.asarray(values.natural_frequency) / HERTZ,
-            "natural_frequency_std_hz": np.asarray(values.natural_frequency_std) / HERTZ,
-            "damping_ratio": values.damping_ratio,
-            "damping_ratio_std": values.damping_ratio_std,
-        },
-    )
+def write_values(
+    path: FilePath, values: BackboneValues, *, added: tuple[str, int] | None = None
+) -> None:
+    """Write natural frequency and damping against velocity, with 1σ.
+
+    Arguments: `added` is one more column, another amplitude of the motion: its name in place of
+    "velocity_m_s", and the power of the natural angular frequency that the velocity is times.
+    """
+    held = values.variables()
+    columns = {name: held[name].values for name in _VALUES}
+    write_table(path, _with_amplitude(columns, "velocity_m_s", added))
+
+
+def _with_amplitude(
+    columns: dict[str, np.ndarray], of: str, added: tuple[str, int] | None
+) -> dict[str, np.ndarray]:
+    if added is None or not added[1]:
+        return columns
+    name, power = added
+    omega = columns["natural_frequency_hz"] * HERTZ
+    return columns | {of.replace("velocity_m_s", name): columns[of] * omega**power}
 
 
 def write_prediction(
@@ -183,7 +175,6 @@ def summarise(identification: Identification, values: BackboneValues) -> dict:
     frequency = np.asarray(values.natural_frequency) / HERTZ
     damping, velocity = values.damping_ratio, values.velocity
     status = np.asarray(points.status)
-    anchor = identification.anchor
     return {
         "sensor": points.sensor,
         "amplitude": points.argument,
@@ -207,17 +198,7 @@ def summarise(identification: Identification, values: BackboneValues) -> dict:
             "level_frequency_std_hz": identification.level_frequency_std / HERTZ,
             "level_damping_ratio_std": identification.level_damping_std,
         },
-        "anchor": None
-        if anchor is None
-        else {
-            "natural_frequency_gap_hz": anchor.frequency_gap / HERTZ,
-            "natural_frequency_gap_std_hz": anchor.frequency_gap_std / HERTZ,
-            "damping_ratio_gap": anchor.damping_gap,
-            "damping_ratio_gap_std": anchor.damping_gap_std,
-            "largest_shift_hz": anchor.largest_frequency_shift / HERTZ,
-            "largest_damping_ratio_shift": anchor.largest_damping_shift,
-        },
-        "notes": list(identification.notes),
+        "notes": [str(note) for note in identification.notes],
     }
 
 
@@ -232,17 +213,17 @@ def summarise_resonance(resonance: Resonance) -> dict:
     }
 
 
-def summarise_distribution(found: ResonanceDistribution) -> dict:
+def summarise_distribution(distribution: ResonanceDistribution) -> dict:
     """Whether a further level has its resonance in a range, and where, in units of the files."""
     return {
-        "force_n": found.force,
-        "largest_amplitude_ratio": found.largest_amplitude_ratio,
-        "probability": found.probability,
+        "force_n": distribution.force,
+        "largest_amplitude_ratio": distribution.largest_amplitude_ratio,
+        "probability": distribution.probability,
         "quantiles": list(QUANTILES),
-        "frequency_hz": (found.frequency / HERTZ).tolist(),
-        "velocity_m_s": found.velocity.tolist(),
-        "negative_damping": found.negative_damping,
-        "holds": found.holds,
+        "frequency_hz": (distribution.frequency / HERTZ).tolist(),
+        "velocity_m_s": distribution.velocity.tolist(),
+        "negative_damping": distribution.negative_damping,
+        "holds": distribution.holds,
     }
 
 

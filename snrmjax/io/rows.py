@@ -1,32 +1,25 @@
-"""The rows of a CSV, and columns of checked numbers in them."""
+"""A CSV as columns of checked numbers: what every table of ours is read by.
+
+The rules are those of a table that is to be trusted: a doubtful field is refused by its row, where
+`pandas` would guess (1_000, full-width digits, short rows).
+"""
 
 import csv
 import io
 import re
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
-from snrmjax.io.columns import Header
-from snrmjax.io.files import shown
-from snrmjax.numerics.rules import FRACTION, IN_RANGE_HZ, NOT_NEGATIVE, POSITIVE, SHORT, WHOLE, Rule
+from snrmjax.io.files import FilePath, file_name, read_text, shown
+from snrmjax.numerics.rules import Rule
 
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 _LIKE_GROUPED_NUMBER = re.compile(r"[+-]?[0-9][0-9.,'_\s]*(?:[eE][+-]?[0-9]+)?")
 _SPACE_BEHIND_QUOTES = re.compile(r'("[^"]*+(?:""[^"]*+)*+")(?:[ \t]+(?=[,\r\n]|\Z))?')
-
-_RULES: dict[str, tuple[Rule, ...]] = {
-    "level": (WHOLE, SHORT),
-    "frequency_hz": (POSITIVE, IN_RANGE_HZ),
-    "force_n": (POSITIVE,),
-    "drive_v": (POSITIVE,),
-    "velocity_m_s": (POSITIVE,),
-    "velocity_std_m_s": (NOT_NEGATIVE,),
-    "phase_std_deg": (NOT_NEGATIVE,),
-    "force_std_n": (NOT_NEGATIVE,),
-    "harmonic_std_m_s": (NOT_NEGATIVE,),
-    "order": (FRACTION,),
-}
+_PLAIN_NUMBER = re.compile(r"[+-]?[0-9.]+(?:[eE][+-]?[0-9]+)?")
 
 
 class Row(NamedTuple):
@@ -39,31 +32,49 @@ class Row(NamedTuple):
 class Cells(NamedTuple):
     """The rows below a header, read a column at a time."""
 
+    names: list[str]  # of the columns, as the header has them
     rows: list[Row]
-    header: Header
     file: str
+
+    def require_rows(self) -> None:
+        """Raises `ValueError` where there are none, or one is not of the header's width."""
+        width, file = len(self.names), self.file
+        for row in self.rows:
+            if len(row.fields) != width:
+                marks = " (numbers need a point as decimal sign and no thousands separators)"
+                raise ValueError(
+                    f"each row must have {width} fields as the header has, but row {row.number} "
+                    f"of {file} has {len(row.fields)}{marks if len(row.fields) > width else ''}."
+                )
+        if not self.rows:
+            raise ValueError(f"{file} has a header, but no rows below it.")
+
+    def has(self, column: str) -> bool:
+        """Whether there is such a column."""
+        return column in self.names
 
     def texts(self, column: str) -> list[str]:
         """The fields of one column."""
-        k = self.header.position[column]
+        k = self.names.index(column)
         return [row.fields[k] for row in self.rows]
 
     def refusal(self, column: str, expected: str, row: int) -> ValueError:
         """The error for one field."""
-        found = self.rows[row].fields[self.header.position[column]]
-        if found == "":
+        field = self.texts(column)[row]
+        if field == "":
             value = "an empty field"
         else:
-            value = found if _NUMBER.fullmatch(found) and len(found) <= 40 else shown(found)
+            value = field if _NUMBER.fullmatch(field) and len(field) <= 40 else shown(field)
         return ValueError(
             f"`{column}` must be {expected}, but row {self.rows[row].number} of {self.file} "
             f"has {value}."
         )
 
-    def numbers(self, column: str, *, empty_allowed: bool = False) -> np.ndarray:
+    def numbers(
+        self, column: str, rules: Sequence[Rule] = (), *, empty_allowed: bool = False
+    ) -> Float[np.ndarray, " row"]:
         """One column as numbers that keep its rules; NaN where a field is empty."""
         values = np.full(len(self.rows), np.nan)
-        rules = _RULES.get(column, ())
         for k, text in enumerate(self.texts(column)):
             if text == "" and empty_allowed:
                 continue
@@ -87,15 +98,55 @@ def _expected_number(text: str) -> str:
     return "a number"
 
 
-def split_rows(text: str, file: str) -> list[Row]:
-    """Split a CSV into rows, header included, without spaces around fields and blank lines behind.
+def read_cells(path: FilePath) -> Cells:
+    """The header and the rows of a CSV; raises `ValueError` as `cells_of` does."""
+    return cells_of(read_text(path), file_name(path))
 
-    Arguments: `text` of the whole file; `file` as messages name it.
-    Raises `ValueError` when the text is not a CSV or has a blank line in the middle.
 
-    >>> split_rows('level, "sensor" \\r\\n 1,"tip"\\r\\n\\r\\n', "beam.csv")[1]
-    Row(number=2, fields=['1', 'tip'])
+def header_of(path: FilePath) -> list[str]:
+    """The names in the first line of a CSV that says something, without reading on."""
+    first = read_text(path).lstrip().split("\n", 1)[0]
+    return [name for field in first.split(",") if (name := field.strip().strip('"').strip())]
+
+
+def cells_of(text: str, file: str) -> Cells:
+    """The header and the rows of a CSV's text; `file` as messages name it.
+
+    Raises `ValueError` where it is not a CSV with a header, has a blank line in the middle, or a
+    column twice. Rows are to be looked at by `Cells.require_rows`, once the header is understood.
+
+    >>> cells_of('level, "sensor" \\r\\n 1,"tip"\\r\\n\\r\\n', "beam.csv").rows
+    [Row(number=2, fields=['1', 'tip'])]
     """
+    header, *rows = _split(text, file)
+    names = header.fields
+    if len(names) == 1 and re.search(r"[;\t]", names[0]):
+        mark = "semicolons" if ";" in names[0] else "tabs"
+        raise ValueError(
+            f"the fields of {file} must be separated by commas, but its header row has {mark}."
+        )
+    if all(_PLAIN_NUMBER.fullmatch(name) for name in names):
+        raise ValueError(
+            f"row 1 of {file} must be a header row with the names of the columns, "
+            f"but has {shown(names[0])}."
+        )
+    for k, name in enumerate(names):
+        if name and name in names[:k]:
+            raise ValueError(
+                f"each column must stand once, but {file} has the column `{shortened_name(name)}` "
+                f"twice (columns {names.index(name) + 1} and {k + 1})."
+            )
+    return Cells(names, rows, file)
+
+
+def shortened_name(name: str) -> str:
+    """A column's name on one line and not too long."""
+    text = name if name.isprintable() else ascii(name)
+    return text if len(text) <= 40 else f"{text[:37]}..."
+
+
+def _split(text: str, file: str) -> list[Row]:
+    """The rows of a CSV without spaces around fields and blank lines behind."""
     tidy = _SPACE_BEHIND_QUOTES.sub(r"\1", text)
     reader = csv.reader(io.StringIO(tidy, newline=""), strict=True, skipinitialspace=True)
     rows: list[Row] = []

@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import io
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from numbers import Integral, Real
 from typing import SupportsFloat
@@ -20,11 +21,12 @@ from snrmjax.io.columns import (
     read_header,
 )
 from snrmjax.io.files import FilePath, file_name, read_text, shown, suggestion, write_atomically
-from snrmjax.io.rows import Cells, split_rows
+from snrmjax.io.rows import Cells, cells_of
 from snrmjax.io.units import DEGREE, HERTZ, in_unit
 from snrmjax.measure.states import NO_PHASE, UNNAMED_SENSOR, SteadyStates, steady_states
 from snrmjax.model.modes import LinearModes
 from snrmjax.model.structures import Structure, modes_of
+from snrmjax.numerics.facts import Fact
 
 
 def read_steady_states(
@@ -55,45 +57,29 @@ def read_steady_states(
 
 
 def _read(text: str, file: str, sensors: tuple[str, ...] | None) -> SteadyStates:
-    rows = split_rows(text, file)
-    header = read_header(rows[0].fields, file)
-    for row in rows[1:]:
-        if len(row.fields) != header.n_columns:
-            hint = (
-                " (numbers need a point as decimal sign and no thousands separators)"
-                if len(row.fields) > header.n_columns
-                else ""
-            )
-            raise ValueError(
-                f"each row must have {header.n_columns} fields as the header has, "
-                f"but row {row.number} of {file} has {len(row.fields)}{hint}."
-            )
-    if len(rows) == 1:
-        raise ValueError(f"{file} has a header, but no rows below it.")
-    cells = Cells(rows[1:], header, file)
-    return _assemble(cells, sensors)
-
-
-def _assemble(cells: Cells, sensors: tuple[str, ...] | None) -> SteadyStates:
-    header, file = cells.header, cells.file
+    cells = cells_of(text, file)
+    header = read_header(cells)
+    cells.require_rows()
     notes = list(header.notes)
-    columns = {name: cells.numbers(name) for name in REQUIRED if name in header.position}
-    for name in FORCES:
-        if name in header.position:
-            columns[name] = cells.numbers(name)
-    for name in (*OPTIONAL, *header.harmonics):
-        if name in header.position:
-            columns[name] = cells.numbers(name, empty_allowed=True)
-            empty = np.flatnonzero(np.isnan(columns[name]))
-            if empty.size:
-                notes.append(
-                    f"`{name}` is not stated in {empty.size} of {len(cells.rows)} rows of {file} "
-                    f"(first in row {cells.rows[empty[0]].number})."
-                )
+    rules = REQUIRED | FORCES | OPTIONAL | dict.fromkeys(header.harmonics, ())
+    columns: dict[str, np.ndarray] = {}
+    for name in [name for name in rules if name in header.used]:
+        optional = name in OPTIONAL or name in header.harmonics
+        columns[name] = cells.numbers(name, rules[name], empty_allowed=optional)
+        empty = np.flatnonzero(np.isnan(columns[name]))
+        if empty.size:
+            first = cells.rows[empty[0]].number
+            of = {"of": len(cells.rows), "file": file, "first_row": first}
+            notes.append(Fact("column_partly_stated", name=name, n=len(empty), **of))
     if "harmonic_std_m_s" in columns and not header.harmonic_order:
-        notes.append(f"`harmonic_std_m_s` of {file} is not used: the table has no harmonics.")
-    if AMPLITUDE in header.position:
-        notes += _without_phases(cells, columns)
+        notes.append(Fact("error_of_no_harmonics", file=file))
+    if AMPLITUDE in header.used:
+        size = cells.numbers(AMPLITUDE, FORCES["force_n"])
+        notes.append(Fact("amplitudes_without_phases", file=file))
+        if "phase_std_deg" in columns:
+            notes.append(Fact("error_of_no_phases", file=file))
+        columns["phase_std_deg"] = np.full(len(size), NO_PHASE / DEGREE)
+        columns |= dict(zip(PHASOR, (size, np.zeros(len(size))), strict=True))
     velocity = _phasors(*(columns[name] for name in PHASOR))
     if not np.any(velocity):
         raise ValueError(f"{file} has nothing but zero velocities.")
@@ -139,20 +125,6 @@ def _assemble(cells: Cells, sensors: tuple[str, ...] | None) -> SteadyStates:
     return dataclasses.replace(data, notes=tuple(notes))
 
 
-def _without_phases(cells: Cells, columns: dict[str, np.ndarray]) -> list[str]:
-    """Put amplitudes in place of phasors, with phases of which nothing is known; notes on it."""
-    size = cells.numbers(AMPLITUDE)
-    notes = [
-        f"{cells.file} has the amplitude of the velocity alone: its phase is unknown, and that of "
-        "harmonics is not used."
-    ]
-    if "phase_std_deg" in columns:
-        notes.append(f"`phase_std_deg` of {cells.file} is not used: the table has no phases.")
-    columns["phase_std_deg"] = np.full(len(size), NO_PHASE / DEGREE)
-    columns |= dict(zip(PHASOR, (size, np.zeros(len(size))), strict=True))
-    return notes
-
-
 def _harmonic(cells: Cells, columns: Mapping[str, np.ndarray], order: int) -> np.ndarray:
     """One harmonic of every row, NaN where it is not stated."""
     names = harmonic_columns(order)
@@ -190,7 +162,7 @@ def _force_std(cells: Cells, values: np.ndarray | None, state: Sequence[int]) ->
 
 def _sensors(cells: Cells, sensors: tuple[str, ...] | None) -> tuple[tuple[str, ...], list[int]]:
     """The sensors of the result, and the index of each row's."""
-    if "sensor" not in cells.header.position:
+    if not cells.has("sensor"):
         if sensors is not None and len(sensors) != 1:
             listed = ", ".join(f"`{name}`" for name in sensors)
             raise ValueError(
@@ -226,19 +198,13 @@ def group_states(keys: Iterable[Sequence[float]], sensor: Iterable[int]) -> list
     >>> group_states([(1, 80.0), (1, 80.0), (1, 80.0), (1, 81.0)], [0, 1, 0, 0])
     [0, 0, 1, 2]
     """
-    states: dict[tuple[float, ...], list[int]] = {}
-    rows_seen: dict[tuple[tuple[float, ...], int], int] = {}
+    states: dict[tuple[tuple[float, ...], int], int] = {}
+    repeats = Counter[tuple[tuple[float, ...], int]]()
     result = []
-    n_states = 0
     for values, which in zip(keys, sensor, strict=True):
         key = tuple(values)
-        occurrence = rows_seen.get((key, which), 0)
-        rows_seen[key, which] = occurrence + 1
-        known = states.setdefault(key, [])
-        if occurrence == len(known):
-            known.append(n_states)
-            n_states += 1
-        result.append(known[occurrence])
+        repeats[key, which] += 1
+        result.append(states.setdefault((key, repeats[key, which]), len(states)))
     return result
 
 
@@ -252,26 +218,19 @@ def write_steady_states(path: FilePath, data: SteadyStates) -> None:
     force is known. Voltages beside known forces are left out: a file has one of both.
     Raises `ValueError` when a file could not hold the data: the rules of the reader apply.
     """
-    write_atomically(path, _table_text(steady_state_fields(data, file_name(path))))
+    write_atomically(path, _table_text(_fields(data, file_name(path))))
 
 
-def steady_state_fields(data: SteadyStates, file: str) -> dict[str, list[str]]:
-    """The fields of a table of steady states by column, as text; see `write_steady_states`.
-
-    Arguments: `file` as messages name what they are written to.
-    Raises `ValueError` as `write_steady_states` does.
-    """
+def _fields(data: SteadyStates, file: str) -> dict[str, list[str]]:
+    """The fields of a table of steady states by column, as text; `file` as messages name it."""
     host: SteadyStates = jax.tree.map(np.asarray, data)
     if not np.all(np.any(host.measured, axis=1)):
         raise ValueError("each steady state must be measured by a sensor, but one is by none.")
     state, sensor = np.nonzero(host.measured)
-    columns: dict[str, list[str]] = {
-        "level": [str(int(value)) for value in host.level[state]],
-        "sensor": [host.sensors[k] for k in sensor],
-        "frequency_hz": _texts(in_unit(float(f), HERTZ) for f in host.frequency[state]),
-    }
-    if host.sensors == UNNAMED_SENSOR:  # a model's only sensor may have another name
-        del columns["sensor"]
+    columns: dict[str, list[str]] = {"level": [str(int(value)) for value in host.level[state]]}
+    if host.sensors != UNNAMED_SENSOR:  # a model's only sensor may have another name
+        columns["sensor"] = [host.sensors[k] for k in sensor]
+    columns["frequency_hz"] = _in_units(host.frequency[state], HERTZ)
     has_force, has_drive = ~np.isnan(host.force), ~np.isnan(host.drive)
     if np.all(has_force):
         columns["force_n"] = _texts(host.force[state])
@@ -284,18 +243,14 @@ def steady_state_fields(data: SteadyStates, file: str) -> dict[str, list[str]]:
         )
     columns["velocity_re_m_s"] = _texts(host.velocity.real[state, sensor])
     columns["velocity_im_m_s"] = _texts(host.velocity.imag[state, sensor])
-    optional: dict[str, np.ndarray | jax.Array] = {
-        "velocity_std_m_s": host.velocity_std[state, sensor],
-        "phase_std_deg": np.asarray(
-            [in_unit(float(value), DEGREE) for value in host.phase_std[state, sensor]]
-        ),
-        "force_std_n": host.force_std[state],
-        "order": host.order[state],
-        "harmonic_std_m_s": host.harmonic_std[state, sensor],
+    optional = {
+        "velocity_std_m_s": _texts(host.velocity_std[state, sensor]),
+        "phase_std_deg": _in_units(host.phase_std[state, sensor], DEGREE),
+        "force_std_n": _texts(host.force_std[state]),
+        "order": _texts(host.order[state]),
+        "harmonic_std_m_s": _texts(host.harmonic_std[state, sensor]),
     }
-    for name, values in optional.items():
-        if not np.all(np.isnan(values)):
-            columns[name] = _texts(values)
+    columns |= {name: values for name, values in optional.items() if any(values)}
     for k, order in enumerate(host.harmonic_order):
         harmonic = np.asarray(host.harmonics[state, sensor, k])
         if order == 0 and np.any(np.nan_to_num(harmonic.imag)):
@@ -309,6 +264,10 @@ def steady_state_fields(data: SteadyStates, file: str) -> dict[str, list[str]]:
             "frequency and force, but different sensors: give each its own `order`."
         )
     return columns
+
+
+def _in_units(values: np.ndarray | jax.Array, unit: float) -> list[str]:
+    return _texts(in_unit(float(value), unit) for value in np.asarray(values))
 
 
 def steady_states_of_fields(columns: Mapping[str, Sequence[str]], file: str) -> SteadyStates:

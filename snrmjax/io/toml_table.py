@@ -56,15 +56,41 @@ class TomlTable(NamedTuple):
                 raise self.refusal(key, rule.expected, value)
         return float(value)
 
-    def numbers(self, key: str, *rules: Rule, each: str = "knot") -> list[float]:
+    def numbers(
+        self, key: str, *rules: Rule, each: str = "knot", count: int | None = None
+    ) -> list[float]:
         """A list of finite numbers that keep their rules; messages call one of them `each`."""
         value = self.entries[key]
         if not isinstance(value, list):
             raise self.refusal(key, "a list of numbers", value)
+        if count is not None and len(value) != count:
+            raise self.refusal(key, f"{count} numbers, one a {each}", value)
         return [
-            TomlTable({key: one}, f"{self.place}, {each} {k + 1},").number(key, *rules)
-            for k, one in enumerate(value)
+            TomlTable({key: number}, f"{self.place}, {each} {k},").number(key, *rules)
+            for k, number in enumerate(value, 1)
         ]
+
+    def mode_numbers(self, key: str) -> tuple[int, ...]:
+        """A list of different mode numbers, counted from one."""
+        value = self.entries[key]
+        if not isinstance(value, list) or not value:
+            raise self.refusal(key, "a list of mode numbers, at least one", value)
+        entries = (
+            TomlTable({key: number}, f"{self.place}, entry {k},")
+            for k, number in enumerate(value, 1)
+        )
+        numbers = tuple(entry.whole(key, 1) for entry in entries)
+        if len(set(numbers)) < len(numbers):
+            raise self.refusal(key, "different mode numbers", value)
+        return numbers
+
+    def numbers_of_modes(self, key: str, count: int, *rules: Rule) -> list[float] | None:
+        """A number for each mode, or one for all; None where it is not stated."""
+        if key not in self.entries:
+            return None
+        if isinstance(self.entries[key], list):
+            return self.numbers(key, *rules, each="mode", count=count)
+        return [self.number(key, *rules)] * count
 
     def text(self, key: str, default: str | None = None) -> str:
         """A text."""
@@ -101,6 +127,6 @@ class TomlTable(NamedTuple):
         """A list of tables at the top of a file."""
         value = self.entries.get(key, [])
         if not isinstance(value, list) or not all(isinstance(entry, dict) for entry in value):
-            found = f"[{key}]" if isinstance(value, dict) else shown(value)
-            raise ValueError(f"`{key}` must be tables under [[{key}]], but {file} has {found}.")
+            given = f"[{key}]" if isinstance(value, dict) else shown(value)
+            raise ValueError(f"`{key}` must be tables under [[{key}]], but {file} has {given}.")
         return [TomlTable(entry, f"{key} {k + 1} of {file}") for k, entry in enumerate(value)]

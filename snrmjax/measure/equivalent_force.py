@@ -1,7 +1,7 @@
 """The force of a low-level test that is known in volts only, from the linear response."""
 
 import dataclasses
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -12,10 +12,8 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.modes import LinearModes, linear_response
-from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.result import AbstractResult, Variable, quantity
 from snrmjax.numerics.status import Status
-
-_HERTZ = 2 * np.pi
 
 
 class ForceStatus(Status):
@@ -48,58 +46,24 @@ class EquivalentForce(AbstractResult):
 
     coordinates: ClassVar[tuple[str, ...]] = ("level",)
 
-    level: Int[Array, " level"]
-    drive: Float[Array, " level"]  # V
-    force: Float[Array, " level"]  # N
     force_covariance: Float[Array, "level level"]  # N²
-    natural_frequency: Float[Array, " level"]  # rad/s, of the mode of interest
-    natural_frequency_std: Float[Array, " level"]  # rad/s, 0 where not adjusted
-    damping_ratio: Float[Array, " level"]
-    damping_ratio_std: Float[Array, " level"]  # 0 where not adjusted
-    phase: Float[Array, " level"]  # rad, by which the measured velocities lead the model's
-    phase_std: Float[Array, " level"]  # rad, 0 where not adjusted
     misfit: Float[Array, " level"]  # rms residual: in stated σ, or in m/s where none is stated
-    status: Int[Array, " level"]
-
-    def summary(self) -> tuple[str, ...]:
-        """See `AbstractResult`."""
-        rows = zip(
-            *(np.asarray(self.level), np.asarray(self.drive), np.asarray(self.force)),
-            *(np.asarray(self.force_std), np.asarray(self.status)),
-            strict=True,
-        )
-        good = int(np.sum(np.asarray(self.status) == ForceStatus.SUCCESSFUL))
-        return (
-            f"EquivalentForce: {good} of {len(self.status)} levels found",
-            *(
-                f"level {level}: {drive:.4g} V, {force:.4g} ± {std:.2g} N (1σ)"
-                if status == ForceStatus.SUCCESSFUL
-                else f"level {level}: {drive:.4g} V, {ForceStatus(int(status)).message}"
-                for level, drive, force, std, status in rows
-            ),
-        )
+    level: Int[Array, " level"] = quantity("level", "1", "level of the test")
+    drive: Float[Array, " level"] = quantity("level", "V", "drive voltage")
+    force: Float[Array, " level"] = quantity("level", "N", "equivalent force")
+    # Of the mode of interest; a 1σ is 0 where nothing was adjusted.
+    natural_frequency: Float[Array, " level"] = quantity("level", "Hz", "natural frequency")
+    natural_frequency_std: Float[Array, " level"] = quantity("level", "Hz", "its 1σ")
+    damping_ratio: Float[Array, " level"] = quantity("level", "1", "damping ratio")
+    damping_ratio_std: Float[Array, " level"] = quantity("level", "1", "its 1σ")
+    phase: Float[Array, " level"] = quantity("level", "deg", "velocities lead the model's by")
+    phase_std: Float[Array, " level"] = quantity("level", "deg", "its 1σ")
+    status: Int[Array, " level"] = quantity("level", "", "what became of the level", of=ForceStatus)
 
     def variables(self) -> dict[str, Variable]:
-        """See `AbstractResult`."""
-
-        def column(values: Any, unit: str, meaning: str) -> Variable:
-            return Variable(("level",), np.asarray(values), unit, meaning)
-
-        natural, natural_std = self.natural_frequency, self.natural_frequency_std
-        names = [ForceStatus(int(one)).name.lower() for one in np.asarray(self.status)]
-        return {
-            "level": column(self.level, "1", "level of the test"),
-            "drive_v": column(self.drive, "V", "drive voltage"),
-            "force_n": column(self.force, "N", "equivalent force"),
-            "force_std_n": column(self.force_std, "N", "its 1σ"),
-            "natural_frequency_hz": column(np.asarray(natural) / _HERTZ, "Hz", "natural frequency"),
-            "natural_frequency_std_hz": column(np.asarray(natural_std) / _HERTZ, "Hz", "its 1σ"),
-            "damping_ratio": column(self.damping_ratio, "1", "damping ratio"),
-            "damping_ratio_std": column(self.damping_ratio_std, "1", "its 1σ"),
-            "phase_deg": column(np.degrees(self.phase), "deg", "velocities lead the model's by"),
-            "phase_std_deg": column(np.degrees(self.phase_std), "deg", "its 1σ"),
-            "status": column(np.array(names, dtype=str), "", "what became of the level"),
-        }
+        """By level, with the forces' errors."""
+        std = Variable(("level",), np.asarray(self.force_std), "N", "1σ of the force")
+        return {**super().variables(), "force_std_n": std}
 
     @property
     def force_std(self) -> Float[Array, " level"]:
@@ -275,7 +239,7 @@ def _fit_level(
         full = jnp.zeros(2).at[iterated].set(step)
         return start * jnp.stack([1 + start[1] * full[0], jnp.exp(full[1])])
 
-    mode, found = start, jnp.all(jnp.isfinite(measured))
+    mode, solved = start, jnp.all(jnp.isfinite(measured))
     if iterated.size:
         solution: optx.Solution = optx.least_squares(
             lambda step, _: eliminated(mode_of(step))[1],
@@ -285,7 +249,7 @@ def _fit_level(
             throw=False,
         )
         mode = mode_of(solution.value)
-        found &= jnp.asarray(solution.result == optx.RESULTS.successful)
+        solved &= jnp.asarray(solution.result == optx.RESULTS.successful)
     best, remaining = eliminated(mode)
     scale = jnp.where(best == 0, 1.0, best).at[3].set(1.0)
     sensitivity = jax.jacfwd(deviation)(best) * scale
@@ -305,9 +269,9 @@ def _fit_level(
     held = jnp.stack([modes.natural_frequency_std[j], modes.damping_ratio_std[j]])
     held = jnp.where(jnp.asarray(adjusted[:2]), 0.0, held) / scale[1:3]
     shared = -scale[0] * (inverse @ (orthogonal.T @ sensitivity[:, 1:3]))[0] * held
-    found &= (mode[0] > 0.5 * lowest) & (mode[0] < 2 * highest) & jnp.all(jnp.isfinite(best))
+    solved &= (mode[0] > 0.5 * lowest) & (mode[0] < 2 * highest) & jnp.all(jnp.isfinite(best))
     status = jnp.where(best[0] > 0, int(ForceStatus.SUCCESSFUL), int(ForceStatus.NEGATIVE))
     determined = singular[-1] > 1e-9 * singular[0]
-    status = jnp.where(found & determined, status, int(ForceStatus.NOT_CONVERGED))
+    status = jnp.where(solved & determined, status, int(ForceStatus.NOT_CONVERGED))
     status = jnp.where(freedom >= 0, status, int(ForceStatus.TOO_FEW))
     return best, std, shared, misfit * jnp.where(use_stated, 1.0, size), status

@@ -1,7 +1,6 @@
 """Force from drive voltage: a straight line through the forces of several voltages."""
 
 import dataclasses
-from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -10,43 +9,23 @@ import numpy as np
 from jaxtyping import Array, Float, Shaped
 
 from snrmjax.measure.states import SteadyStates
-from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.result import AbstractResult, quantity
+from snrmjax.numerics.rules import POSITIVE, require
 
 
 class ForceCalibration(AbstractResult):
     """The line F = gain · drive + offset, and how well it is known."""
 
-    coordinates: ClassVar[tuple[str, ...]] = ("term",)
-
-    gain: Float[Array, ""]  # N/V
-    offset: Float[Array, ""]  # N
-    covariance: Float[Array, "2 2"]  # of gain and offset; NaN = unknown
-    residual_std: Float[Array, ""]  # N, scatter about the line, NaN with two points
-    misfit: Float[Array, ""]  # the same in stated σ, NaN where none is stated
-
-    def summary(self) -> tuple[str, ...]:
-        """See `AbstractResult`."""
-        std = np.sqrt(np.diag(np.asarray(self.covariance)))
-        return (
-            "ForceCalibration: force = gain · drive + offset",
-            f"gain {float(self.gain):.6g} ± {std[0]:.2g} N/V (1σ)",
-            f"offset {float(self.offset):.4g} ± {std[1]:.2g} N (1σ)",
-            f"scatter about the line {float(self.residual_std):.3g} N",
-        )
-
-    def variables(self) -> dict[str, Variable]:
-        """See `AbstractResult`."""
-        std = np.sqrt(np.diag(np.asarray(self.covariance)))
-        covariance = np.asarray(self.covariance)
-        terms, line = np.array(["gain", "offset"]), np.array([self.gain, self.offset])
-        across = ("term", "other_term")
-        return {
-            "term": Variable(("term",), terms, "", "term of the line"),
-            "value": Variable(("term",), line, "N/V and N", "value"),
-            "std": Variable(("term",), std, "N/V and N", "its 1σ"),
-            "covariance": Variable(across, covariance, "products of N/V and N", "covariance"),
-            "residual_std_n": Variable((), np.asarray(self.residual_std), "N", "scatter"),
-        }
+    gain: Float[Array, ""] = quantity("", "N/V", "gain")
+    offset: Float[Array, ""] = quantity("", "N", "offset")
+    # Of gain and offset; NaN = unknown.
+    covariance: Float[Array, "2 2"] = quantity(
+        "term other_term", "products of N/V and N", "covariance"
+    )
+    # NaN with two points.
+    residual_std: Float[Array, ""] = quantity("", "N", "scatter about the line")
+    # NaN where no error is stated.
+    misfit: Float[Array, ""] = quantity("", "1", "scatter about the line over the stated 1σ")
 
     def force(self, drive: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
         """Force in N at a drive in V."""
@@ -91,28 +70,28 @@ def calibrate_force(
     (Array(0.027307, dtype=float64), Array(-8.091e-05, dtype=float64))
     """
     volts, newtons = jnp.asarray(drive, dtype=float), jnp.asarray(force, dtype=float)
-    if volts.ndim != 1 or newtons.shape != volts.shape:
-        raise ValueError(
-            f"`drive` and `force` must be vectors of one length, but have shapes {volts.shape} "
-            f"and {newtons.shape}."
-        )
     n = volts.size
+    given: dict[str, tuple[Array, tuple[int, ...]]] = {
+        "`drive`": (volts, (n,)),
+        "`force`": (newtons, (n,)),
+    }
     if force_std is not None and force_covariance is not None:
         raise ValueError("`force_std` and `force_covariance` are both given; give one.")
     stated = force_std is not None or force_covariance is not None
-    root = jnp.eye(n)
+    std, covariance = jnp.ones(n), jnp.eye(n)
     if force_std is not None:
         std = jnp.asarray(force_std, dtype=float)
-        _require_finite("force_std", std, (n,), positive=True)
-        root = jnp.diag(std)
-    elif force_covariance is not None:
-        given = jnp.asarray(force_covariance, dtype=float)
-        _require_finite("force_covariance", given, (n, n))
-        root = jnp.linalg.cholesky(given)
-        if not isinstance(root, jax.core.Tracer) and not np.all(np.isfinite(root)):
-            raise ValueError("`force_covariance` must be positive definite, but is not.")
-    _require_finite("drive", volts, (n,))
-    _require_finite("force", newtons, (n,))
+        given["`force_std`"] = (std, (n,))
+    if force_covariance is not None:
+        covariance = jnp.asarray(force_covariance, dtype=float)
+        given["`force_covariance`"] = (covariance, (n, n))
+    for name, (value, shape) in given.items():
+        if value.shape != shape:
+            raise ValueError(f"{name} must have shape {shape}, but has {value.shape}.")
+        require(name, value, *([POSITIVE] if value is std else []))
+    root = jnp.diag(std) if force_covariance is None else jnp.linalg.cholesky(covariance)
+    if not isinstance(root, jax.core.Tracer) and not np.all(np.isfinite(root)):
+        raise ValueError("`force_covariance` must be positive definite, but is not.")
     if n < 2 or (not isinstance(volts, jax.core.Tracer) and np.unique(volts).size < 2):
         raise ValueError(
             f"`drive` must contain two different voltages at least, but is {np.asarray(volts)}."
@@ -147,21 +126,6 @@ def _line(
         residual_std=scatter,
         misfit=misfit if stated else jnp.array(jnp.nan),
     )
-
-
-def _require_finite(
-    name: str, value: Array, shape: tuple[int, ...], *, positive: bool = False
-) -> None:
-    if value.shape != shape:
-        raise ValueError(f"`{name}` must have shape {shape}, but has {value.shape}.")
-    if isinstance(value, jax.core.Tracer):
-        return
-    array = np.asarray(value)
-    bad = ~np.isfinite(array) | (positive & (array <= 0))
-    if bad.any():
-        index = tuple(int(k) for k in np.argwhere(bad)[0])
-        expected = "finite and positive" if positive else "finite"
-        raise ValueError(f"`{name}` must be {expected}, but entry {index} is {array[index]:g}.")
 
 
 def apply_calibration(data: SteadyStates, calibration: ForceCalibration) -> SteadyStates:

@@ -19,7 +19,8 @@ def nnm_appropriation(
     Δ = (1/N) Σ_k Re{X_k}ᵀRe{X_k} / X_kᴴX_k, where the X_k are displacements relative to a sine
     force. With velocities relative to a cosine force X_k = V_k e^{−ikπ/2}/(ikΩ), so that the part
     which counts is Re V_k for odd k and Im V_k for even k; the frequency cancels. For the
-    fundamental of one sensor Δ is cos² of the velocity phase.
+    fundamental of one sensor Δ is cos² of the velocity phase, and for that of several it is the
+    mode indicator of Eq. (21).
 
     Arguments: `velocity_amplitudes` in m/s (any unit), one column a harmonic of `orders`; a vector
     is taken as one sensor. NaN means not measured: such entries are left out, and so is a harmonic
@@ -28,7 +29,7 @@ def nnm_appropriation(
     Raises `ValueError` when `orders` does not fit.
     Validity: every harmonic weighs the same, however small it is; harmonics that are only noise
     pull Δ towards one half.
-    Reference: Kwarta & Allen, Eq. (20).
+    Reference: Kwarta & Allen, Eqs. (20) and (21).
 
     >>> nnm_appropriation(jnp.array([1.0 + 1.0j, 0.01j]), (1, 2)).round(12)
     Array(0.75, dtype=float64)
@@ -57,29 +58,11 @@ def _appropriation(
     return jnp.where(n_counted > 0, jnp.sum(ratio, axis=-1) / jnp.maximum(n_counted, 1), jnp.nan)
 
 
-def mode_indicator(velocity: Complex[Array, "*batch sensor"]) -> Float[Array, "*batch"]:
-    """Mode indicator of a single-harmonic response: 1 when all sensors are at phase resonance.
-
-    Δ = Re{X}ᵀRe{X} / XᴴX with displacements relative to a sine force, which is
-    Σ(Re V)² / Σ|V|² with velocities relative to a cosine force.
-
-    Arguments: `velocity` in m/s (any unit), one entry a sensor; NaN entries are left out.
-    Returns a number from 0 to 1; NaN when every sensor is zero or NaN. Differentiable.
-    Reference: Kwarta & Allen, Eq. (21).
-
-    >>> mode_indicator(jnp.array([3.0 + 4.0j])).round(12)
-    Array(0.36, dtype=float64)
-    """
-    return nnm_appropriation(jnp.atleast_1d(velocity)[..., None], (1,))
-
-
-def appropriation_of(data: SteadyStates, *, significance: float = 0.0) -> Float[Array, " state"]:
+def appropriation_of(data: SteadyStates) -> Float[Array, " state"]:
     """Appropriation indicator of every measured state, from all harmonics it was measured with.
 
     Eq. (20) over the fundamental (`velocity`) and the stored `harmonics`, without harmonic 0.
 
-    Arguments: `data`; `significance`: a higher harmonic counts when its rms over the sensors is
-    at least that many times their stated `harmonic_std` (harmonics without one always count).
     Returns one number per state; NaN for a state that no sensor measured. Differentiable.
     Reference: Kwarta & Allen, Eq. (20).
 
@@ -88,22 +71,12 @@ def appropriation_of(data: SteadyStates, *, significance: float = 0.0) -> Float[
     >>> appropriation_of(data).round(12)
     Array([1. , 0.5], dtype=float64)
     """
-    return _appropriation_of(data, jnp.asarray(significance, dtype=float))
-
-
-@eqx.filter_jit
-def _appropriation_of(data: SteadyStates, significance: Float[Array, ""]) -> Float[Array, " state"]:
     higher = [k for k, order in enumerate(data.harmonic_order) if order > 1]
     harmonics = data.harmonics[..., np.asarray(higher, dtype=int)]
-    usable = data.measured[..., None] & jnp.isfinite(harmonics)
-    floor = jnp.nan_to_num(data.harmonic_std)[..., None]
-    energy = jnp.sum(jnp.where(usable, jnp.abs(harmonics) ** 2, 0.0), axis=1, keepdims=True)
-    noise = jnp.sum(jnp.where(usable, floor**2, 0.0), axis=1, keepdims=True)
-    usable &= energy >= significance**2 * noise
     amplitudes = jnp.concatenate(
         [
             jnp.where(data.measured, data.velocity, jnp.nan)[..., None],
-            jnp.where(usable, harmonics, jnp.nan),
+            jnp.where(data.measured[..., None], harmonics, jnp.nan),
         ],
         axis=-1,
     )

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.modes import LinearModes
 from snrmjax.model.structures import Structure, modes_of
+from snrmjax.numerics.facts import Fact
 
 _LEAST_STATES = 6
 _NEAR = 0.2  # of a level's largest |V|/F: states that are nearer to resonance than others
@@ -24,25 +25,13 @@ _WRONG_SIZE = 10.0  # ratio of modal constants, that no law of amplitude passes 
 
 
 class _Reading(NamedTuple):
-    """A velocity that recorded phasors V may stand for: turn·V, or turn·V* where conjugated."""
+    """A velocity that recorded phasors V may stand for: i^n V, or i^n V* where conjugated."""
 
-    turn: complex
     conjugated: bool
-
-    @property
-    def words(self) -> str:
-        """What is to be done with the phasors."""
-        turns = {1j: "turned by +90°", -1j: "turned by -90°", -1: "turned by 180°"}
-        parts = ["conjugated"] if self.conjugated else []
-        if self.turn in turns:
-            parts.append(turns[self.turn])
-        return " and then ".join(parts)
+    quarter_turns: int  # n
 
 
-_READINGS = (
-    *(_Reading(turn, False) for turn in (1, 1j, -1j, -1)),
-    *(_Reading(turn, True) for turn in (1, 1j, -1j, -1)),
-)
+_READINGS = tuple(_Reading(conjugated, n) for conjugated in (False, True) for n in (0, 1, -1, 2))
 
 
 class _NearResonance(NamedTuple):
@@ -62,8 +51,8 @@ class _Fit(NamedTuple):
     cosine: float  # mean of cos φ
 
 
-def wrong_phases(data: SteadyStates, modes: LinearModes | Structure) -> tuple[str, ...]:
-    """A sentence where measured phases are clearly not those of a velocity relative to the force.
+def wrong_phases(data: SteadyStates, modes: LinearModes | Structure) -> tuple[Fact, ...]:
+    """A fact where measured phases are clearly not those of a velocity relative to the force.
 
     Near resonance a single mode has F cos φ = d(a)|V| and ΩF sin φ = (k(a) − mΩ²)|V|, with m and
     d(a) above zero and smooth functions of the amplitude a. Both are fitted by linear least
@@ -73,7 +62,7 @@ def wrong_phases(data: SteadyStates, modes: LinearModes | Structure) -> tuple[st
     one is named, or all where several fit alike.
 
     Arguments: `data` measured states, `modes` whose shape and participation give the sign of a
-    velocity at resonance. Returns no sentence or one. Not differentiable.
+    velocity at resonance. Returns no fact or one. Not differentiable.
     Validity: one resonance; states on both sides of it, or else conjugation cannot be told.
     """
     modes = modes_of(modes)
@@ -87,29 +76,33 @@ def wrong_phases(data: SteadyStates, modes: LinearModes | Structure) -> tuple[st
     if near is None:
         return ()
     fits = [_fitted(near, reading) for reading in _READINGS]
-    misfit = np.array([fits[0].misfit, *(_of_a_damped_mode(one) for one in fits[1:])])
+    misfit = np.array([fits[0].misfit, *(_of_a_damped_mode(fit) for fit in fits[1:])])
     best = float(misfit.min())
+    known = bool(np.any(np.isfinite(np.asarray(data.force))))
     if best > _RIGHT or misfit[0] < max(_WRONG, _BETTER * best):
-        known = np.any(np.isfinite(np.asarray(data.force)))
         return _wrong_size(near, fits[0], abs(constant)) if known else ()
-    chosen = np.flatnonzero(misfit <= _AS_GOOD * best)
-    known = np.any(np.isfinite(np.asarray(data.force)))
-    size = fits[chosen[0]].constant / abs(constant) if known else np.nan
-    said = _in_words(_READINGS[chosen[0]], size, float(near.frequency.mean()), constant > 0)
-    if len(chosen) > 1:
-        listed = " or ".join(_READINGS[k].words for k in chosen)
-        said = (
-            "the phases are not those of a velocity relative to the force, but would be if "
-            f"{listed}, which states at resonance or on one side of it do not tell apart."
-        )
+    alike = [_READINGS[k] for k in np.flatnonzero(misfit <= _AS_GOOD * best)]
+    shares = {"as_given": float(misfit[0]), "read_so": best}
+    if len(alike) > 1:
+        return (Fact("phases_misread_alike", readings=tuple(map(tuple, alike)), **shares),)
+    size = fits[_READINGS.index(alike[0])].constant / abs(constant) if known else np.nan
+    omega, turns = float(near.frequency.mean()), alike[0].quarter_turns
+    # Over the model's constant: what displacements or accelerations in place of velocities need.
+    instead = ""
+    if turns == 1 and size < omega**-0.5:
+        instead = "displacement"
+    elif turns == -1 and omega**0.5 < size < np.inf:
+        instead = "acceleration"
+    same_sign = constant > 0
     return (
-        f"{said} (A single mode misses the phasors by {100 * misfit[0]:.0f} % as they are, by "
-        f"{100 * best:.2g} % read so.)",
+        Fact(
+            "phases_misread", **alike[0]._asdict(), instead=instead, same_sign=same_sign, **shares
+        ),
     )
 
 
-def _wrong_size(near: _NearResonance, fit: _Fit, constant: float) -> tuple[str, ...]:
-    """A sentence where velocity over force is not that of the model's modal mass by far.
+def _wrong_size(near: _NearResonance, fit: _Fit, constant: float) -> tuple[Fact, ...]:
+    """A fact where velocity over force is not that of the model's modal mass by far.
 
     Only where states away from resonance refute that mass: at resonance any will do.
     """
@@ -120,12 +113,12 @@ def _wrong_size(near: _NearResonance, fit: _Fit, constant: float) -> tuple[str, 
     if held.misfit < max(_WRONG, _BETTER * fit.misfit):
         return ()
     return (
-        f"velocity over force is {ratio:.3g} times that of a mode with the model's `shape` times "
-        "`participation`: the force seems not to be in newtons (a drive voltage belongs into "
-        "`drive_v`), the velocity not in m/s, or the modal mass is another one; damping and "
-        "what is found off resonance mean nothing until that is mended, or the gain of the force "
-        f"is free. (A single mode with the model's modal mass misses the phasors by "
-        f"{100 * held.misfit:.0f} %, with its own by {100 * fit.misfit:.2g} %.)",
+        Fact(
+            "velocity_over_force_off",
+            ratio=float(ratio),
+            as_given=held.misfit,
+            with_own_mass=fit.misfit,
+        ),
     )
 
 
@@ -155,7 +148,7 @@ def _of_a_damped_mode(fit: _Fit) -> float:
 
 def _fitted(near: _NearResonance, reading: _Reading, mass: float | None = None) -> _Fit:
     phasor = np.exp(1j * near.phase)
-    phasor = reading.turn * (phasor.conj() if reading.conjugated else phasor)
+    phasor = 1j**reading.quarter_turns * (phasor.conj() if reading.conjugated else phasor)
     mean, most = near.frequency.mean(), near.mobility.max()
     relative, ratio = near.mobility / most, near.frequency / mean
     terms = np.clip(len(ratio) // _PER_TERM, 1, len(_POWERS))
@@ -179,63 +172,44 @@ def _least_squares(
 ) -> tuple[float, Float[np.ndarray, " state"]]:
     """The last column's coefficient and the values of the fit."""
     size = np.linalg.norm(columns, axis=0)
-    found = np.linalg.lstsq(columns / size, values, rcond=1e-10)[0] / size
-    return float(found[-1]), columns @ found
-
-
-def _in_words(reading: _Reading, size: float, omega: float, positive: bool) -> str:
-    """What a reading means; `size` is the modal constant that the data need over the model's."""
-    clauses = []
-    if reading.conjugated:
-        clauses.append(
-            "the phases rise through resonance where those of a velocity relative to the force "
-            "fall: the phasors seem to be conjugated (time dependence e^(-iΩt)); change the sign "
-            "of `velocity_im_m_s`, or import again with the other `--phase-sign`"
-        )
-    if reading.turn == 1j:
-        said = "turn the phases by +90°, or multiply the phasors by iΩ if they are displacements"
-        if size < omega**-0.5:
-            said = "displacements seem to be given as velocities; multiply the phasors by iΩ"
-        clauses.append(f"the phases lie 90° behind those of a velocity: {said}")
-    elif reading.turn == -1j:
-        said = "turn the phases by -90°, or divide the phasors by iΩ if they are accelerations"
-        if size > omega**0.5 and np.isfinite(size):
-            said = "accelerations seem to be given as velocities; divide the phasors by iΩ"
-        clauses.append(f"the phases lie 90° ahead of those of a velocity: {said}")
-    elif reading.turn == -1:
-        is_, sign = ("against", "positive") if positive else ("with", "negative")
-        clauses.append(
-            f"at resonance the velocity is {is_} the force where the model's `shape` times "
-            f"`participation` is {sign}: the sensor, the force or the model seems to have the "
-            "wrong sign; turn the phases by 180°, or change that sign"
-        )
-    return "; with that done, ".join(clauses) + "."
+    coefficients = np.linalg.lstsq(columns / size, values, rcond=1e-10)[0] / size
+    return float(coefficients[-1]), columns @ coefficients
 
 
 Arguments = ParamSpec("Arguments")
 Found = TypeVar("Found")
 
 
+class MisreadPhases(ValueError):
+    """A verb's refusal of data whose phases are wrong; `facts` are those of `wrong_phases`."""
+
+    def __init__(self, facts: tuple[Fact, ...], reason: ValueError) -> None:
+        super().__init__(f"{facts[0]} As the data are: {reason}")
+        self.facts = facts
+
+
 def naming_wrong_phases(verb: Callable[Arguments, Found]) -> Callable[Arguments, Found]:
     """A verb that says first what is wrong with the phases of its data, if anything is.
 
-    In the `notes` of what it returns, or in its `ValueError`.
+    In the `notes` of what it returns, or in place of its `ValueError` by `MisreadPhases`.
     """
 
     @functools.wraps(verb)
     def named(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Found:
         given: tuple[object, ...] = (*args, *kwargs.values())
-        data = [one for one in given if isinstance(one, SteadyStates)]
-        modes = [one for one in given if isinstance(one, LinearModes | Structure)]
-        said = wrong_phases(data[0], modes[0]) if data and modes else ()
+        data = [argument for argument in given if isinstance(argument, SteadyStates)]
+        modes = [argument for argument in given if isinstance(argument, LinearModes | Structure)]
+        wrong = wrong_phases(data[0], modes[0]) if data and modes else ()
         try:
-            found: Any = verb(*args, **kwargs)
+            result: Any = verb(*args, **kwargs)
+        except MisreadPhases:  # said by a verb within this one
+            raise
         except ValueError as error:
-            if not said or said[0] in str(error):
-                raise
-            raise ValueError(f"{said[0]} As the data are: {error}") from error
-        if said:
-            found = dataclasses.replace(found, notes=(*said, *found.notes))
-        return cast(Found, found)
+            if wrong:
+                raise MisreadPhases(wrong, error) from error
+            raise
+        if wrong:
+            result = dataclasses.replace(result, notes=(*wrong, *result.notes))
+        return cast(Found, result)
 
     return named

@@ -78,8 +78,8 @@ def _peak(
         start,
     )
     # Where the curve is too flat for Newton's method, the sample is the better peak.
-    found, sampled = derivative(fixed, angle, 0), derivative(fixed, start, 0)
-    angle = jnp.where(jnp.abs(found) >= jnp.abs(sampled), angle, start)
+    refined, sampled = derivative(fixed, angle, 0), derivative(fixed, start, 0)
+    angle = jnp.where(jnp.abs(refined) >= jnp.abs(sampled), angle, start)
     sign = jnp.where(sampled < 0, -1.0, 1.0)
     # One more step, now differentiated: it carries how the peak moves into second derivatives.
     return sign * derivative(values, angle - newton_step(values, angle), 0)
@@ -112,10 +112,8 @@ def force_velocity_loop(
     >>> force_velocity_loop(2.0, jnp.array([0.5 + 0.1j]), (1,)).mean_power
     Array(0.5, dtype=float64)
     """
-    orders = require_orders("orders", orders)
+    orders = require_fundamental("orders", orders)
     values = checked_amplitudes("velocity_amplitudes", velocity_amplitudes, orders)
-    if 1 not in orders:
-        raise ValueError(f"`orders` must contain the fundamental, 1, but is {orders}.")
     peak = jnp.asarray(force, dtype=float)
     phase = jnp.linspace(0.0, 2 * jnp.pi, n_points)
     return ForceVelocityLoop(
@@ -149,3 +147,11 @@ def require_orders(name: str, orders: Sequence[int] | Int[np.ndarray, " order"])
     if not whole or len(set(given)) != len(given):
         raise ValueError(f"`{name}` must be distinct whole numbers from 0 on, but is {given}.")
     return tuple(int(order) for order in given)
+
+
+def require_fundamental(name: str, orders: Sequence[int]) -> tuple[int, ...]:
+    """As `require_orders`, of orders that must hold the fundamental, 1."""
+    checked = require_orders(name, orders)
+    if 1 not in checked:
+        raise ValueError(f"`{name}` must contain the fundamental, 1, but is {checked}.")
+    return checked

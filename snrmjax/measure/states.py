@@ -10,7 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.compiled import value_of
+from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
+from snrmjax.numerics.units import DEGREE, HERTZ
 
 PHASE_UNKNOWN = np.pi / 3
 """1σ of a phase, rad, from which on it counts as unknown.
@@ -19,7 +22,7 @@ Errors are carried to first order, which at a radian says nothing any more: a ve
 resonance would pass for anything from cos 60° of its size on.
 """
 
-_HERTZ = 2 * np.pi
+_UNKNOWN_FROM = PHASE_UNKNOWN * (1 - 1e-12)  # rounding of 60°
 
 NO_PHASE = np.pi
 """1σ, rad, that stands for a phase that was not measured."""
@@ -38,24 +41,34 @@ class SteadyStates(AbstractResult):
 
     coordinates: ClassVar[tuple[str, ...]] = ("state", "sensor", "harmonic", "level")
 
-    level: Int[Array, " state"]
-    frequency: Float[Array, " state"]  # rad/s
-    force: Float[Array, " state"]  # N
-    velocity: Complex[Array, "state sensor"]  # m/s, fundamental
     measured: Bool[Array, "state sensor"]
-    velocity_std: Float[Array, "state sensor"]  # m/s, 1σ of the amplitude, NaN = not stated
-    phase_std: Float[Array, "state sensor"]  # rad, 1σ, NaN = not stated
-    force_std: Float[Array, " state"]  # N, 1σ, NaN = not stated
-    drive: Float[Array, " state"]  # V, NaN where the force is known
-    order: Float[Array, " state"]  # test order 0…1, NaN = not stated
-    harmonics: Complex[Array, "state sensor harmonic"]  # m/s, NaN = not measured
-    harmonic_std: Float[Array, "state sensor"]  # m/s, rms of the complex error, NaN = not stated
     harmonic_order: tuple[int, ...] = eqx.field(static=True)
     sensors: tuple[str, ...] = eqx.field(static=True)
-    notes: tuple[str, ...] = eqx.field(static=True, default=())
+    level: Int[Array, " state"] = quantity("state", "1", "level of the test")
+    frequency: Float[Array, " state"] = quantity("state", "Hz", "forcing frequency")
+    force: Float[Array, " state"] = quantity("state", "N", "force amplitude")
+    # Fundamental, relative to the force.
+    velocity: Complex[Array, "state sensor"] = quantity("state sensor", "m/s", "velocity")
+    # NaN in what follows: not stated, not measured; of the drive, that the force is known.
+    velocity_std: Float[Array, "state sensor"] = quantity(
+        "state sensor", "m/s", "1σ of the amplitude"
+    )
+    phase_std: Float[Array, "state sensor"] = quantity("state sensor", "deg", "1σ of the phase")
+    force_std: Float[Array, " state"] = quantity("state", "N", "1σ of the force")
+    drive: Float[Array, " state"] = quantity(
+        "state", "V", "drive voltage where the force is unknown"
+    )
+    order: Float[Array, " state"] = quantity("state", "1", "place in the test, from 0 to 1")
+    harmonics: Complex[Array, "state sensor harmonic"] = quantity(
+        "state sensor harmonic", "m/s", "harmonic of the velocity", name="harmonic"
+    )
+    harmonic_std: Float[Array, "state sensor"] = quantity(
+        "state sensor", "m/s", "rms error of a harmonic"
+    )
+    notes: tuple[Fact | str, ...] = setting(default=())
 
     def summary(self) -> tuple[str, ...]:
-        """See `AbstractResult`."""
+        """Ranges, what is stated and what is missing."""
 
         def spans(values: Any, unit: str) -> str:
             finite = np.asarray(values)[np.isfinite(np.asarray(values))]
@@ -66,19 +79,15 @@ class SteadyStates(AbstractResult):
         load = spans(self.drive, "V (force unknown)") if volts else spans(self.force, "N")
         stated = [
             name
-            for name, std in (
-                ("velocity", self.velocity_std),
-                ("phase", self.phase_std),
-                ("force", self.force_std),
-            )
-            if np.isfinite(np.asarray(std)).any()
+            for name in ("velocity", "phase", "force")
+            if np.isfinite(np.asarray(getattr(self, f"{name}_std"))).any()
         ]
         size = np.where(np.asarray(self.measured), np.abs(np.asarray(self.velocity)), np.nan)
         missing = int(np.sum(~np.asarray(self.measured)))
         lines = [
             f"SteadyStates: {self.n_states} states of {n_levels} "
             f"level{'s' if n_levels != 1 else ''} at {', '.join(self.sensors)}",
-            f"frequency {spans(np.asarray(self.frequency) / _HERTZ, 'Hz')}, force {load}",
+            f"frequency {spans(np.asarray(self.frequency) / HERTZ, 'Hz')}, force {load}",
             f"velocity {spans(size, 'm/s')}",
             f"errors stated of {', '.join(stated) or 'nothing'}",
         ]
@@ -89,40 +98,15 @@ class SteadyStates(AbstractResult):
         return (*lines, *(f"note: {note}" for note in self.notes))
 
     def variables(self) -> dict[str, Variable]:
-        """See `AbstractResult`; the columns of a table of steady states."""
-
-        def column(values: Any, unit: str, meaning: str) -> Variable:
-            array = np.asarray(values)
-            return Variable(("state", "sensor", "harmonic")[: array.ndim], array, unit, meaning)
-
-        velocity = np.where(self.measured, self.velocity, np.nan)
-        phase_std = np.degrees(np.asarray(self.phase_std))
+        """The columns of a table of steady states."""
+        seen: Any = np.where(self.measured, self.velocity, np.nan)
+        masked = dataclasses.replace(self, velocity=seen)
         orders = np.asarray(self.harmonic_order, dtype=int)
-        own = {
-            "state": column(np.arange(self.n_states), "1", "steady state"),
+        return {
+            **super(SteadyStates, masked).variables(),
             "sensor": Variable(("sensor",), np.asarray(self.sensors), "", "sensor"),
             "harmonic": Variable(("harmonic",), orders, "1", "harmonic of the forcing frequency"),
-            "level": column(self.level, "1", "level of the test"),
-            "frequency_hz": column(np.asarray(self.frequency) / _HERTZ, "Hz", "forcing frequency"),
-            "force_n": column(self.force, "N", "force amplitude"),
-            "force_std_n": column(self.force_std, "N", "its 1σ"),
-            "drive_v": column(self.drive, "V", "drive voltage where the force is unknown"),
-            "order": column(self.order, "1", "place in the test, from 0 to 1"),
-            "velocity_re_m_s": column(velocity.real, "m/s", "velocity in phase with the force"),
-            "velocity_im_m_s": column(velocity.imag, "m/s", "velocity 90° ahead of the force"),
-            "velocity_std_m_s": column(self.velocity_std, "m/s", "1σ of the amplitude"),
-            "phase_std_deg": column(phase_std, "deg", "1σ of the phase"),
-            "harmonic_std_m_s": column(self.harmonic_std, "m/s", "rms error of a harmonic"),
         }
-        harmonics = np.asarray(self.harmonics)
-        return own | {
-            "harmonic_re_m_s": column(harmonics.real, "m/s", "real part of a harmonic"),
-            "harmonic_im_m_s": column(harmonics.imag, "m/s", "imaginary part of a harmonic"),
-        }
-
-    def attributes(self) -> dict[str, str | float | int]:
-        """See `AbstractResult`."""
-        return {"notes": "\n".join(self.notes)} if self.notes else {}
 
     @property
     def n_states(self) -> int:
@@ -132,7 +116,7 @@ class SteadyStates(AbstractResult):
     @property
     def phase_unknown(self) -> Bool[Array, "state sensor"]:
         """Where a velocity was measured whose amplitude alone is known."""
-        return self.measured & (self.phase_std >= PHASE_UNKNOWN * (1 - 1e-12))
+        return self.measured & (self.phase_std >= _UNKNOWN_FROM)
 
     def select(self, rows: Bool[np.ndarray, " state"] | Int[np.ndarray, " row"]) -> "SteadyStates":
         """Some of the states: those where a mask is true, or of these rows in this order."""
@@ -219,11 +203,11 @@ def steady_states(
         harmonics = np.zeros((n_states, n_sensors, 0), dtype=np.complex128)
         if harmonic_order:
             raise ValueError("`harmonic_order` is given without `harmonics`.")
-    told: Any = np.asarray(harmonics, dtype=np.complex128)
-    if told.shape != (n_states, n_sensors, len(harmonic_order)):
+    recorded: Any = np.asarray(harmonics, dtype=np.complex128)
+    if recorded.shape != (n_states, n_sensors, len(harmonic_order)):
         raise ValueError(
             f"`harmonics` must have shape {(n_states, n_sensors, len(harmonic_order))}, "
-            f"but has {told.shape}."
+            f"but has {recorded.shape}."
         )
     states = SteadyStates(
         level=per_state("level", level, np.int64),
@@ -238,7 +222,7 @@ def steady_states(
         force_std=per_state("force_std", columns.get("force_std")),
         drive=per_state("drive", columns.get("drive")),
         order=per_state("order", columns.get("order")),
-        harmonics=told,
+        harmonics=recorded,
         harmonic_std=per_sensor("harmonic_std", columns.get("harmonic_std")),
         harmonic_order=harmonic_order,
         sensors=tuple(sensors),
@@ -247,37 +231,26 @@ def steady_states(
     return jax.device_put(states, may_alias=False)
 
 
-def _on_host(data: SteadyStates, *names: str) -> SteadyStates:
-    """Some columns as NumPy's, for which nothing compiles, unless one of them is traced."""
-    columns = [getattr(data, name) for name in names]
-    if any(isinstance(column, jax.core.Tracer) for column in columns):
-        return data
-    own: dict[str, Any] = dict(zip(names, map(np.asarray, columns), strict=True))
-    return dataclasses.replace(data, **own)
-
-
 def check_phases(data: SteadyStates, purpose: str) -> None:
     """Raise `ValueError` where phases are unknown; `purpose` is what needs them."""
-    phases: Any = _on_host(data, "phase_std", "measured").phase_unknown
-    if isinstance(phases, jax.core.Tracer):  # within `jax.jit` nothing has a value yet
+    std, measured = value_of(data.phase_std), value_of(data.measured)
+    if std is None or measured is None:
         return
-    unknown = np.any(np.asarray(phases), axis=1)
+    unknown = np.any(measured & (std >= _UNKNOWN_FROM), axis=1)
     if unknown.any():
         raise ValueError(
             f"{purpose} needs the phases of all velocities relative to the force, but those of "
             f"{int(unknown.sum())} of {data.n_states} steady states are unknown (`velocity_m_s` "
             f"in place of real and imaginary part, or `phase_std_deg` of "
-            f"{np.degrees(PHASE_UNKNOWN):.0f} or more): leave these out, or ask `snrmjax diagnose` "
+            f"{PHASE_UNKNOWN / DEGREE:.0f} or more): leave these out, or ask `snrmjax diagnose` "
             "(`diagnose_model`) what the model lacks, which works with amplitudes alone."
         )
 
 
 def check_force(data: SteadyStates, purpose: str) -> None:
     """Raise `ValueError` where no state has a force; `purpose` is what needs it."""
-    force: Any = _on_host(data, "force").force
-    known = force.__array_namespace__().isfinite(force)
-    # Within `jax.jit` nothing has a value yet; within a derivative this still has one.
-    if isinstance(known, jax.core.Tracer) or np.any(known):
+    force = value_of(data.force)
+    if force is None or np.any(np.isfinite(force)):
         return
     if not np.any(np.isfinite(np.asarray(data.drive))):
         raise ValueError(f"{purpose} needs the force, but no steady state has one.")
@@ -327,12 +300,12 @@ def join_steady_states(*parts: SteadyStates | Iterable[SteadyStates]) -> SteadyS
 
 def with_levels_apart(tests: Iterable[SteadyStates]) -> tuple[SteadyStates, ...]:
     """Tests whose levels follow one another, so that joined no two of them share one."""
-    found, offset = [], 0
+    apart, offset = [], 0
     for test in tests:
-        one = test.renumbered(offset)
-        offset = int(one.level.max())
-        found.append(one)
-    return tuple(found)
+        moved = test.renumbered(offset)
+        offset = int(moved.level.max())
+        apart.append(moved)
+    return tuple(apart)
 
 
 def _with_harmonics(data: SteadyStates, orders: tuple[int, ...]) -> SteadyStates:

@@ -13,10 +13,10 @@ from snrmjax.measure.states import SteadyStates, join_steady_states, with_levels
 from snrmjax.methods.record_comparison import RECORD_METHODS, run_record_method, states_of
 from snrmjax.methods.records.recorded_test import RecordedTest, RecordKind, recorded_test
 from snrmjax.methods.result import (
-    MethodPoint,
     MethodResult,
     MethodStatus,
     method_result,
+    points_of_curves,
 )
 from snrmjax.methods.steady.arslan_ozguven import arslan_ozguven
 from snrmjax.methods.steady.concerto import concerto
@@ -24,6 +24,7 @@ from snrmjax.methods.steady.harmonic_force_surface import harmonic_force_surface
 from snrmjax.methods.steady.phase_resonance import phase_resonance
 from snrmjax.methods.steady.rct import rct
 from snrmjax.model.modes import LinearModes
+from snrmjax.numerics.facts import Fact
 
 _SAMPLES = 41  # of the curves that the inverse method gives
 
@@ -47,14 +48,10 @@ def snrm(data: SteadyStates, modes: LinearModes) -> MethodResult:
         joint = fit_jointly(data, modes, free=("instrument_phase",))
         backbone, notes = as_backbone(joint), joint.notes
     curve = backbone.sampled(_SAMPLES)
-    columns = (
+    points = points_of_curves(
         *(curve.velocity, curve.natural_frequency, curve.natural_frequency_std),
         *(curve.damping_ratio, curve.damping_ratio_std),
     )
-    points = [
-        MethodPoint(MethodStatus.FOUND, -1, *(float(value) for value in row))
-        for row in np.stack([np.asarray(one) for one in columns], axis=1)
-    ]
     return method_result("snrm", points, data.n_states, notes)
 
 
@@ -75,7 +72,7 @@ class Comparison(NamedTuple):
     results: tuple[MethodResult, ...]
     stopped: dict[str, str]  # method: why
     data: SteadyStates | None = None  # of tables, stepped sines and slow sweeps
-    records: tuple[str, ...] = ()  # what each time record was taken for, and why
+    records: tuple[Fact, ...] = ()  # what each time record was taken for, and why
 
 
 def compare_methods(
@@ -94,85 +91,83 @@ def compare_methods(
     Raises `ValueError` for a name that no method has, and where not one method could run
     or found anything.
     """
-    every = (*METHODS, *RECORD_METHODS)
-    names = list(every) if methods is None else list(methods)
-    unknown = [name for name in names if name not in every]
+    known = (*METHODS, *RECORD_METHODS)
+    names = list(known) if methods is None else list(methods)
+    unknown = [name for name in names if name not in known]
     if unknown:
         raise ValueError(
-            f"`methods` must be among {', '.join(every)}, but has {', '.join(unknown)}."
+            f"`methods` must be among {', '.join(known)}, but has {', '.join(unknown)}."
         )
-    parts = [data] if isinstance(data, SteadyStates) else list(data)
-    tests, unread = _sorted_records(parts, modes)
-    states, read, unsteady = _all_states(parts, tests)
+    read = _read([data] if isinstance(data, SteadyStates) else list(data), modes)
     results: list[MethodResult] = []
     stopped: dict[str, str] = {}
-    absent: dict[str, str] = {}
+    absent: dict[str, str] = {}  # methods without data of their kind
     for name in names:
         if name in RECORD_METHODS:
-            found = run_record_method(name, tests, modes)
+            found = run_record_method(name, read.tests, modes)
             if found.result is not None:
                 results.append(found.result)
             else:
                 (stopped if found.had_data else absent)[name] = found.reason
-        elif states is None:
-            why = f"{name} needs steady states, and the data have none."
-            (stopped if unsteady else absent)[name] = f"{name}: {unsteady[0]}" if unsteady else why
+        elif read.states is None:
+            if read.without_states:
+                stopped[name] = read.without_states[0]
+            else:
+                absent[name] = "steady states are needed, and the data have none."
         else:
             try:
-                results.append(METHODS[name](states, modes))
+                results.append(METHODS[name](read.states, modes))
             except ValueError as error:
                 stopped[name] = str(error)
-    for why in unread:  # a record that nothing can use stops what has no other data
-        for name in absent:
-            stopped[name] = f"{name}: {why}"
-        absent = {}
+    if read.unknown:  # a record that nothing can use stops what has no other data
+        absent = dict.fromkeys(absent, read.unknown[-1])
+    stopped = {name: f"{name}: {why}" for name, why in (stopped | absent).items()}
     if not results:
-        first, reason = next(iter((stopped | absent).items()), ("none", "none was asked for."))
-        own = reason if reason.startswith(first) else f"{first}: {reason}"
-        raise ValueError(f"no method could run; {own}")
-    if not any(one.found.any() for one in results):
+        raise ValueError(f"no method could run; {next(iter(stopped.values()), 'none was asked.')}")
+    if not any(result.found.any() for result in results):
         why = MethodStatus(int(results[0].status[0])).message
         raise ValueError(f"no method found anything; {results[0].method}: {why}.")
-    left_out = [f"left out: {why}" for why in (*unread, *unsteady)]
-    return Comparison(tuple(results), stopped | absent, states, (*_kinds(tests, read), *left_out))
+    return Comparison(tuple(results), stopped, read.states, read.facts())
 
 
-def _kinds(tests: Sequence[RecordedTest], read: dict[int, str]) -> list[str]:
-    """What each record was taken for, why, and how many states it gave."""
-    return [
-        f"{one.recording.name}: {one.kind.value} ({one.why}"
-        + (f"; {read[k]})" if k in read else ")")
-        for k, one in enumerate(tests)
-    ]
+class _Read(NamedTuple):
+    """Tables and records by what they are."""
+
+    states: SteadyStates | None  # of tables, steps and sweeps
+    tests: list[RecordedTest]
+    counts: list[Fact | None]  # of the states of each
+    unknown: list[str]  # why records are of no known kind
+    without_states: list[str]  # why steps and sweeps have no states
+
+    def facts(self) -> tuple[Fact, ...]:
+        """What each record was taken for, why, and how many states it gave."""
+        taken = (
+            Fact("record_sorted", name=t.recording.name, kind=t.kind.value, why=t.why, states=n)
+            for t, n in zip(self.tests, self.counts, strict=True)
+        )
+        left_out = (Fact("data_left_out", why=why) for why in self.unknown + self.without_states)
+        return (*taken, *left_out)
 
 
-def _sorted_records(
-    parts: Sequence[SteadyStates | TimeRecording], modes: LinearModes
-) -> tuple[list[RecordedTest], list[str]]:
-    """Records by what they are, and why some are nothing."""
-    tests, unread = [], []
-    for one in parts:
-        if isinstance(one, TimeRecording):
+def _read(parts: Sequence[SteadyStates | TimeRecording], modes: LinearModes) -> _Read:
+    states = [part for part in parts if isinstance(part, SteadyStates)]
+    read = _Read(None, [], [], [], [])
+    for part in parts:
+        if isinstance(part, SteadyStates):
+            continue
+        try:
+            read.tests.append(recorded_test(part, modes))
+        except ValueError as error:
+            read.unknown.append(str(error))
+            continue
+        read.counts.append(None)
+        if read.tests[-1].kind in (RecordKind.STEPPED_SINE, RecordKind.SLOW_SWEEP):
             try:
-                tests.append(recorded_test(one, modes))
+                found, read.counts[-1] = states_of(read.tests[-1])
+                states.append(found)
             except ValueError as error:
-                unread.append(str(error))
-    return tests, unread
-
-
-def _all_states(
-    parts: Sequence[SteadyStates | TimeRecording], tests: Sequence[RecordedTest]
-) -> tuple[SteadyStates | None, dict[int, str], list[str]]:
-    """Steady states of tables, steps and sweeps, how many by record, and why some have none."""
-    found, why = [one for one in parts if isinstance(one, SteadyStates)], []
-    read: dict[int, str] = {}
-    for k, test in enumerate(tests):
-        if test.kind in (RecordKind.STEPPED_SINE, RecordKind.SLOW_SWEEP):
-            try:
-                states, read[k] = states_of(test)
-                found.append(states)
-            except ValueError as error:
-                why.append(str(error))
-    if not found:
-        return None, read, why
-    return found[0] if len(found) == 1 else join_steady_states(with_levels_apart(found)), read, why
+                read.without_states.append(str(error))
+    if not states:
+        return read
+    joined = states[0] if len(states) == 1 else join_steady_states(with_levels_apart(states))
+    return read._replace(states=joined)

@@ -6,9 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from snrmjax.identify.pointwise.snrm import reference_sensor
 from snrmjax.measure.states import PHASE_UNKNOWN, SteadyStates
-from snrmjax.model.modes import LinearModes
+from snrmjax.model.modes import LinearModes, reference_sensor
 
 
 class SensorStates(NamedTuple):
@@ -47,12 +46,12 @@ class SensorStates(NamedTuple):
 
 
 def sensor_states(
-    data: SteadyStates, modes: LinearModes, method: str, *, any_scale: bool = False
+    data: SteadyStates, modes: LinearModes, *, any_scale: bool = False
 ) -> SensorStates:
     """The states that a method of one sensor can use, velocities turned to the mode's sign.
 
-    Arguments: `method` is named in errors; with `any_scale` a drive voltage stands for the force
-    where no force was measured, for methods to which the modal constant does not matter.
+    Arguments: with `any_scale` a drive voltage stands for the force where no force was measured,
+    for methods to which the modal constant does not matter.
     A phase whose error is not stated is as wrong, in rad, as its amplitude is relatively.
     Raises `ValueError` where no force or no phase was measured, or where the reference sensor is
     not in the data.
@@ -60,7 +59,7 @@ def sensor_states(
     name = modes.sensors[reference_sensor(modes)]
     if name not in data.sensors:
         raise ValueError(
-            f"{method} needs the sensor {name}, where the mode moves most, but the data have "
+            f"the sensor {name}, where the mode moves most, is needed, but the data have "
             f"{', '.join(data.sensors)}."
         )
     at = data.sensors.index(name)
@@ -71,12 +70,12 @@ def sensor_states(
     measured = np.asarray(data.measured)[:, at] & (np.abs(velocity) > 0)
     forced = measured & np.isfinite(force) & (force > 0)
     if not forced.any():
-        raise ValueError(f"{method} needs forces in N, but the data have none (force_n).")
+        raise ValueError("forces in N are needed, but the data have none (force_n).")
     phased = forced & ~(phase_std >= PHASE_UNKNOWN * (1 - 1e-12))
     if not phased.any():
-        raise ValueError(f"{method} needs phases, but the data have amplitudes alone.")
+        raise ValueError("phases are needed, but the data have amplitudes alone.")
     kept = np.flatnonzero(phased)
-    turn = np.sign(_drive_point(modes))
+    turn = np.sign(signed_drive_point(modes))
     velocity_std = np.asarray(data.velocity_std)[kept, at] / np.abs(velocity[kept])
     force_std = np.asarray(data.force_std)[kept] / force[kept]
     return SensorStates(
@@ -89,7 +88,7 @@ def sensor_states(
     )
 
 
-def _drive_point(modes: LinearModes) -> float:
+def signed_drive_point(modes: LinearModes) -> float:
     """Shape at the reference sensor times participation: 1 / modal mass there, 1/kg, signed."""
     k = modes.mode_of_interest
     return float(modes.mode_shape[reference_sensor(modes), k] * modes.participation[k])
@@ -97,4 +96,4 @@ def _drive_point(modes: LinearModes) -> float:
 
 def drive_point(modes: LinearModes) -> float:
     """Velocity of the reference sensor per modal velocity and force: |Φ_r Φᵀb|, 1/kg."""
-    return abs(_drive_point(modes))
+    return abs(signed_drive_point(modes))

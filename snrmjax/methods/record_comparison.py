@@ -1,24 +1,23 @@
-"""The methods that a time record allows: decays, restoring forces, manifolds."""
+"""The methods that a time record allows: decays, restoring forces, manifolds, state spaces."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from snrmjax.measure.recordings.stepped_sine import stepped_sine_states
-from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.states import SteadyStates
 from snrmjax.measure.sweeps.slow_sweep import sweep_states
 from snrmjax.methods.records.pnlss import pnlss
 from snrmjax.methods.records.recorded_test import RecordedTest, RecordKind
-from snrmjax.methods.records.recorded_velocity import RecordedVelocity, recorded_velocity
+from snrmjax.methods.records.recorded_velocity import recorded_velocity
 from snrmjax.methods.records.resonant_decay import even_record, resonant_decay
 from snrmjax.methods.records.restoring_force import restoring_force
 from snrmjax.methods.records.ssm import ssm
-from snrmjax.methods.result import MethodPoint, MethodResult, MethodStatus, method_result
+from snrmjax.methods.result import MethodResult, method_result
 from snrmjax.model.modes import LinearModes
+from snrmjax.numerics.facts import Fact
 
 _LONGEST = 2**22  # samples of a record that these methods hold in memory
 
@@ -31,7 +30,7 @@ class Found(NamedTuple):
     had_data: bool = True  # records of the kind that it reads
 
 
-def states_of(test: RecordedTest) -> tuple[SteadyStates, str]:
+def states_of(test: RecordedTest) -> tuple[SteadyStates, Fact]:
     """Steady states of a stepped sine or a slow sweep at the model's sensors, and how many.
 
     Raises `ValueError` that names the record for what `stepped_sine_states` and `sweep_states`
@@ -42,25 +41,16 @@ def states_of(test: RecordedTest) -> tuple[SteadyStates, str]:
     if force is None:
         raise ValueError(f"{test.recording.name} has no force.")
     drive = channels.drive if channels.force is not None else None
+    settings: dict[str, Any] = {"sensors": channels.sensors, "drive": drive}
     try:
         if test.kind is RecordKind.STEPPED_SINE:
-            steps = stepped_sine_states(
-                test.recording, force, channels.motions, sensors=channels.sensors, drive=drive
-            )
-            return steps.states, f"{steps.states.n_states} of {len(steps.status)} settled"
-        swept = sweep_states(
-            test.recording, force, channels.motions, sensors=channels.sensors, drive=drive
-        ).states
-        return swept, f"{swept.n_states} states read"
+            steps = stepped_sine_states(test.recording, force, channels.motions, **settings)
+            states = steps.states
+            return states, Fact("steps_settled", n=states.n_states, n_steps=len(steps.status))
+        states = sweep_states(test.recording, force, channels.motions, **settings).states
+        return states, Fact("states_read", n=states.n_states)
     except ValueError as error:
         raise ValueError(f"{test.recording.name}: {error}") from error
-
-
-def _decays(test: RecordedTest) -> list[RecordedVelocity]:
-    return [
-        recorded_velocity(test.recording, test.channels.reference, test.frequency, part)
-        for part in test.free
-    ]
 
 
 def _of_decays(
@@ -68,38 +58,50 @@ def _of_decays(
 ) -> Callable[[RecordedTest, LinearModes], list[MethodResult]]:
     def run(test: RecordedTest, modes: LinearModes) -> list[MethodResult]:
         found = []
-        for one in _decays(test):
-            seen = method(one.time, one.velocity, least_amplitude=one.floor)
-            found.append(_noted(seen, one.notes))
+        for part in test.free:
+            seen = recorded_velocity(test.recording, test.channels.reference, test.frequency, part)
+            result = method(seen.time, seen.velocity, least_amplitude=seen.floor)
+            found.append(_noted(result, seen.notes))
         return found
 
     return run
 
 
-def _noted(result: MethodResult, notes: Sequence[str]) -> MethodResult:
+def _noted(result: MethodResult, notes: Sequence[Fact]) -> MethodResult:
     return dataclasses.replace(result, notes=(*result.notes, *notes))
 
 
 def _restoring_force(test: RecordedTest, modes: LinearModes) -> list[MethodResult]:
     if test.kind is RecordKind.FREE_DECAY:
         return _of_decays(restoring_force)(test, modes)
-    if test.channels.force is None:
-        raise ValueError("a forced record needs its force in N (force_n).")
-    whole = (0, test.recording.n_samples)
+    channel, whole = _force_channel(test), (0, test.recording.n_samples)
     seen = recorded_velocity(
         test.recording, test.channels.reference, test.frequency, whole, forced=True
     )
-    force = _force(test.recording, test.channels.force, seen)
-    found = restoring_force(seen.time, seen.velocity, force, modes)
+    force = test.recording.values([channel], seen.start, seen.start + len(seen.time))[0]
+    found = restoring_force(seen.time, seen.velocity, even_record(seen.time, force)[1], modes)
     return [_noted(found, seen.notes)]
 
 
-def _force(
-    recording: TimeRecording, name: str, seen: RecordedVelocity
-) -> Float[np.ndarray, " sample"]:
-    """The force at the samples of a velocity."""
-    force = recording.values([name], seen.start, seen.start + len(seen.time))[0]
-    return even_record(seen.time, force, f"channel {name}")[1]
+def _force_channel(test: RecordedTest) -> str:
+    if test.channels.force is None:
+        raise ValueError("a forced record needs its force in N (force_n).")
+    return test.channels.force
+
+
+def _pnlss_of(tests: Sequence[RecordedTest], modes: LinearModes) -> MethodResult:
+    """One model of all realisations and levels; the one next to the largest is predicted."""
+    if len({(test.channels, test.recording.sampling_rate) for test in tests}) > 1:
+        raise ValueError("records of different channels or rates are fitted one by one.")
+    force = _force_channel(tests[0])
+    records = [test.recording for test in tests]
+    if len(records) == 1:
+        return pnlss(records, force, tests[0].channels.reference, modes)
+    size = [float(np.std(record.values([force], 0, _LONGEST))) for record in records]
+    first, second, *others = np.argsort(size)[::-1]
+    ordered = [records[k] for k in (first, *others, second)]
+    found = pnlss(ordered, force, tests[0].channels.reference, modes)
+    return _noted(found, [Fact("one_model_of_records", n=len(tests))])
 
 
 class RecordMethod(NamedTuple):
@@ -107,33 +109,7 @@ class RecordMethod(NamedTuple):
 
     run: Callable[[RecordedTest, LinearModes], list[MethodResult]]
     kinds: tuple[RecordKind, ...]
-    together: Callable[[Sequence[RecordedTest], LinearModes], list[MethodResult]] | None = None
-
-
-def _pnlss(test: RecordedTest, modes: LinearModes) -> list[MethodResult]:
-    return [_pnlss_of([test], modes)]
-
-
-def _pnlss_of(tests: Sequence[RecordedTest], modes: LinearModes) -> MethodResult:
-    records, force = [one.recording for one in tests], _force_channel(tests[0])
-    return pnlss(records, force, tests[0].channels.reference, modes)
-
-
-def _force_channel(test: RecordedTest) -> str:
-    if test.channels.force is None:
-        raise ValueError("the force must be known in N (force_n).")
-    return test.channels.force
-
-
-def _pnlss_together(tests: Sequence[RecordedTest], modes: LinearModes) -> list[MethodResult]:
-    """One model of all realisations and levels; the one next to the largest is predicted."""
-    if len({(one.channels, one.recording.sampling_rate) for one in tests}) > 1:
-        raise ValueError("records of different channels or rates are fitted one by one.")
-    force = _force_channel(tests[0])
-    size = [float(np.std(one.recording.values([force], 0, _LONGEST))) for one in tests]
-    first, second, *others = np.argsort(size)[::-1]
-    found = _pnlss_of([tests[k] for k in (first, *others, second)], modes)
-    return [_noted(found, (f"one model of {len(tests)} records",))]
+    together: Callable[[Sequence[RecordedTest], LinearModes], MethodResult] | None = None
 
 
 RECORD_METHODS: dict[str, RecordMethod] = {
@@ -142,7 +118,9 @@ RECORD_METHODS: dict[str, RecordMethod] = {
         _restoring_force, (RecordKind.FREE_DECAY, RecordKind.BROADBAND)
     ),
     "ssm": RecordMethod(_of_decays(ssm), (RecordKind.FREE_DECAY,)),
-    "pnlss": RecordMethod(_pnlss, (RecordKind.BROADBAND,), _pnlss_together),
+    "pnlss": RecordMethod(
+        lambda test, modes: [_pnlss_of([test], modes)], (RecordKind.BROADBAND,), _pnlss_of
+    ),
 }
 """Methods that read time records, by name."""
 
@@ -155,55 +133,39 @@ def run_record_method(name: str, tests: Sequence[RecordedTest], modes: LinearMod
     can read none.
     """
     method = RECORD_METHODS[name]
-    own = [one for one in tests if one.kind in method.kinds]
-    if not own:
+    readable = [test for test in tests if test.kind in method.kinds]
+    if not readable:
         wanted = " or ".join(kind.value for kind in method.kinds)
-        return Found(None, f"{name} needs a time record ({wanted}), and the data have none.", False)
+        return Found(None, f"a time record ({wanted}) is needed, and the data have none.", False)
     found: list[MethodResult] = []
     reasons: list[str] = []
-    seconds = 0.0
-    apart: tuple[str, ...] = ()
-    if method.together is not None and len(own) > 1:
+    apart: list[Fact] = []
+    read: list[RecordedTest] = []
+    if method.together is not None and len(readable) > 1:
         try:
-            found = method.together(own, modes)
-            seconds = sum(one.recording.duration for one in own)
-            own = []
+            found, read, readable = [method.together(readable, modes)], readable, []
         except ValueError as error:
-            apart = (f"each record alone: {error}",)
-    for test in own:
+            apart = [Fact("records_apart", why=str(error))]
+    for test in readable:
         try:
             if test.recording.n_samples > _LONGEST:
                 raise ValueError(f"the record has more than {_LONGEST} samples: cut it.")
             found += method.run(test, modes)
-            seconds += test.recording.duration
+            read.append(test)
         except ValueError as error:
-            said = str(error)
-            named = said if said.startswith(name) else f"{name}: {said}"
-            reasons.append(f"{named} ({test.recording.name})")
+            reasons.append(f"{error} ({test.recording.name})")
     if not found:
         return Found(None, reasons[0])
-    return Found(_noted(_joined(name, found, reasons, seconds), apart), "")
-
-
-def _joined(
-    name: str, found: Sequence[MethodResult], reasons: Sequence[str], seconds: float
-) -> MethodResult:
-    """Several results of one method as one, the number of the record as level."""
-    points = [
-        MethodPoint(
-            MethodStatus(int(one.status[k])),
-            number,
-            *(
-                float(column[k])
-                for column in (
-                    *(one.velocity, one.natural_frequency, one.natural_frequency_std),
-                    *(one.damping_ratio, one.damping_ratio_std),
-                )
-            ),
-        )
-        for number, one in enumerate(found, 1)
-        for k in range(len(one.status))
+    notes = [
+        *(Fact("record_left_out", why=why) for why in reasons),
+        *(note for result in found for note in result.notes),
+        *apart,
     ]
-    notes = [note for one in found for note in one.notes]
-    left_out = [f"a record was left out: {why}" for why in reasons]
-    return method_result(name, points, 0, (*left_out, *notes), test_seconds=seconds)
+    # The number of the record as level.
+    points = [
+        point._replace(level=number)
+        for number, result in enumerate(found, 1)
+        for point in result.points()
+    ]
+    seconds = sum(test.recording.duration for test in read)
+    return Found(method_result(name, points, 0, notes, test_seconds=seconds), "")

@@ -77,10 +77,40 @@ class MethodResult(AbstractResult):
     test_seconds: float = setting(default=np.nan)  # of a test that it ran itself
     notes: tuple[Fact | str, ...] = setting(default=())
 
+    def points(self) -> list[MethodPoint]:
+        """The answers one by one."""
+        rows = zip(
+            *(self.status, self.level, self.velocity),
+            *(self.natural_frequency, self.natural_frequency_std),
+            *(self.damping_ratio, self.damping_ratio_std),
+            strict=True,
+        )
+        return [
+            MethodPoint(MethodStatus(int(status)), int(level), *map(float, numbers))
+            for status, level, *numbers in rows
+        ]
+
     @property
     def found(self) -> Bool[np.ndarray, " point"]:
         """Where there is an answer."""
         return np.asarray(self.status) == int(MethodStatus.FOUND)
+
+
+def points_of_curves(
+    velocity: Numbers,
+    natural_frequency: Numbers,
+    natural_frequency_std: Numbers,
+    damping_ratio: Numbers,
+    damping_ratio_std: Numbers,
+) -> list[MethodPoint]:
+    """Points of curves over velocity; where the damping is not positive none is a mode."""
+    columns = (velocity, natural_frequency, natural_frequency_std, damping_ratio, damping_ratio_std)
+    return [
+        MethodPoint(MethodStatus.FOUND, -1, *map(float, row))
+        if row[3] > 0
+        else MethodPoint(MethodStatus.NOT_A_MODE, -1)
+        for row in np.stack([np.asarray(column) for column in columns], axis=1)
+    ]
 
 
 def method_result(
@@ -92,21 +122,12 @@ def method_result(
     test_seconds: float = np.nan,
 ) -> MethodResult:
     """A method's points as one result, by rising velocity, those without an answer last."""
-    kept = sorted(points, key=lambda one: (one.status != MethodStatus.FOUND, one.velocity))
-
-    def column(name: str) -> np.ndarray:
-        return np.array([getattr(one, name) for one in kept], dtype=float)
-
+    kept = sorted(points, key=lambda point: (point.status != MethodStatus.FOUND, point.velocity))
+    kinds = {"status": int, "level": int}
+    columns = {
+        name: np.array([getattr(point, name) for point in kept], dtype=kinds.get(name, float))
+        for name in MethodPoint._fields
+    }
     return MethodResult(
-        method,
-        column("velocity"),
-        column("natural_frequency"),
-        column("natural_frequency_std"),
-        column("damping_ratio"),
-        column("damping_ratio_std"),
-        np.array([one.level for one in kept], dtype=int),
-        np.array([int(one.status) for one in kept], dtype=int),
-        n_states,
-        test_seconds,
-        tuple(notes),
+        method=method, n_states=n_states, test_seconds=test_seconds, notes=tuple(notes), **columns
     )

@@ -1,5 +1,5 @@
 from .arches import ArchSettings, shallow_arch
-from .averaging import averaged_effect, averaged_force, averaged_response
+from .averaging import averaged_effect
 from .beams import CURVED_BEAM_FORCES, FLAT_BEAM_FORCES, curved_beam, flat_beam
 from .effect_base import (
     AbstractForce,
@@ -22,7 +22,7 @@ from .effect_metadata import (
     parameter,
 )
 from .effect_shape import shape_of
-from .effects import EFFECTS, LAWS, describe_effects, make_effect, register_effect
+from .effects import EFFECTS, LAWS, make_effect, register_effect
 from .modes import (
     LinearModes,
     LinearModesStd,
@@ -32,7 +32,7 @@ from .modes import (
     residual_velocity,
 )
 from .parameters import parameter_values, with_parameters
-from .potential import PolynomialPotential, polynomial_potential, potential_from_force_table
+from .potential import PolynomialPotential, polynomial_potential
 from .structures import Structure, equilibria, structure
 
 __all__ = [
@@ -62,10 +62,7 @@ __all__ = [
     "Structure",
     "Symmetry",
     "averaged_effect",
-    "averaged_force",
-    "averaged_response",
     "curved_beam",
-    "describe_effects",
     "equilibria",
     "flat_beam",
     "linear_modes",
@@ -74,7 +71,6 @@ __all__ = [
     "parameter",
     "parameter_values",
     "polynomial_potential",
-    "potential_from_force_table",
     "register_effect",
     "residual_velocity",
     "shallow_arch",

@@ -16,9 +16,17 @@ from jaxtyping import Array, Float
 from snrmjax.model.modes import LinearModes, have_values
 from snrmjax.model.potential import Monomial, PolynomialPotential
 from snrmjax.model.structures import Structure
+from snrmjax.numerics.rules import (
+    BELOW_ONE,
+    BETWEEN_ZERO_AND_ONE,
+    NOT_NEGATIVE,
+    POSITIVE,
+    require,
+)
 
 _STEEPEST = 0.1  # rise over length: the strain of a shallow arch is wrong by some per cent there
 _MOST = 20  # number of a beam function
+_NUMBERS = ("length", "width", "thickness", "rise", "young", "density")
 _POINTS = 200  # of Gauss's rule; exact to rounding for the highest beam function
 
 Number = float | Float[Array, ""]
@@ -46,8 +54,8 @@ class ArchSettings(eqx.Module):
             raise ValueError(f"`beam_functions` must be from 1 to {_MOST}, but are {numbers}.")
         for name in ("sensor_position", "force_position"):
             place = getattr(self, name)
-            if place is not None and not 0 < place < 1:
-                raise ValueError(f"`{name}` must be between 0 and 1, but is {place:g}.")
+            if place is not None:
+                require(f"`{name}`", place, BETWEEN_ZERO_AND_ONE)
 
 
 DEFAULT_ARCH = ArchSettings()
@@ -96,7 +104,7 @@ def shallow_arch(
     [78.97, 426.74]
     """
     numbers = [length, width, thickness, rise, young, density]
-    given = [jnp.asarray(one, dtype=jnp.float64) for one in (*numbers, damping_ratio)]
+    given = [jnp.asarray(number, dtype=jnp.float64) for number in (*numbers, damping_ratio)]
     if have_values(given):
         _check(given, len(settings.beam_functions))
     return _arch(jnp.stack(given[:6]), given[6], settings)
@@ -130,7 +138,7 @@ def _arch(numbers: Float[Array, " 6"], damping_ratio: Array, settings: ArchSetti
     )
     cubic = 0.5 * stretching * jnp.einsum("i,jk->ijk", slope, shortening)
     quartic = 0.125 * stretching * jnp.einsum("ij,kl->ijkl", shortening, shortening)
-    parts = [_gathered(one) for one in (cubic, quartic)]
+    parts = [_gathered(form) for form in (cubic, quartic)]
     coefficient = jnp.concatenate([values for values, _ in parts])
     potential = PolynomialPotential(
         coefficient, jnp.zeros(coefficient.shape), parts[0][1] + parts[1][1], n
@@ -141,7 +149,7 @@ def _arch(numbers: Float[Array, " 6"], damping_ratio: Array, settings: ArchSetti
 def _gathered(tensor: Float[Array, "..."]) -> tuple[Float[Array, " monomial"], tuple]:
     """The coefficients of a form by its monomials, permutations of the same modes summed."""
     places = list(itertools.product(*(range(n) for n in tensor.shape)))
-    monomials: tuple[Monomial, ...] = tuple(sorted({tuple(sorted(one)) for one in places}))
+    monomials: tuple[Monomial, ...] = tuple(sorted({tuple(sorted(place)) for place in places}))
     row = {monomial: k for k, monomial in enumerate(monomials)}
     sums = np.zeros((len(monomials), len(places)))
     for k, place in enumerate(places):
@@ -201,26 +209,19 @@ def _beam_functions(
 
 
 def _check(given: list[Array], n_modes: int) -> None:
-    names = ("length", "width", "thickness", "rise", "young", "density")
-    numbers = dict(zip(names, given, strict=False))
-    for name, one in numbers.items():
-        if one.ndim:
-            raise ValueError(f"`{name}` must be one number, but has shape {one.shape}.")
-        value = float(one)
-        least = value >= 0 if name == "rise" else value > 0
-        if not (np.isfinite(value) and least):
-            wanted = "zero or positive" if name == "rise" else "positive"
-            raise ValueError(f"`{name}` must be {wanted}, but is {value:g}.")
-    rise, length = float(numbers["rise"]), float(numbers["length"])
+    for name, number in zip(_NUMBERS, given, strict=False):
+        if number.ndim:
+            raise ValueError(f"`{name}` must be one number, but has shape {number.shape}.")
+        require(f"`{name}`", number, NOT_NEGATIVE if name == "rise" else POSITIVE)
+    length, rise = float(given[0]), float(given[3])
     if rise > _STEEPEST * length:
         raise ValueError(
             f"`rise` must be at most a tenth of the length, {_STEEPEST * length:g} m, for a shallow"
             f" arch, but is {rise:g} m."
         )
-    damping = np.asarray(given[6])
+    damping = given[6]
     if damping.shape not in ((), (n_modes,)):
         raise ValueError(
             f"`damping_ratio` must be one number or {n_modes}, but has shape {damping.shape}."
         )
-    if not np.all((damping >= 0) & (damping < 1)):
-        raise ValueError(f"`damping_ratio` must be from 0 to below 1, but is {damping}.")
+    require("`damping_ratio`", damping, BELOW_ONE)

@@ -13,6 +13,7 @@ import numpy as np
 from snrmjax.model.modes import linear_modes
 from snrmjax.model.potential import polynomial_potential
 from snrmjax.model.structures import Structure, structure
+from snrmjax.numerics.units import HERTZ
 
 FLAT_BEAM_FORCES = (2.669e-3, 4.448e-3, 8.896e-3, 1.334e-2)
 """Forces in N of the flat beam's response functions in the paper (Fig. 8)."""
@@ -89,7 +90,7 @@ def flat_beam() -> Structure:
     4
     """
     modes = linear_modes(
-        2 * np.pi * np.array([79.02, 427.46, 1057.30, 1970.70]),
+        HERTZ * np.array([79.02, 427.46, 1057.30, 1970.70]),
         [0.05, 0.0009, 0.0008, 0.0006],
         [[11.84338, -10.48504, 10.54894, 10.54619]],
         [247.841, 108.510, 69.055, -50.640],
@@ -112,7 +113,7 @@ def curved_beam(reading: Literal["monostable", "as_printed"] = "monostable") -> 
     if factor is None:
         raise ValueError(f'`reading` must be "monostable" or "as_printed", but is {reading!r}.')
     modes = linear_modes(
-        2 * np.pi * np.array([64.78]), [0.05], [[12.77433]], [3341.536], sensors=("midspan",)
+        HERTZ * np.array([64.78]), [0.05], [[12.77433]], [3341.536], sensors=("midspan",)
     )
     # The table gives the force α q² + β q³; the potential is α q³/3 + β q⁴/4.
     potential = polynomial_potential({"111": -3.4380e9 / 3, "1111": factor * 6.2183e12 / 4}, 1)

@@ -29,6 +29,8 @@ from snrmjax.model.modes import LinearModes
 from snrmjax.model.potential import PolynomialPotential
 
 Scalar = Float[Array, ""]
+Samples = Float[Array, " time"]
+States = Float[Array, " state"]
 Starts = list[tuple[float, ...]]
 """Parameters, in the order of the constructor, from which a fit begins."""
 Bounds = list[tuple[float, float]]
@@ -90,21 +92,24 @@ class AbstractEffect(eqx.Module):
     def starts(cls, scales: MotionScales) -> Starts:
         """Parameters from which a fit to measured states begins, of a strength plainly seen.
 
-        Those of a force whose `shape` has a factor and a power of amplitude follow from these.
-        Empty where nothing is stated: the strength is then found from the force itself.
+        One, of the parameters' own `start`, where the strength states one; those of a force whose
+        `shape` has a factor and a power of amplitude follow from these. Empty where nothing is
+        stated: the strength is then found from the force itself.
         """
+        stated = list(cls.parameters().values())
+        if stated[0].start is not None:
+            return [tuple(of.start(scales) if of.start else of.typical for of in stated)]
         shape = cls.shape
         if shape is None or shape.factor is None or shape.power is None:
             return []
         size = shape.factor * scales.amplitude**shape.power
         strength = scales.change / (size * scales.frequency**shape.frequency_power)
-        others = list(cls.parameters().values())[1:]
-        return [(strength, *(other.typical for other in others))]
+        return [(strength, *(other.typical for other in stated[1:]))]
 
     @classmethod
     def bounds(cls, scales: MotionScales) -> Bounds:
         """The least and the largest value of every parameter that a fit considers."""
-        return [one.prior.bounds(scales) for one in cls.parameters().values()]
+        return [parameter.prior.bounds(scales) for parameter in cls.parameters().values()]
 
     @classmethod
     def steps(cls, start: tuple[float, ...]) -> tuple[float, ...]:
@@ -113,15 +118,16 @@ class AbstractEffect(eqx.Module):
 
     @classmethod
     def without_strength(cls, natural_frequency: float, damping_ratio: float) -> Self:
-        """The effect as it does nothing: strength zero, other parameters at their typical values.
+        """The effect at zero strength, its other parameters at their typical values.
 
         Arguments: natural frequency (rad/s) and damping ratio of the mode of interest.
         """
         _, *others = cls.parameters().values()
-        return cls(*(jnp.asarray(value) for value in (0.0, *(one.typical for one in others))))
+        values = (0.0, *(parameter.typical for parameter in others))
+        return cls(*(jnp.asarray(value) for value in values))
 
     def idle(self, natural_frequency: float, damping_ratio: float) -> Self:
-        """An effect like this one, of the same structure, that does nothing.
+        """An effect like this one, of the same structure, at zero strength.
 
         Arguments: see `without_strength`.
         """
@@ -132,18 +138,14 @@ class AbstractForce(AbstractEffect):
     """A force on the mode of interest, known over one cycle of a steady motion."""
 
     @abstractmethod
-    def cycle_force(
-        self, displacement: Float[Array, " time"], velocity: Float[Array, " time"]
-    ) -> Float[Array, " time"]:
+    def cycle_force(self, displacement: Samples, velocity: Samples) -> Samples:
         """The force at equally spaced samples of one period of a steady motion.
 
         Arguments: q in kg^1/2 m and q̇ in kg^1/2 m/s; sample 0 is at phase 0 of the force and the
         end of the period is left out. Returns kg^1/2 m/s², on the left of the modal equation.
         """
 
-    def quick_cycle_force(
-        self, displacement: Float[Array, " time"], velocity: Float[Array, " time"]
-    ) -> Float[Array, " time"]:
+    def quick_cycle_force(self, displacement: Samples, velocity: Samples) -> Samples:
         """`cycle_force` by a shorter formula, where there is one; NaN where that does not hold.
 
         Of friction it is Masing's rule, which holds for cycles with two turning points.
@@ -163,9 +165,7 @@ class AbstractMemoryless(AbstractForce):
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
         """The force f(q, q̇) on the left of the modal equation, in kg^1/2 m/s²."""
 
-    def cycle_force(
-        self, displacement: Float[Array, " time"], velocity: Float[Array, " time"]
-    ) -> Float[Array, " time"]:
+    def cycle_force(self, displacement: Samples, velocity: Samples) -> Samples:
         """See `AbstractForce.cycle_force`; valid for any samples, of one period or not."""
         return jax.vmap(self.force)(displacement, velocity)
 
@@ -187,9 +187,7 @@ class AbstractKinked(AbstractMemoryless):
         """See `AbstractMemoryless.force`."""
         return self.rounded_force(displacement, velocity, jnp.zeros(()))
 
-    def cycle_force(
-        self, displacement: Float[Array, " time"], velocity: Float[Array, " time"]
-    ) -> Float[Array, " time"]:
+    def cycle_force(self, displacement: Samples, velocity: Samples) -> Samples:
         """See `AbstractForce.cycle_force`; the kinks are rounded with the cycle's own range."""
         width = 0.5 * KINK_WIDTH * (jnp.max(displacement) - jnp.min(displacement))
         return jax.vmap(lambda q, v: self.rounded_force(q, v, width))(displacement, velocity)
@@ -227,24 +225,20 @@ class AbstractHysteresis(AbstractForce):
         return self
 
     @abstractmethod
-    def initial_states(self) -> Float[Array, " state"]:
+    def initial_states(self) -> States:
         """The internal states of a structure that has not moved yet."""
 
     @abstractmethod
-    def state_force(
-        self, displacement: Scalar, velocity: Scalar, states: Float[Array, " state"]
-    ) -> Scalar:
+    def state_force(self, displacement: Scalar, velocity: Scalar, states: States) -> Scalar:
         """The force for given internal states, in kg^1/2 m/s²."""
 
     @abstractmethod
-    def state_rate(
-        self, displacement: Scalar, velocity: Scalar, states: Float[Array, " state"]
-    ) -> Float[Array, " state"]:
+    def state_rate(self, displacement: Scalar, velocity: Scalar, states: States) -> States:
         """Rates of the internal states, per second."""
 
     @abstractmethod
     def settled_states(
-        self, displacement: Float[Array, " time"], velocity: Float[Array, " time"]
+        self, displacement: Samples, velocity: Samples
     ) -> Float[Array, "time state"]:
         """Internal states over the steady cycle of a periodic motion; see `cycle_force`."""
 
@@ -320,8 +314,8 @@ def checked_effects(effects: AbstractEffect | Iterable[AbstractEffect]) -> tuple
     Raises `ValueError` for a class in place of an effect, and for what is no effect.
     """
     several = isinstance(effects, Iterable) and not isinstance(effects, type)
-    every: Any = effects if several else (effects,)
-    return tuple(_with_arrays(effect) for effect in every)
+    given: Any = effects if several else (effects,)
+    return tuple(_with_arrays(effect) for effect in given)
 
 
 def _with_arrays(effect: Any) -> Any:
@@ -341,4 +335,4 @@ def _with_arrays(effect: Any) -> Any:
     if not plain:
         return effect
     arrays = [jnp.asarray(getattr(effect, name), dtype=jnp.float64) for name in plain]
-    return eqx.tree_at(lambda one: [getattr(one, name) for name in plain], effect, arrays)
+    return eqx.tree_at(lambda owner: [getattr(owner, name) for name in plain], effect, arrays)

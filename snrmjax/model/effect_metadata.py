@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import numpy as np
 
+from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.rules import Rule
 
 VISIBLE_CHANGE = 0.05
@@ -46,20 +47,6 @@ class Prior(NamedTuple):
         size = 1.0 if self.unit is None else self.unit(scales)
         return self.lower * size, self.upper * size
 
-    def __repr__(self) -> str:
-        """The range in words.
-
-        >>> Prior(lower=0.0), Prior(1e-5, 0.2), Prior()
-        (Prior(at least 0), Prior(from 1e-05 to 0.2), Prior(any))
-        """
-        at_least, at_most = self.lower > -np.inf, self.upper < np.inf
-        text = "any"
-        if at_least and at_most:
-            text = f"from {self.lower:g} to {self.upper:g}"
-        elif at_least or at_most:
-            text = f"at least {self.lower:g}" if at_least else f"at most {self.upper:g}"
-        return f"Prior({text}{'' if self.unit is None else ' times a measured size'})"
-
 
 ANY = Prior()
 NOT_BELOW_ZERO = Prior(lower=0.0)
@@ -85,7 +72,8 @@ class Parameter:
     value from which a fit begins and which the parameter has while the effect has no strength.
     `exponent` names, for the coefficient c of a law c x^p, the parameter p: the coefficient is
     that at unit amplitude, and a fit steps in c R^(p − 1), at a typical amplitude R, instead.
-    `entries` says of a law's parameters that they are a number for every knot.
+    `entries` says of a law's parameters that they are a number for every knot. `start` gives the
+    one value from which a fit to motions of some sizes begins.
     """
 
     unit: str = ""
@@ -95,24 +83,15 @@ class Parameter:
     typical: float = 1.0
     exponent: str | None = None
     entries: Entries = Entries.ONE
+    start: Callable[[MotionScales], float] | None = None
 
 
-def parameter(
-    unit: str,
-    meaning: str = "",
-    *,
-    rules: tuple[Rule, ...] = (),
-    prior: Prior = ANY,
-    typical: float = 1.0,
-    exponent: str | None = None,
-    entries: Entries = Entries.ONE,
-) -> Any:
+def parameter(unit: str, meaning: str = "", **stated: Any) -> Any:
     """A field of an effect that is one of its parameters; the arguments are `Parameter`'s.
 
     The first parameter is the effect's strength: at zero the effect does nothing.
     """
-    stated = Parameter(unit, meaning, rules, prior, typical, exponent, entries)
-    return eqx.field(metadata={"parameter": stated})
+    return eqx.field(metadata={"parameter": Parameter(unit, meaning, **stated)})
 
 
 class Part(StrEnum):
@@ -168,23 +147,11 @@ class Shape(NamedTuple):
         return 3 if self.symmetry is Symmetry.ODD else 2
 
     @property
-    def sentence(self) -> str:
-        """What the effect changes and where it shows, as a report says it.
-
-        >>> Shape(Part.STIFFNESS, Symmetry.ODD, power=2).sentence
-        'It changes the stiffness with the power 2 of the amplitude and shows in harmonic 3.'
-        """
-        if self.part is Part.INSTRUMENTS:
-            return "It changes what is recorded, not the motion."
-        if self.part is Part.TIME:
-            return "It changes in the course of the test, not with the amplitude."
-        power = ""
-        if self.power is not None:
-            power = f" with the power {self.power:g} of the amplitude" if self.power else ""
-            power = power or " at all amplitudes alike"
-        harmonic = self.lowest_harmonic
-        shown = "" if harmonic is None else f" and shows in harmonic {harmonic}"
-        return f"It changes the {self.part}{power}{shown}."
+    def fact(self) -> Fact:
+        """What the effect changes and where it shows."""
+        return Fact(
+            "shape_of_effect", part=self.part, power=self.power, harmonic=self.lowest_harmonic
+        )
 
     @property
     def is_drag(self) -> bool:

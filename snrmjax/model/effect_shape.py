@@ -39,10 +39,10 @@ def shape_of(effect: type[AbstractEffect]) -> Shape | None:
 @lru_cache(maxsize=256)
 def computed_shape(effect: type[AbstractForce]) -> Shape | None:
     """The shape that follows from a force alone, whatever the class states; see `shape_of`."""
-    own = _with_unit_strength(effect)
+    unit = _with_unit_strength(effect)
     q = _AMPLITUDES[:, None] * np.cos(_PHASE)
     v = -_AMPLITUDES[:, None] * _FREQUENCY * np.sin(_PHASE)
-    force = np.asarray(jax.vmap(own.cycle_force)(jnp.asarray(q), jnp.asarray(v)))
+    force = np.asarray(jax.vmap(unit.cycle_force)(jnp.asarray(q), jnp.asarray(v)))
     size = np.max(np.abs(force), axis=1)
     if not np.all(np.isfinite(force)) or not np.any(size > 0):
         return None
@@ -53,7 +53,7 @@ def computed_shape(effect: type[AbstractForce]) -> Shape | None:
         if np.all(np.abs(left) <= _NOTHING * size[:, None]):
             symmetry = name
     average = averaged_effect(
-        own, jnp.asarray(_AMPLITUDES), jnp.asarray(_FREQUENCY), n_samples=_SAMPLES
+        unit, jnp.asarray(_AMPLITUDES), jnp.asarray(_FREQUENCY), n_samples=_SAMPLES
     )
     changes = np.abs([average.stiffness, average.damping * _FREQUENCY])
     seen = changes > _NOTHING * size / _AMPLITUDES
@@ -66,12 +66,12 @@ def computed_shape(effect: type[AbstractForce]) -> Shape | None:
         power = _power(changes[number]) if seen[number].all() else None
     else:  # the fundamental changes through other harmonics only
         part, order = Part.STIFFNESS, 2
-    argument = _argument(own, q, v)
+    argument = _argument(unit, q, v)
     return Shape(part, symmetry, argument, power, strength_order=order)
 
 
 def _with_unit_strength(effect: type[AbstractForce]) -> AbstractForce:
-    typical = [one.typical for one in effect.parameters().values()]
+    typical = [parameter.typical for parameter in effect.parameters().values()]
     return effect(*(jnp.asarray(value) for value in (1.0, *typical[1:])))
 
 
@@ -80,10 +80,10 @@ def _power(changes: Float[np.ndarray, " amplitude"]) -> float | None:
     return float(np.round(np.mean(powers), 3)) if np.ptp(powers) < _SAME_POWER else None
 
 
-def _argument(own: AbstractForce, q: np.ndarray, v: np.ndarray) -> Argument:
-    if not isinstance(own, AbstractMemoryless):
+def _argument(effect: AbstractForce, q: np.ndarray, v: np.ndarray) -> Argument:
+    if not isinstance(effect, AbstractMemoryless):
         return Argument.HISTORY
-    nothing, law = np.zeros_like(q), jax.vmap(jax.vmap(own.force))
+    nothing, law = np.zeros_like(q), jax.vmap(jax.vmap(effect.force))
     states = ((q, v), (q, nothing), (nothing, v))
     both, of_q, of_v = (np.asarray(law(*(jnp.asarray(a) for a in state))) for state in states)
     scale = _NOTHING * np.max(np.abs(both))
@@ -101,21 +101,21 @@ def starts_of(effect: type[AbstractEffect], scales: MotionScales) -> Starts:
     """
     if stated := effect.starts(scales):
         return stated
-    typical = [one.typical for one in effect.parameters().values()]
+    typical = [parameter.typical for parameter in effect.parameters().values()]
     if not issubclass(effect, AbstractForce):
         return [tuple(typical)]
     first, *others = typical
-    own = effect(*(jnp.asarray(value) for value in typical))
+    typical_effect = effect(*(jnp.asarray(value) for value in typical))
     shape = shape_of(effect)
     if shape is not None and shape.strength_order > 1:
         # As a quadratic stiffness softens: Δ(ω̃²) = −(5/6) (f/Q)²/ω₀².
         q = scales.amplitude * np.cos(_PHASE)
         v = -scales.amplitude * scales.frequency * np.sin(_PHASE)
-        size = float(jnp.max(jnp.abs(own.cycle_force(jnp.asarray(q), jnp.asarray(v)))))
+        size = float(jnp.max(jnp.abs(typical_effect.cycle_force(jnp.asarray(q), jnp.asarray(v)))))
         strength = np.sqrt(1.2 * scales.change) * scales.frequency * scales.amplitude / size
         return [(float(sign * first * strength), *others) for sign in (1.0, -1.0)]
     at = (jnp.asarray(scales.amplitude), jnp.asarray(scales.frequency))
-    change = averaged_effect(own, *at)
+    change = averaged_effect(typical_effect, *at)
     size = float(jnp.hypot(change.stiffness, scales.frequency * change.damping))
     return [(first * (scales.change / size if size > 0 else 1.0), *others)]
 

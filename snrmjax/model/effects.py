@@ -49,6 +49,7 @@ from snrmjax.model.library.stiffness import (
     QuinticStiffness,
     StaticPreload,
 )
+from snrmjax.numerics.rules import require
 
 
 class EffectTable(dict[str, type[AbstractEffect]]):
@@ -56,26 +57,17 @@ class EffectTable(dict[str, type[AbstractEffect]]):
 
     def __repr__(self) -> str:
         """One line for each effect."""
-        return describe_effects(self)
-
-
-def describe_effects(effects: Mapping[str, type[AbstractEffect]] | None = None) -> str:
-    """A table of effects, one line each: kind, parameters with their units, description.
-
-    Arguments: `effects` by kind, by default all of `EFFECTS`, with those that are registered.
-    """
-    every = EFFECTS if effects is None else effects
-    if not every:
-        return "no effects"
-    rows = [(kind, _parameters_with_units(one), _description(one)) for kind, one in every.items()]
-    width = max(len(kind) for kind, *_ in rows)
-    return "\n".join(f"{kind:{width}}  {own}: {text}".rstrip() for kind, own, text in rows)
+        width = max((len(kind) for kind in self), default=0)
+        return "\n".join(
+            f"{kind:{width}}  {_parameters_with_units(effect)}: {_description(effect)}".rstrip()
+            for kind, effect in self.items()
+        )
 
 
 def _parameters_with_units(effect: type[AbstractEffect]) -> str:
     return ", ".join(
-        f"{name} ({'no unit' if one.unit == '1' else one.unit})" if one.unit else name
-        for name, one in effect.parameters().items()
+        f"{name} ({'no unit' if of.unit == '1' else of.unit})" if of.unit else name
+        for name, of in effect.parameters().items()
     )
 
 
@@ -132,7 +124,7 @@ LAWS: dict[str, type[AbstractLaw]] = {
 """The laws given by a table of knots, by their kind: drawn where no effect of the library holds."""
 
 # `help(EFFECTS)` shows the docstring of its class.
-EffectTable.__doc__ = f"{EffectTable.__doc__}\n\n{describe_effects()}"
+EffectTable.__doc__ = f"{EffectTable.__doc__}\n\n{EFFECTS!r}"
 
 
 def register_effect(effect: type[AbstractEffect]) -> type[AbstractEffect]:
@@ -193,16 +185,7 @@ def make_effect(kind: str, parameters: Mapping[str, float | Array | np.ndarray])
     if set(parameters) != set(wanted):
         raise ValueError(f"{kind} takes the parameters {list(wanted)}, not {sorted(parameters)}.")
     for name, value in parameters.items():
-        if isinstance(value, jax.core.Tracer):
-            continue
-        for entry in np.ravel(value).tolist():
-            if not np.isfinite(entry):
-                raise ValueError(f"`{name}` of {kind} must be finite, but is {entry}.")
-            for rule in wanted[name].rules:
-                if not rule.good(entry):
-                    raise ValueError(
-                        f"`{name}` of {kind} must be {rule.expected}, but is {entry:g}."
-                    )
+        require(f"`{name}` of {kind}", value, *wanted[name].rules)
     arrays = {k: jnp.asarray(v, dtype=jnp.float64) for k, v in parameters.items()}
     _check_tables(kind, arrays)
     return effect_class(kind)(**arrays)
@@ -211,9 +194,9 @@ def make_effect(kind: str, parameters: Mapping[str, float | Array | np.ndarray])
 def _check_tables(kind: str, arrays: Mapping[str, Array]) -> None:
     """Refuse tables of a law that are no table, and one number where a table belongs."""
     shape: tuple[int, ...] = ()
-    for name, one in effect_class(kind).parameters().items():
+    for name, parameter in effect_class(kind).parameters().items():
         value = arrays[name]
-        if one.entries is Entries.ONE:
+        if parameter.entries is Entries.ONE:
             continue
         if value.ndim != 1 or value.shape[0] < 2:
             raise ValueError(
@@ -226,7 +209,7 @@ def _check_tables(kind: str, arrays: Mapping[str, Array]) -> None:
                 f"{value.shape[0]}."
             )
         shape = value.shape
-        if one.entries is Entries.KNOTS and not isinstance(value, jax.core.Tracer):
+        if parameter.entries is Entries.KNOTS and not isinstance(value, jax.core.Tracer):
             steps = np.diff(np.asarray(value))
             if np.any(steps <= 0):
                 place = int(np.argmax(steps <= 0))

@@ -1,6 +1,5 @@
 """Linear modes of a structure and their response to a harmonic force."""
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -8,6 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Shaped
+
+from snrmjax.numerics.rules import BELOW_ONE, POSITIVE, require
+from snrmjax.numerics.units import HERTZ
 
 _SHOWN = 12  # modes, in a text
 
@@ -46,7 +48,7 @@ class LinearModes(eqx.Module):
         count = f"{self.n_modes} mode{'s' if self.n_modes > 1 else ''}"
         lines = [f"LinearModes: {count}{beside} at {', '.join(self.sensors)}"]
         for k in range(min(self.n_modes, _SHOWN)):
-            hertz, ratio = float(self.natural_frequency[k]) / (2 * np.pi), self.damping_ratio[k]
+            hertz, ratio = float(self.natural_frequency[k]) / HERTZ, self.damping_ratio[k]
             chosen = ", of interest" if k == self.mode_of_interest else ""
             lines.append(f"mode {k + 1}: {hertz:.6g} Hz, damping {100 * ratio:.3g} %{chosen}")
         if self.n_modes > _SHOWN:
@@ -128,7 +130,7 @@ def linear_modes(
         raise ValueError(
             f"`mode_shape` must have shape (sensors, {n_modes} modes), but has {shape.shape}."
         )
-    _require_finite("mode_shape", shape)
+    require("`mode_shape`", shape)
     n_sensors = shape.shape[0]
     names = sensors or tuple(f"sensor {k + 1}" for k in range(n_sensors))
     if len(names) != n_sensors:
@@ -137,8 +139,8 @@ def linear_modes(
         raise ValueError(
             f"`mode_of_interest` must lie between 0 and {n_modes - 1}, but is {mode_of_interest}."
         )
-    _require("natural_frequency", frequency, lambda f: f > 0, "positive")
-    _require("damping_ratio", damping, lambda z: (z >= 0) & (z < 1), "from 0 to below 1")
+    require("`natural_frequency`", frequency, POSITIVE)
+    require("`damping_ratio`", damping, BELOW_ONE)
     shapes, participations = rigid_body or RigidBodyModes(np.zeros((n_sensors, 0)), [])
     rigid_shape = _numbers(shapes)
     if rigid_shape.ndim != 2 or rigid_shape.shape[0] != n_sensors:
@@ -146,7 +148,7 @@ def linear_modes(
             f"`rigid_body.shape` must have shape ({n_sensors} sensors, rigid-body modes), "
             f"but has {rigid_shape.shape}."
         )
-    _require_finite("rigid_body.shape", rigid_shape)
+    require("`rigid_body.shape`", rigid_shape)
     numbers: dict[str, Any] = {
         "natural_frequency": frequency,
         "damping_ratio": damping,
@@ -157,9 +159,9 @@ def linear_modes(
             "rigid_body.participation", participations, rigid_shape.shape[1]
         ),
     }
-    for name, own in zip(LinearModesStd._fields, std or LinearModesStd(), strict=True):
-        if own is not None:
-            numbers[f"{name}_std"] = _vector(f"std.{name}", own, n_modes)
+    for name, values in zip(LinearModesStd._fields, std or LinearModesStd(), strict=True):
+        if values is not None:
+            numbers[f"{name}_std"] = _vector(f"std.{name}", values, n_modes)
         elif name != "modal_mass":
             numbers[f"{name}_std"] = np.zeros(n_modes)
     modes = LinearModes(**numbers, sensors=tuple(names), mode_of_interest=mode_of_interest)
@@ -175,25 +177,11 @@ def _numbers(value: Any) -> Any:
 
 def _vector(name: str, value: object, size: int | None = None) -> Any:
     vector = _numbers(value)
-    _require_finite(name, vector)
+    require(f"`{name}`", vector)
     if vector.ndim != 1 or (size is not None and vector.size != size):
         wanted = "a vector" if size is None else f"a vector of {size}"
         raise ValueError(f"`{name}` must be {wanted}, but has shape {vector.shape}.")
     return vector
-
-
-def _require_finite(name: str, value: Any) -> None:
-    _require(name, value.reshape(-1), np.isfinite, "finite")
-
-
-def _require(name: str, value: Any, rule: Callable[[np.ndarray], np.ndarray], text: str) -> None:
-    """Refuse values that break a rule; traced ones have none yet."""
-    if isinstance(value, jax.core.Tracer):
-        return
-    good = rule(value)
-    if not np.all(good):
-        first = int(np.argmin(good))
-        raise ValueError(f"`{name}` must be {text}, but entry {first} is {value[first]:g}.")
 
 
 def residual_velocity(
@@ -243,6 +231,19 @@ def linear_response(
         frequency,
         force,
     ) + _rigid_body_velocity(modes, frequency, force)
+
+
+def reference_sensor(modes: LinearModes) -> int:
+    """The sensor at which the mode of interest moves most: amplitudes are given there.
+
+    Within `jax.jit` mode shapes of several sensors must be known while compiling (not arguments).
+    """
+    if modes.mode_shape.shape[0] == 1:
+        return 0
+    shape = modes.mode_shape
+    if isinstance(shape, jax.core.Tracer):  # of a derivative: it still has its value
+        shape = jax.lax.stop_gradient(shape)
+    return int(np.argmax(np.abs(np.asarray(shape)[:, modes.mode_of_interest])))
 
 
 def _modal_sum(

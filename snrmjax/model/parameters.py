@@ -5,6 +5,7 @@ import difflib
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -68,44 +69,28 @@ def parameter_rules(model: Structure, name: str) -> tuple[Rule, ...]:
 
 def parameter_value(model: Structure, name: str) -> Float[Array, ""]:
     """The number that a name of `parameter_names` stands for."""
-    part, entry, field, knot = _places(model)[name]
-    if part == "effects":
-        return jnp.asarray(getattr(model.effects[entry], field))[knot]
-    return getattr(getattr(model, part), field)[entry]
+    return _number_at(model, _places(model)[name])
 
 
 def parameter_values(model: Structure) -> dict[str, float]:
     """All numbers by their names."""
-    places = _places(model)
-    parts = {(p.part, p.field) for p in places.values() if p.part != "effects"}
-    arrays = {
-        (part, field): np.asarray(getattr(getattr(model, part), field)) for part, field in parts
-    }
-    return {
-        name: float(
-            np.asarray(getattr(model.effects[entry], field))[knot]
-            if part == "effects"
-            else arrays[part, field][entry]
-        )
-        for name, (part, entry, field, knot) in places.items()
-    }
+    on_host = jax.device_get(model)  # all at once: one by one they take much longer
+    return {name: float(_number_at(on_host, place)) for name, place in _places(model).items()}
 
 
 def stated_stds(model: Structure) -> dict[str, float]:
     """1σ of the numbers for which the model states one."""
-    found = {}
+    stds = {}
     for name, (part, entry, field, _) in _places(model).items():
         std = getattr(getattr(model, part), f"{field}_std", None)
-        if std is not None and (own := float(np.asarray(std)[entry])) > 0:
-            found[name] = own
-    return found
+        if std is not None and (stated := float(np.asarray(std)[entry])) > 0:
+            stds[name] = stated
+    return stds
 
 
 def stated_std(model: Structure, name: str) -> float:
     """1σ that the model states for a number, 0 where it states none."""
-    part, entry, field, _ = _places(model)[name]
-    std = getattr(getattr(model, part), f"{field}_std", None)
-    return 0.0 if std is None else float(std[entry])
+    return stated_stds(model).get(name, 0.0)
 
 
 def with_parameters(
@@ -136,6 +121,13 @@ class _Place(NamedTuple):
     knot: tuple[int, ...] = ()  # of a law's field the place in it
 
 
+def _number_at(model: Structure, place: _Place) -> Array:
+    part, entry, field, knot = place
+    if part == "effects":
+        return getattr(model.effects[entry], field)[knot]
+    return getattr(getattr(model, part), field)[entry]
+
+
 def _places(model: Structure) -> dict[str, _Place]:
     places = {
         f"potential.{monomial_key(monomial)}": _Place("potential", k, "coefficient")
@@ -148,11 +140,11 @@ def _places(model: Structure) -> dict[str, _Place]:
         kinds.append(effect.kind)
         number = kinds.count(effect.kind)
         head = effect.kind if number == 1 else f"{effect.kind}_{number}"
-        for field, one in effect.parameters().items():
+        for field, parameter in effect.parameters().items():
             value = getattr(effect, field)
             if jnp.ndim(value) == 0:
                 places[f"{head}.{field}"] = _Place("effects", k, field)
-            elif one.entries is Entries.VALUES and jnp.ndim(value) == 1:
+            elif parameter.entries is Entries.VALUES and jnp.ndim(value) == 1:
                 for knot in range(value.shape[0]):
                     name = f"{head}.{field}_{knot + 1}"
                     places[name] = _Place("effects", k, field, (knot,))

@@ -34,22 +34,18 @@ class PolynomialPotential(eqx.Module):
         self, displacement: Float[Array | np.ndarray, "*batch mode"]
     ) -> Float[Array, "*batch"]:
         """Potential energy in J, without the linear stiffness's."""
-        basis = _products(displacement, self.monomials)
-        return basis @ self.coefficient
+        return _products(displacement, self.monomials) @ self.coefficient
 
     def force(self, displacement: Float[Array, "*batch mode"]) -> Float[Array, "*batch mode"]:
         """Restoring force ∂V/∂q, in the modal unit kg^1/2 m/s²."""
-        basis, to_coefficient = _derivative_map(self.monomials, self.n_modes)
-        coefficients = (self.coefficient @ to_coefficient).reshape(len(basis), self.n_modes)
+        basis, coefficients = self._gradient
         return _products(displacement, basis) @ coefficients
 
     def stiffness(
         self, displacement: Float[Array, "*batch mode"]
     ) -> Float[Array, "*batch mode mode"]:
         """Tangent stiffness ∂²V/∂q∂q, in 1/s²."""
-        basis, to_coefficient = _second_derivative_map(self.monomials, self.n_modes)
-        n = self.n_modes
-        coefficients = (self.coefficient @ to_coefficient).reshape(len(basis), n * n)
+        n, (basis, coefficients) = self.n_modes, self._hessian
         flat = _products(displacement, basis) @ coefficients
         return flat.reshape(*displacement.shape[:-1], n, n)
 
@@ -57,19 +53,26 @@ class PolynomialPotential(eqx.Module):
         self, displacement: Float[Array, "mode sample"]
     ) -> Float[Array, "mode sample"]:
         """As `force`, with the samples along the last axis, where long loops are fast."""
-        basis, to_coefficient = _derivative_map(self.monomials, self.n_modes)
-        coefficients = (self.coefficient @ to_coefficient).reshape(len(basis), self.n_modes)
-        return coefficients.T @ _products_of_rows(displacement, basis)
+        basis, coefficients = self._gradient
+        return coefficients.T @ _products(displacement, basis, by_rows=True)
 
     def stiffness_of_rows(
         self, displacement: Float[Array, "mode sample"]
     ) -> Float[Array, "mode mode sample"]:
         """As `stiffness`, with the samples along the last axis."""
-        basis, to_coefficient = _second_derivative_map(self.monomials, self.n_modes)
-        n = self.n_modes
-        coefficients = (self.coefficient @ to_coefficient).reshape(len(basis), n * n)
-        flat = coefficients.T @ _products_of_rows(displacement, basis)
+        n, (basis, coefficients) = self.n_modes, self._hessian
+        flat = coefficients.T @ _products(displacement, basis, by_rows=True)
         return flat.reshape(n, n, displacement.shape[1])
+
+    @property
+    def _gradient(self) -> tuple[tuple[Monomial, ...], Float[Array, "monomial mode"]]:
+        basis, to_coefficient = _derivative_map(self.monomials, self.n_modes)
+        return basis, (self.coefficient @ to_coefficient).reshape(len(basis), self.n_modes)
+
+    @property
+    def _hessian(self) -> tuple[tuple[Monomial, ...], Float[Array, "monomial pair"]]:
+        basis, to_coefficient = _second_derivative_map(self.monomials, self.n_modes)
+        return basis, (self.coefficient @ to_coefficient).reshape(len(basis), self.n_modes**2)
 
 
 def polynomial_potential(
@@ -142,85 +145,27 @@ def monomial_key(monomial: Monomial) -> str:
     return "".join(numbers) if all(len(n) == 1 for n in numbers) else "-".join(numbers)
 
 
-def potential_from_force_table(
-    force_coefficients: Mapping[Monomial, Float[np.ndarray, " mode"]], n_modes: int
-) -> tuple[PolynomialPotential, dict[str, float]]:
-    """The potential behind a table of force coefficients, and what breaks its symmetry.
-
-    A table gives, for a monomial of the *force* (modes counted from zero), its coefficient in
-    every modal equation. If the force has a potential, coefficients that belong to the same
-    monomial of the potential agree; the returned potential takes their mean. The second result
-    maps each potential monomial whose estimates disagree to their relative spread,
-    (max − min)/max|estimate|; an estimate missing from the table counts as 0.
-
-    Raises `ValueError` for a monomial given twice, of degree below 2 or of modes that do not
-    exist, and for a row that is not one finite number for every mode.
-    Reference: DESIGN of this package; reduced-order models from static load cases rarely come
-    out exactly symmetric.
-
-    >>> table = {(0, 0): np.array([3.0, 1.0]), (0, 1): np.array([2.0, 0.0])}
-    >>> potential, spread = potential_from_force_table(table, 2)
-    >>> potential.coefficient, spread
-    (Array([1., 1.], dtype=float64), {})
-    """
-    table: dict[Monomial, np.ndarray] = {}
-    for key, row in force_coefficients.items():
-        monomial, numbers = parse_monomial(key, n_modes), np.asarray(row, dtype=np.float64)
-        if monomial in table:
-            raise ValueError(f"force monomial {key!r} is given twice (the order is free).")
-        if numbers.shape != (n_modes,) or not np.all(np.isfinite(numbers)):
-            raise ValueError(
-                f"force monomial {key!r} must have a finite coefficient for each of the {n_modes} "
-                f"modes, but has {numbers}."
-            )
-        table[monomial] = numbers
-    monomials = {tuple(sorted((*key, mode))) for key in table for mode in range(n_modes)}
-    coefficients: dict[Monomial, float] = {}
-    spread: dict[str, float] = {}
-    for monomial in sorted(monomials, key=lambda m: (len(m), m)):
-        estimates = []
-        for mode in sorted(set(monomial)):
-            rest = list(monomial)
-            rest.remove(mode)
-            row = table.get(tuple(rest), np.zeros(n_modes))
-            estimates.append(row[mode] / monomial.count(mode))
-        largest = max(abs(e) for e in estimates)
-        if largest == 0.0:
-            continue
-        coefficients[monomial] = float(np.mean(estimates))
-        relative = (max(estimates) - min(estimates)) / largest
-        if relative > 0.0:
-            spread[monomial_key(monomial)] = float(relative)
-    return polynomial_potential(coefficients, n_modes), spread
-
-
 def _products(
-    displacement: Float[Array | np.ndarray, "*batch mode"], monomials: tuple[Monomial, ...]
-) -> Float[Array, "*batch monomial"]:
-    """Π q_i for every monomial, built by multiplying a padding one in (index n = the one)."""
+    displacement: Float[Array | np.ndarray, "..."],
+    monomials: tuple[Monomial, ...],
+    *,
+    by_rows: bool = False,
+) -> Float[Array, "..."]:
+    """Π q_i for every monomial, in place of the axis of the modes: the last, or the first."""
+    axis, before = (0, ()) if by_rows else (-1, (...,))
     if not monomials:
-        return jnp.zeros((*displacement.shape[:-1], 0), dtype=displacement.dtype)
-    index = _factors(monomials, displacement.shape[-1])
+        shape = list(displacement.shape)
+        shape[axis] = 0
+        return jnp.zeros(shape, dtype=displacement.dtype)
+    # Factors that are missing are a padding one (index n).
+    index = _factors(monomials, displacement.shape[axis])
     # NumPy's own arrays stay NumPy's: nothing is compiled then.
     xp = np if isinstance(displacement, np.ndarray) else jnp
-    padded = xp.concatenate([displacement, xp.ones_like(displacement[..., :1])], axis=-1)
-    product = padded[..., index[:, 0]]
+    ones = xp.ones_like(displacement[(*before, slice(0, 1))])
+    padded = xp.concatenate([displacement, ones], axis=axis)
+    product = padded[(*before, index[:, 0])]
     for column in range(1, index.shape[1]):
-        product = product * padded[..., index[:, column]]
-    return product
-
-
-def _products_of_rows(
-    displacement: Float[Array, "mode sample"], monomials: tuple[Monomial, ...]
-) -> Float[Array, "monomial sample"]:
-    """The same with the modes along the first axis."""
-    if not monomials:
-        return jnp.zeros((0, displacement.shape[1]), dtype=displacement.dtype)
-    index = _factors(monomials, displacement.shape[0])
-    padded = jnp.concatenate([displacement, jnp.ones_like(displacement[:1])])
-    product = padded[index[:, 0]]
-    for column in range(1, index.shape[1]):
-        product = product * padded[index[:, column]]
+        product = product * padded[(*before, index[:, column])]
     return product
 
 

@@ -65,8 +65,8 @@ class Structure(eqx.Module):
         lines.append(f"polynomial potential: {terms}")
         for effect in self.effects:
             values = [
-                f"{name} {_text(getattr(effect, name))} {one.unit}".removesuffix(" 1")
-                for name, one in effect.parameters().items()
+                f"{name} {_text(getattr(effect, name))} {parameter.unit}".removesuffix(" 1")
+                for name, parameter in effect.parameters().items()
             ]
             lines.append(f"effect {effect.kind}: {', '.join(values)}")
         names = ("relative gain", "phase (rad)", "natural frequency (rad/s)", "damping ratio")
@@ -121,19 +121,19 @@ class Structure(eqx.Module):
     @property
     def measurement_effects(self) -> tuple[AbstractMeasurementEffect, ...]:
         """The effects that change what is recorded, in the order in which they act."""
-        found = [e for e in self.effects if isinstance(e, AbstractMeasurementEffect)]
-        return tuple(sorted(found, key=lambda effect: effect.stage))
+        effects = [e for e in self.effects if isinstance(e, AbstractMeasurementEffect)]
+        return tuple(sorted(effects, key=lambda effect: effect.stage))
 
     def linear_terms(self) -> LinearTerms:
         """Mass 1, damping 2ζω and stiffness ω² of every mode, with the linear changes."""
         modes, j = self.modes, self.modes.mode_of_interest
-        frequency, ratio, own = modes.natural_frequency, modes.damping_ratio, self.own_mode
+        frequency, ratio, on_mode = modes.natural_frequency, modes.damping_ratio, self.own_mode
         terms = LinearTerms(jnp.ones(self.n_modes), 2 * ratio * frequency, frequency**2)
         for effect in self.effects:
             if isinstance(effect, AbstractLinearChange):
                 added = effect.linear_terms(frequency[j], ratio[j], self.test_order)
                 terms = LinearTerms(
-                    *(term + own * change for term, change in zip(terms, added, strict=True))
+                    *(term + on_mode * change for term, change in zip(terms, added, strict=True))
                 )
         return terms
 
@@ -307,14 +307,14 @@ def equilibria(model: Structure, *, n_starts: int = 512, seed: int = 0) -> list[
         tolerance = 1e-12 * scale
     else:
         candidates, tolerance = _equilibria_by_newton(model, n_starts, seed)
-    found: list[Equilibrium] = []
+    distinct: list[Equilibrium] = []
     for q in sorted(candidates, key=lambda row: float(np.linalg.norm(row))):
-        if any(np.linalg.norm(q - e.displacement) <= tolerance for e in found):
+        if any(np.linalg.norm(q - e.displacement) <= tolerance for e in distinct):
             continue
         energy, tangent = _energy_and_tangent(model, jnp.asarray(q))
         stable = bool(np.all(np.linalg.eigvalsh(np.asarray(tangent)) > 0))
-        found.append(Equilibrium(q, float(energy), stable))
-    return found
+        distinct.append(Equilibrium(q, float(energy), stable))
+    return distinct
 
 
 def _equilibria_by_newton(model: Structure, n_starts: int, seed: int) -> tuple[np.ndarray, float]:
@@ -370,8 +370,8 @@ def displacement_scale(model: Structure) -> np.ndarray:
     ):
         mode, degree = monomial[0], len(monomial)
         if set(monomial) == {mode} and degree > 2 and value != 0.0:
-            own = (squared[mode] / (degree * abs(value))) ** (1.0 / (degree - 2))
-            scale[mode] = np.fmin(scale[mode], own)
+            reached_at = (squared[mode] / (degree * abs(value))) ** (1.0 / (degree - 2))
+            scale[mode] = np.fmin(scale[mode], reached_at)
     if model.memoryless:
         j = model.modes.mode_of_interest
         grid = np.logspace(-12, 3, 601)

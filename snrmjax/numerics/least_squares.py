@@ -1,4 +1,4 @@
-"""Penalised least squares for points whose errors are partly shared by a whole level."""
+"""Covariances and degrees of freedom of linear least squares, by scaled columns."""
 
 import numpy as np
 

@@ -102,11 +102,11 @@ def minimise(
     lower, upper = bounds
     point, now = np.array(points), list(at_points)
     last_step = np.zeros_like(point)
-    square = np.array([_sum_of_squares(one) for one in now])
+    square = np.array([_sum_of_squares(value) for value in now])
     damping = np.full(len(point), rule.damping)
     status = [
-        MinimisationStatus.STEP_LIMIT if np.isfinite(one) else MinimisationStatus.NOT_FINITE
-        for one in square
+        MinimisationStatus.STEP_LIMIT if np.isfinite(value) else MinimisationStatus.NOT_FINITE
+        for value in square
     ]
     active = np.isfinite(square)
     for turn in range(rule.steps):
@@ -162,6 +162,6 @@ def damped_step(
     return -np.linalg.solve(matrix, scaled.T @ residuals) / size
 
 
-def _sum_of_squares(one: AbstractLinearisation) -> float:
-    value = float(np.sum(one.residuals**2))
+def _sum_of_squares(linearised: AbstractLinearisation) -> float:
+    value = float(np.sum(linearised.residuals**2))
     return value if np.isfinite(value) else np.inf

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, dataclass_transform
 
 import equinox as eqx
 import jax
@@ -11,6 +11,7 @@ import numpy as np
 from snrmjax.numerics import rendering
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.status import Status
+from snrmjax.numerics.units import DEGREE, HERTZ
 
 if TYPE_CHECKING:
     import matplotlib.figure
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 
 _ENDINGS = {"Hz": "_hz", "m/s": "_m_s", "m": "_m", "N": "_n", "V": "_v", "J": "_j", "deg": "_deg"}
 # What a field holds over what its unit in files is.
-_SIZES = {"Hz": 2 * np.pi, "deg": np.pi / 180}
+_SIZES = {"Hz": HERTZ, "deg": DEGREE}
 
 
 class Variable(NamedTuple):
@@ -40,18 +41,26 @@ class _Quantity(NamedTuple):
     name: str
     of: type[Status] | None
 
-    def variable(self, name: str, values: Any) -> tuple[str, Variable]:
-        """The field's values in units of files, under the name that files have."""
-        values = np.asarray(values)
+    def variables(self, name: str, values: Any) -> dict[str, Variable]:
+        """The field's values in units of files, under the names that files have."""
+        values, ending = np.asarray(values), _ENDINGS.get(self.unit, "")
+        if np.iscomplexobj(values):
+            stem, parts = self.name or name, (("re", values.real), ("im", values.imag))
+            return {
+                f"{stem}_{key}{ending}": self._variable(part, f"{self.meaning}, {key}")
+                for key, part in parts
+            }
         if self.of is not None:
-            names = [self.of(int(one)).name.lower() for one in values.ravel()]
+            names = [self.of(int(number)).name.lower() for number in values.ravel()]
             values = np.array(names, dtype=np.str_).reshape(values.shape)
         elif self.unit in _SIZES:
             values = values / _SIZES[self.unit]
         elif not self.unit:
             values = values.astype(np.str_)
-        named = self.name or name + _ENDINGS.get(self.unit, "")
-        return named, Variable(self.dimensions, values, self.unit, self.meaning)
+        return {self.name or name + ending: self._variable(values, self.meaning)}
+
+    def _variable(self, values: np.ndarray, meaning: str) -> Variable:
+        return Variable(self.dimensions, values, self.unit, meaning)
 
 
 def quantity(
@@ -68,8 +77,8 @@ def quantity(
     Arguments: `dimensions` by name, separated by spaces, "" for a single number; `unit` that files
     and data sets have ("1" for none, "" for text): a field in "Hz" holds rad/s and one in "deg"
     rad; `meaning` in a few words; `name` of the variable, where it is not the field's with the
-    unit's ending; `of` the status that whole numbers stand for, which the data set names; others
-    as `equinox.field`.
+    unit's ending (complex numbers are two variables: the name, `_re` or `_im`, the ending); `of`
+    the status that whole numbers stand for, which the data set names; others as `equinox.field`.
     """
     about = _Quantity(tuple(dimensions.split()), unit, meaning, name, of)
     return eqx.field(metadata={"quantity": about}, **settings)
@@ -83,22 +92,25 @@ def setting(**settings: Any) -> Any:
     return eqx.field(static=True, metadata={"setting": True}, **settings)
 
 
+@dataclass_transform(field_specifiers=(eqx.field, quantity, setting))
 class AbstractResult(eqx.Module):
     """Base of results: a repr of one screen, `to_xarray()`, `to_pandas()` and `plot()`.
 
     Fields say by `quantity` and `setting` what a data set has of them; a result with computed
-    quantities adds them to `variables`. Names in `coordinates` label the others.
+    quantities adds them to `variables`. Names in `coordinates` label the others; one that is a
+    dimension and no variable counts from 0.
     """
 
     coordinates: ClassVar[tuple[str, ...]] = ()
 
     def variables(self) -> Mapping[str, Variable]:
         """Quantities by name, in units of files (Hz, m/s)."""
-        return dict(
-            field.metadata["quantity"].variable(field.name, getattr(self, field.name))
-            for field in dataclasses.fields(self)
-            if "quantity" in field.metadata
-        )
+        variables: dict[str, Variable] = {}
+        for field in dataclasses.fields(self):
+            if "quantity" in field.metadata:
+                values = getattr(self, field.name)
+                variables |= field.metadata["quantity"].variables(field.name, values)
+        return variables
 
     def attributes(self) -> Mapping[str, str | float | int]:
         """What holds for the whole result: settings, statuses, notes."""
@@ -123,9 +135,14 @@ class AbstractResult(eqx.Module):
             attributes = {"units": of.unit, "long_name": of.meaning}
             return of.dimensions, np.asarray(of.values), attributes
 
-        every = {name: labelled(variable) for name, variable in self.variables().items()}
-        labels = {name: every.pop(name) for name in self.coordinates}
-        return xarray.Dataset(every, coords=labels, attrs=dict(self.attributes()))
+        variables = dict(self.variables())
+        for of in list(variables.values()):
+            for name, size in zip(of.dimensions, np.shape(of.values), strict=True):
+                if name in self.coordinates and name not in variables:
+                    variables[name] = Variable((name,), np.arange(size), "1", name)
+        arrays = {name: labelled(variable) for name, variable in variables.items()}
+        labels = {name: arrays.pop(name) for name in self.coordinates}
+        return xarray.Dataset(arrays, coords=labels, attrs=dict(self.attributes()))
 
     def to_pandas(self) -> "pandas.DataFrame":
         """The result as a table, one row a member of its dimension.
@@ -154,4 +171,4 @@ def _attribute(value: Any) -> str | float | int:
         return value
     if isinstance(value, Fact):
         return str(value)
-    return "\n".join(str(one) for one in value)
+    return "\n".join(str(entry) for entry in value)

@@ -1,28 +1,29 @@
 """Rules for numbers that are read in: the words for what is expected, and the test for it."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
 
 
 class Rule(NamedTuple):
-    """What a message says is expected, and the test for it."""
+    """What a message says is expected, and the test for it, of a number or of every entry."""
 
     expected: str
-    good: Callable[[float], bool]
-
-    def __repr__(self) -> str:
-        """What is expected: Rule("positive")."""
-        return f'Rule("{self.expected}")'
+    good: Callable[[Any], Any]
 
 
+FINITE = Rule("finite", np.isfinite)
 POSITIVE = Rule("positive", lambda value: value > 0)
 NOT_NEGATIVE = Rule("zero or positive", lambda value: value >= 0)
 NOT_ZERO = Rule("a number other than zero", lambda value: value != 0)
 ABOVE_MINUS_ONE = Rule("above -1", lambda value: value > -1)
-FRACTION = Rule("from 0 to 1", lambda value: 0 <= value <= 1)
-BELOW_ONE = Rule("from 0 to below 1", lambda value: 0 <= value < 1)
-BETWEEN_ONE_AND_THREE = Rule("above 1 and below 3", lambda value: 1 < value < 3)
-WHOLE = Rule("a whole number", lambda value: value == int(value))
+FRACTION = Rule("from 0 to 1", lambda value: (value >= 0) & (value <= 1))
+BELOW_ONE = Rule("from 0 to below 1", lambda value: (value >= 0) & (value < 1))
+BETWEEN_ZERO_AND_ONE = Rule("between 0 and 1", lambda value: (value > 0) & (value < 1))
+BETWEEN_ONE_AND_THREE = Rule("above 1 and below 3", lambda value: (value > 1) & (value < 3))
+WHOLE = Rule("a whole number", lambda value: value == np.floor(value))
 SHORT = Rule("of at most 15 digits", lambda value: abs(value) < 1e15)
 # In rad/s it must still be a number.
 IN_RANGE_HZ = Rule("below 1e300 Hz", lambda value: value < 1e300)
@@ -32,3 +33,19 @@ OF_A_FREQUENCY = (POSITIVE, IN_RANGE_HZ)
 
 OF_A_DAMPING_RATIO = (BELOW_ONE,)
 """Of the damping ratio of a further mode."""
+
+
+def require(subject: str, value: Any, *rules: Rule) -> None:
+    """Raises `ValueError` for the first number that is not finite or breaks one of the rules.
+
+    `subject` says what it is, with its backticks. Traced numbers have no value yet: they pass.
+    """
+    if isinstance(value, jax.core.Tracer):
+        return
+    entries = np.asarray(value)
+    for rule in (FINITE, *rules):
+        bad = np.argwhere(~np.asarray(rule.good(entries)))
+        if len(bad):
+            place = tuple(bad[0].tolist())
+            entry = f"entry {place[0] if len(place) == 1 else place} is" if place else "is"
+            raise ValueError(f"{subject} must be {rule.expected}, but {entry} {entries[place]:g}.")

@@ -1,6 +1,7 @@
 from .check import check_files
 from .diagnose import diagnose_test, read_test
 from .identify import identify_test
+from .imports import import_test, list_contents
 from .measured_files import read_measured_test
 from .modes import find_linear_modes, read_modal_sources
 from .reduce import read_reduction_source, reduce_model
@@ -12,6 +13,8 @@ __all__ = [
     "diagnose_test",
     "find_linear_modes",
     "identify_test",
+    "import_test",
+    "list_contents",
     "read_measured_test",
     "read_modal_sources",
     "read_reduction_source",

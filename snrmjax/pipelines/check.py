@@ -1,18 +1,36 @@
 """Check: errors of import and of a test, and the imports that mend them."""
 
+import math
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from snrmjax.doctor.check import check_test
-from snrmjax.doctor.findings import Checkup
+from snrmjax.doctor.findings import Checkup, Finding, Repair
+from snrmjax.io.exchange.import_map import ImportMap, read_import_map
+from snrmjax.io.files import FilePath
 from snrmjax.io.laboratory.checkups import read_recordings
 from snrmjax.io.models import read_model
 from snrmjax.io.tables import read_steady_states
-from snrmjax.pipelines.corrections import FilesRead, with_imports
+from snrmjax.pipelines.folder_contents import MAP, TestFiles
+
+_SI = {"": "m/s", "acceleration": "m/s2", "displacement": "m"}
+_PER_SECOND = {"displacement": "", "velocity": "/s"}
+
+
+class FilesRead(NamedTuple):
+    """The files that all states were read from: tables of our own, or a laboratory's by a map."""
+
+    files: tuple[Path, ...]
+    map_file: Path | None = None
+    told: ImportMap = ImportMap()
 
 
 def check_files(
-    data: Sequence[Path], model: Path | None = None, records: Sequence[Path] = ()
+    data: Sequence[FilePath],
+    model: FilePath | None = None,
+    records: Sequence[FilePath] = (),
 ) -> Checkup:
     """Look for errors in tables of steady states and in records of the same test.
 
@@ -23,4 +41,107 @@ def check_files(
     structure = None if model is None else read_model(model)
     tables = [read_steady_states(path, structure) for path in data]
     recordings = [record for path in records for record in read_recordings(path)]
-    return with_imports(check_test(tables, structure, recordings), FilesRead(tuple(data)))
+    return with_imports(
+        check_test(tables, structure, recordings), FilesRead(tuple(map(Path, data)))
+    )
+
+
+def files_of_test(folder: Path, files: TestFiles) -> FilesRead | None:
+    """What the states of a folder were read from; None where nobody says how, or of both kinds."""
+    tables = tuple(state.table for state in files.states if state.table is not None)
+    records = [record.file.partition(": ")[0] for record in files.records]
+    read = [*(state.file for state in files.states if state.table is None), *records]
+    if tables and not read:
+        return FilesRead(tables)
+    told = folder / MAP
+    if tables or not told.is_file():
+        return None
+    return FilesRead(
+        tuple(folder / name for name in dict.fromkeys(read)), told, read_import_map(told)
+    )
+
+
+def with_imports(checkup: Checkup, read: FilesRead | None) -> Checkup:
+    """The findings with the import that mends each; the first certain one with that of all."""
+    if read is None:
+        return checkup
+    certain = [finding for finding in checkup.findings if is_certain(finding)]
+    told = []
+    for finding in checkup.findings:
+        lines = [line for repair in finding.repairs if (line := _command(repair, read))]
+        mend = str(finding.mend)
+        mend = f"{mend.rstrip('.')}: {', or '.join(lines)}." if lines else mend
+        if (
+            len(certain) > 1
+            and finding is certain[0]
+            and (line := _command(_joined(certain), read))
+        ):
+            mend = f"{' and '.join(each.name for each in certain)} at once: {line}. Alone, {mend}"
+        told.append(finding._replace(mend=mend))
+    return Checkup(tuple(told), checkup.notes)
+
+
+def is_certain(one: Finding) -> bool:
+    """Whether a finding leaves no choice of what all numbers are, and an import can say it."""
+    if one.severity != "error" or len(one.repairs) != 1:
+        return False
+    (repair,) = one.repairs
+    return bool(_options_of_own(repair)) and repair.force_unit != "V"
+
+
+def _joined(findings: Sequence[Finding]) -> Repair:
+    """Several findings' repairs as one; each was found with the others' errors mended."""
+    every = [finding.repairs[0] for finding in findings]
+    return Repair(
+        response=math.prod(one.response for one in every),
+        force=math.prod(one.force for one in every),
+        unit="".join(one.unit for one in every),
+        force_unit="".join(one.force_unit for one in every),
+        quantity="".join(one.quantity for one in every),
+        conjugate=any(one.conjugate for one in every),
+    )
+
+
+def _command(repair: Repair, read: FilesRead) -> str:
+    """The import that does a repair; empty where no options of it can."""
+    own = read.map_file is None
+    options = _options_of_own(repair) if own else _options_of_laboratory(repair, read.told)
+    if not options:
+        return ""
+    told = () if own else ("--map", str(read.map_file))
+    to = ("--out", str(read.files[0].parent / "mended"))
+    words = ("snrmjax", "import", *map(str, read.files), *told, *options, *to)
+    # Double quotes, which every shell knows.
+    quoted = [word if shlex.quote(word) == word else f'"{word}"' for word in words]
+    return f"`{' '.join(quoted)}`"
+
+
+def _options_of_own(repair: Repair) -> list[str]:
+    """Options that read our own table as what it is; none where it does not hold enough."""
+    if repair.force_unit == "V":
+        return ["--force-unit", "V"]
+    words = []
+    if repair.quantity or repair.response != 1:
+        size = f"{repair.response:.8g} " if repair.response != 1 else ""
+        words += ["--unit", f"{size}{_SI[repair.quantity]}"]
+    if repair.force != 1:
+        words += ["--force-unit", f"{repair.force:.8g} N"]
+    return [*words, *(["--phase-sign", "lag"] if repair.conjugate else [])]
+
+
+def _options_of_laboratory(repair: Repair, told: ImportMap) -> list[str]:
+    """Likewise of a laboratory's files by a map: where the units that a finding names are all."""
+    kinds = {response.quantity for response in told.responses}
+    named = (repair.response == 1 or repair.unit) and (repair.force == 1 or repair.force_unit)
+    if repair.quantity or not named or len(kinds) != 1 or (repair.conjugate and told.record):
+        return []
+    words = []
+    if repair.unit:
+        (kind,) = kinds
+        if (repair.unit in ("g", "m/s2")) != (kind == "acceleration"):
+            return []
+        words += ["--unit", f"{repair.unit}{_PER_SECOND.get(kind, '')}"]
+    words += ["--force-unit", repair.force_unit] if repair.force_unit else []
+    words += ["--phase-unit", repair.phase_unit] if repair.phase_unit else []
+    sign = "lead" if told.phase_sign == "lag" else "lag"
+    return [*words, *(["--phase-sign", sign] if repair.conjugate else [])]

@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 from snrmjax.diagnose.diagnosis import diagnose_model
@@ -15,6 +14,7 @@ from snrmjax.diagnose.response_prediction import (
     holds_response,
     predict_levels,
 )
+from snrmjax.io.files import FilePath
 from snrmjax.io.measurement_plans import read_further_states
 from snrmjax.io.models import read_model
 from snrmjax.io.tables import read_steady_states
@@ -84,7 +84,7 @@ def simulated_levels(diagnosis: Diagnosis, model: Structure) -> SimulatedLevels:
 
 
 def read_test(
-    data: Path, model: Path, further: Sequence[Path] = ()
+    data: FilePath, model: FilePath, further: Sequence[FilePath] = ()
 ) -> tuple[Structure, SteadyStates]:
     """A model, and a table of steady states with those of further tables of the same structure."""
     structure = read_model(model)

@@ -16,7 +16,7 @@ from snrmjax.io.exchange.import_map import (
 )
 from snrmjax.io.exchange.importing import Imported, import_files
 from snrmjax.io.exchange.own_tables import is_own_file
-from snrmjax.io.exchange.record_import import told_record
+from snrmjax.io.exchange.record_import import mapped_record
 from snrmjax.io.files import read_text
 from snrmjax.io.laboratory.contents import LaboratoryFile
 from snrmjax.io.laboratory.reading import read_laboratory_file
@@ -124,7 +124,7 @@ def read_test_files(folder: Path, model: Path | None = None) -> TestFiles:
         raise ValueError(f"{folder} must be a folder with the files of a test.")
     files = sorted(one for one in folder.iterdir() if one.is_file() and one.name[0] != ".")
     models = [] if model is None else [model]
-    maps = [one for one in files if one.name == MAP]
+    maps = [file for file in files if file.name == MAP]
     told = read_import_map(maps[0]) if maps else ImportMap()
     notes: list[str] = []
     states: list[NamedStates] = []
@@ -161,15 +161,19 @@ def read_test_files(folder: Path, model: Path | None = None) -> TestFiles:
                     states.append(NamedStates(path.name, found.states))
             else:
                 responses += [NamedResponses(path.name, one) for one in _linear(held, path)]
-            for one in held.recordings:
-                record = one if told.is_empty else told_record(one, told, path.name, assumed)[0]
-                several = f"{path.name}: {one.name}"
+            for recording in held.recordings:
+                record = (
+                    recording
+                    if told.is_empty
+                    else mapped_record(recording, told, path.name, assumed)[0]
+                )
+                several = f"{path.name}: {recording.name}"
                 records.append(
                     NamedRecord(several if len(held.recordings) > 1 else path.name, record)
                 )
             notes += [f"{path.name}: {key}: {why}" for key, why in assumed.items()]
     if len(models) > 1:
-        listed = " and ".join(one.name for one in models)
+        listed = " and ".join(model.name for model in models)
         raise ValueError(
             f"which is the model of this test, {listed}? Say so by `--model {models[0].name}`."
         )

@@ -71,12 +71,12 @@ class IdentifiedTest(NamedTuple):
     @property
     def responses(self) -> list[PredictedResponse]:
         """Predicted responses of all forces."""
-        return [response for one in self.predictions for response in one.responses]
+        return [response for prediction in self.predictions for response in prediction.responses]
 
     @property
     def resonances(self) -> list[Resonance]:
         """Predicted resonances of all forces."""
-        return [resonance for one in self.predictions for resonance in one.resonances]
+        return [resonance for prediction in self.predictions for resonance in prediction.resonances]
 
     @property
     def advice(self) -> NextMeasurements | None:
@@ -121,7 +121,6 @@ def _by_points(data: SteadyStates, model: Structure, options: IdentifyOptions) -
             amplitude=options.amplitude,
             measure=options.measure,
             n_knots=options.knots,
-            anchor=options.anchor,
         )
     except ValueError as error:
         raise with_doubt(error, data, model) from error

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from snrmjax.io.files import file_name, read_text
+from snrmjax.io.files import FilePath, file_name, read_text
 from snrmjax.io.laboratory.reading import read_laboratory_file
 from snrmjax.io.laboratory.record_tables import (
     is_record_table,
@@ -18,13 +18,14 @@ _STATES = {"level", "frequency_hz"}  # columns of which a table of steady states
 _NOT_CSV = (".mat", ".h5", ".hdf5", ".nc", ".nc4", ".cdf", ".tdms", ".uff", ".unv", ".58")
 
 
-def read_measured_test(path: Path, structure: Structure) -> list[SteadyStates | TimeRecording]:
+def read_measured_test(path: FilePath, structure: Structure) -> list[SteadyStates | TimeRecording]:
     """Steady states or time records of one file.
 
     A CSV with a column `time_s` is a time record, one with `level` or `frequency_hz` a table of
     steady states; whatever else is a laboratory's file, of which the time records are taken.
     Raises `ValueError` as the readers do, and for a file without either.
     """
+    path = Path(path)
     if path.suffix.lower() not in _NOT_CSV and _is_text(path):
         if is_record_table(path):
             return [read_record_table(path)]
@@ -36,7 +37,7 @@ def read_measured_test(path: Path, structure: Structure) -> list[SteadyStates | 
             f"{file_name(path)} holds no time record (a CSV needs the column time_s) and no table "
             "of steady states (level, frequency_hz, …)."
         )
-    return [with_named_channels(one, file_name(path)) for one in held.recordings]
+    return [with_named_channels(recording, file_name(path)) for recording in held.recordings]
 
 
 def _header(path: Path) -> set[str]:

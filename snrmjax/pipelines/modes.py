@@ -21,7 +21,7 @@ from snrmjax.identify.scaling.scale import (
 )
 from snrmjax.identify.scaling.scaled_modes import ScaledModes
 from snrmjax.io.exchange.own_tables import is_own_file
-from snrmjax.io.files import file_name
+from snrmjax.io.files import FilePath, file_name
 from snrmjax.io.laboratory.reading import read_laboratory_file
 from snrmjax.io.tables import read_steady_states
 from snrmjax.io.units import HERTZ
@@ -94,13 +94,14 @@ def find_linear_modes(
 
 
 def read_modal_sources(
-    paths: Sequence[Path],
+    files: Sequence[FilePath],
 ) -> FrequencyResponses | SteadyStates | tuple[TimeRecording, ...]:
     """One test from its files: joined frequency responses, steady states, or records of decays.
 
     Raises `ValueError` that names the file: of mixed kinds, with nothing of these in it, or as its
     reader says.
     """
+    paths = [Path(file) for file in files]
     found = [_read(path) for path in paths]
     kinds = {type(one) for one in found}
     if len(kinds) > 1:
@@ -130,7 +131,12 @@ def _read(path: Path) -> FrequencyResponses | SteadyStates | tuple[TimeRecording
     if held.responses:
         return joined_responses(held.responses)
     if held.recordings:
-        forces = [c.name for one in held.recordings for c in one.channels if c.quantity == "force"]
+        forces = [
+            c.name
+            for recording in held.recordings
+            for c in recording.channels
+            if c.quantity == "force"
+        ]
         if forces:
             raise ValueError(
                 f"{file_name(path)} holds time records with a force ({forces[0]}): modes need "

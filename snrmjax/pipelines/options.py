@@ -45,9 +45,9 @@ def checked(options: Options) -> Options:
     Raises `ValueError` that names the option: of a number out of its range, of one that belongs to
     another which is not stated, or that has no effect beside another.
     """
-    fields = {one.name: one for one in dataclasses.fields(options)}  # type: ignore[arg-type]
+    fields = {field.name: field for field in dataclasses.fields(options)}  # type: ignore[arg-type]
     stated = {name for name, one in fields.items() if getattr(options, name) != one.default}
-    for name in (one for one in fields if one in stated):
+    for name in (known for known in fields if known in stated):
         about: Option = fields[name].metadata["option"]
         flag, value = flag_of(fields[name]), getattr(options, name)
         for number in value if isinstance(value, Sequence) else (value,):
@@ -144,13 +144,6 @@ class IdentifyOptions:
         panel=_POINTS,
         alone=_FIT,
         why_alone="a joint fit has the size with the family, as `--fit spline:5`",
-    )
-    anchor: bool = option(
-        False,
-        "Make both curves start at the linear frequency and damping of the model.",
-        panel=_POINTS,
-        alone=_FIT,
-        why_alone="a joint fit is not tied to the linear mode",
     )
     fit: str | None = option(
         None,

@@ -47,11 +47,9 @@ class Prediction(NamedTuple):
         return [each for each in self.responses if isinstance(each, FittedResponse)]
 
     @property
-    def load(self) -> str:
-        """The force in words, and its drive voltage where the force is known as one."""
-        if self.drive is None:
-            return f"{self.force:g} N"
-        return f"{self.drive:.5g} V ({self.force:.4g} N)"
+    def load(self) -> Fact:
+        """The force, and its drive voltage where the force is known as one."""
+        return Fact("load", force=self.force, drive=self.drive)
 
 
 def reach_of(options: IdentifyOptions) -> float:

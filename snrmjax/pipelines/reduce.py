@@ -1,12 +1,12 @@
 """A reduced-order model from its source: load cases, condensation, and how far it holds."""
 
+import dataclasses
 from collections.abc import Callable
-from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from snrmjax.condense.condensation import Condensation, condense
+from snrmjax.condense.condensation import Condensation, reduced_model
 from snrmjax.condense.load_cases import StaticCases
 from snrmjax.condense.load_set import modal_loads
 from snrmjax.condense.scale_study import (
@@ -17,6 +17,7 @@ from snrmjax.condense.scale_study import (
     typical_displacement,
 )
 from snrmjax.io.calculix.reduction import read_deck_source
+from snrmjax.io.files import FilePath
 from snrmjax.io.reduction.beam_source import read_beam
 from snrmjax.io.reduction.load_tables import read_load_tables
 from snrmjax.io.reduction.source import ReductionSource, run_load_cases
@@ -24,7 +25,7 @@ from snrmjax.io.units import HERTZ
 from snrmjax.model.potential import monomial_key
 from snrmjax.model.structures import Structure, equilibria
 from snrmjax.numerics.facts import Fact
-from snrmjax.pipelines.options import ReduceOptions
+from snrmjax.pipelines.options import ReduceOptions, checked
 
 _SWEEP = (2.0, 3.0, 5.0, 7.5, 10.0)  # of the loads of single modes, to see the model's range
 _FEW_SCALES = (0.1, 0.3, 1.0, 3.0)  # of a study whose load cases take long
@@ -72,7 +73,7 @@ def reduce_model(
     displacement, cases = None, source.cases
     if cases is None:
         displacement, cases = run_load_cases(source)
-    found = condense(source.basis, cases, degree=source.degree)
+    found = reduced_model(source.basis, cases, degree=source.degree)
     _refuse_contradictions(source, found)
     compared = _stated_scale_compared(source, found)
     scales = sweep = None
@@ -90,7 +91,7 @@ def reduce_model(
         )
     structure = source.structure(found)
     notes: list[Fact | str] = [*source.notes, *compared]
-    notes += [warning.message for warning in found.warnings]
+    notes += found.warnings
     if scales is not None and not scales.holds_default:
         notes.append(Fact("load_scale_outside_plateau"))
     states = [one for one in equilibria(structure) if one.stable]
@@ -102,9 +103,9 @@ def reduce_model(
 def _refuse_contradictions(source: ReductionSource, found: Condensation) -> None:
     if source.cases is None:
         return
-    for one in found.warnings:
-        if one.kind == "inconsistent_case":
-            raise ValueError(f"{one.message}; mend or remove it.")
+    for warning in found.warnings:
+        if warning.kind == "inconsistent_case":
+            raise ValueError(f"{warning}; mend or remove it.")
     ratio = found.quality.linear_stiffness_ratio
     worst = int(np.argmax(np.abs(np.nan_to_num(ratio, nan=1.0) - 1)))
     if abs(ratio[worst] - 1) > _REFUSED_LINEAR:
@@ -136,7 +137,7 @@ def _stated_scale_compared(source: ReductionSource, found: Condensation) -> list
     except ValueError as error:
         why = str(error)
         return [Fact("load_scale_not_compared", stated=source.load_scale, why=why)]
-    chosen = condense(source.basis, cases, degree=source.degree)
+    chosen = reduced_model(source.basis, cases, degree=source.degree)
     scale = float(np.max(displacement)) / source.thickness
     monomials, own = chosen.potential.monomials, np.asarray(chosen.potential.coefficient)
     leading = np.flatnonzero(leading_terms(own, typical_displacement(cases), monomials))
@@ -156,11 +157,14 @@ def _stated_scale_compared(source: ReductionSource, found: Condensation) -> list
     return [fact]
 
 
-def read_reduction_source(beam: Path | None, options: ReduceOptions) -> ReductionSource:
+def read_reduction_source(
+    beam: FilePath | None = None, options: ReduceOptions | None = None, **settings: Any
+) -> ReductionSource:
     """What is condensed: a beam file, or tables or a deck by the options; exactly one of them.
 
     Raises `ValueError` for none or several of them, and as the readers do.
     """
+    options = checked(dataclasses.replace(options or ReduceOptions(), **settings))
     sources = {"BEAM": beam, "--tables": options.tables, "--calculix": options.calculix}
     given = [name for name, path in sources.items() if path is not None]
     if len(given) != 1:

@@ -122,7 +122,7 @@ def _notes_on_curve(curve: ResponseCurve) -> Iterator[Fact]:
     if curve.branch == "main" and curve.status != CurveStatus.UPPER_END:
         yield Fact("curve_ended", force=curve.force, status=curve.status)
     if curve.not_located:
-        yield Fact("events_not_located", force=curve.force, kinds=curve.not_located)
+        yield Fact("curve_events_not_located", force=curve.force, kinds=curve.not_located)
     unknown = int(np.sum(curve.stability == int(Stability.NOT_COMPUTED)))
     if unknown:
         yield Fact("stability_not_computed", force=curve.force, n=unknown)
@@ -134,7 +134,7 @@ def _notes_on_equilibria(model: Structure) -> tuple[Fact, ...]:
     if not others:
         return ()
     shape = np.asarray(model.modes.mode_shape)
-    places = tuple(float((shape @ one.displacement)[0]) for one in others)  # m
-    stable = tuple(bool(one.stable) for one in others)
+    places = tuple(float((shape @ other.displacement)[0]) for other in others)  # m
+    stable = tuple(bool(other.stable) for other in others)
     sensor = model.modes.sensors[0]
     return (Fact("further_equilibria", sensor=sensor, displacement=places, stable=stable),)

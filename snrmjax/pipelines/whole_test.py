@@ -16,6 +16,7 @@ from snrmjax.identify.modal.modes_of_tests import find_modes
 from snrmjax.identify.modal.response_data import joined_responses
 from snrmjax.identify.scaling.scale import DrivePoint, scale_modes
 from snrmjax.identify.scaling.scaled_modes import ScaledModes
+from snrmjax.io.files import FilePath
 from snrmjax.measure.phase_convention import wrong_phases
 from snrmjax.measure.recordings.step_counts import StepCounts, joined_counts
 from snrmjax.measure.recordings.stepped_sine import SteppedSineStates, stepped_sine_states
@@ -28,7 +29,7 @@ from snrmjax.measure.states import (
 from snrmjax.methods.records.recorded_test import RecordedTest, RecordKind, recorded_test
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.facts import Fact
-from snrmjax.pipelines.corrections import files_of_test, is_certain, with_imports
+from snrmjax.pipelines.check import files_of_test, is_certain, with_imports
 from snrmjax.pipelines.diagnose import DiagnosedTest, diagnose_test
 from snrmjax.pipelines.folded_records import FoldedRecord, folded_records
 from snrmjax.pipelines.folder_contents import NamedRecord, TestFiles, read_test_files
@@ -76,7 +77,7 @@ class WholeTest(NamedTuple):
 
 
 def run_whole_test(
-    folder: Path,
+    folder: FilePath,
     options: WholeTestOptions | None = None,
     *,
     progress: Callable[[str, float], None] = lambda stage, seconds: None,
@@ -90,6 +91,7 @@ def run_whole_test(
     or whether to go on in spite of what the check found; and as its stages do.
     """
     options = checked(dataclasses.replace(options or WholeTestOptions(), **settings))
+    folder = Path(folder)
     stage, name = _Stages(progress), folder.resolve().name
     files = read_test_files(folder, options.model)
     read = files_of_test(folder, files)
@@ -131,7 +133,7 @@ def run_whole_test(
         *left_out,
         *files.notes,
         *_taken_sensors(files, model),
-        *(Fact("steps_used", file=each.file, counts=each.steps.counts) for each in stepped),
+        *(_note_on_steps(each) for each in stepped),
         *by_points,
     )
     counts = _used_steps(files, stepped)
@@ -162,6 +164,10 @@ def not_diagnosed(data: SteadyStates, model: Structure) -> tuple[Note, ...]:
     """
     doubts = (*wrong_phases(data, model), *doubt(data, model))
     return (Fact("diagnosis_left_out", why=str(doubts[0])),) if doubts else ()
+
+
+def _note_on_steps(record: SteppedRecord) -> Note:
+    return Fact("note_of_file", file=record.file, note=record.steps.counts.fact)
 
 
 def _taken_sensors(files: TestFiles, model: Structure) -> tuple[Note, ...]:

@@ -79,7 +79,7 @@ def report_html(report: Report) -> str:
         lstrip_blocks=True,
     )
     sections = [
-        {**section._asdict(), "figures": [_embedded(one) for one in section.figures]}
+        {**section._asdict(), "figures": [_embedded(figure) for figure in section.figures]}
         for section in report.sections
     ]
     template = environment.get_template("report.html.j2")

@@ -144,7 +144,6 @@ _FIGURES: dict[str, Callable[..., Figure]] = {
     "NormalModeBranch": simulation_figures.normal_mode_figure,
     "PeriodicMotion": _motions,
     "PredictedResponse": _predicted,
-    "Profile": joint_figures.profile_figure,
     "Propagation": uncertainty_figures.propagation_figure,
     "ResponseBatch": simulation_figures.batch_figure,
     "ResponseCurve": lambda one, **settings: simulated_response_figure([one], **settings),

@@ -59,7 +59,7 @@ class BackboneSamples(NamedTuple):
 
 
 def sample_backbone(backbone: Backbone, *, reach: float = 1.0) -> BackboneSamples:
-    """A backbone from its smallest amplitude, zero if anchored, to `reach` times its largest."""
+    """A backbone from its smallest amplitude to `reach` times its largest."""
     values = backbone.sampled(_CURVE_POINTS, reach=reach)
     ends = float(backbone.smallest), reach * float(backbone.largest)
     return _in_units(values, np.linspace(*ends, _CURVE_POINTS) > float(backbone.largest))

@@ -18,6 +18,7 @@ _PAGES = {
     "Comparison": "comparison",
     "DiagnosedTest": "diagnosis",
     "IdentifiedTest": "identified_test",
+    "Imported": "imports",
     "LinearModesFound": "modes",
     "Reduction": "reduction",
     "SimulatedMode": "simulation",

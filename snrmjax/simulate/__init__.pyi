@@ -1,80 +1,87 @@
 from .balance.harmonics import velocity_phasors
 from .continuation.continuation import CurveStatus, StepControl
 from .continuation.response_curve import ResponseCurve
-from .continuation.stability import Stability, StabilityLoss, floquet_multipliers
-from .solutions.controlled import (
-    ControlledCurve,
-    DampedModeBranch,
-    damped_normal_mode,
-    phase_controlled,
-    response_controlled,
-)
+from .continuation.stability import Stability, floquet_multipliers
+from .solutions.controlled import damped_normal_mode, phase_controlled, response_controlled
 from .solutions.forced_response import (
-    ResponseBatch,
     ResponseSettings,
     forced_response,
     forced_response_batch,
     solve_at_frequency,
 )
-from .solutions.isolated_responses import IsolatedResponses, IsolatedSearch, isolated_responses
+from .solutions.isolated_responses import IsolatedSearch, isolated_responses
 from .solutions.mode_at_velocities import normal_mode_at_velocities
-from .solutions.normal_modes import NormalModeBranch, Tongue, nonlinear_normal_mode
+from .solutions.normal_modes import nonlinear_normal_mode
 from .solutions.periodic_motion import (
-    PeriodicMotion,
     motions_at_velocities,
     periodic_motion,
     response_at_velocities,
 )
 from .solutions.time_integration import (
-    IntegratedMotion,
     IntegrationAccuracy,
     MotionStatus,
     settled_motion,
     stepped_sine,
 )
-from .virtual_test.controlled_test import phase_controlled_test, response_controlled_test
-from .virtual_test.phase_resonance_test import SweepSimulation, VirtualTest, phase_resonance_test
+from .virtual_test.controlled_test import phase_controlled_test
+from .virtual_test.equipment import Instruments, Shaker
+from .virtual_test.laboratory import AbstractController, Laboratory, run_test
+from .virtual_test.phase_loop import LoopGains, phase_sweep
+from .virtual_test.phase_resonance_test import SweepSimulation, phase_resonance_test
+from .virtual_test.programmes import (
+    AmplitudeGains,
+    Playback,
+    decay_test,
+    multisine_test,
+    steady_states_of,
+    stepped_sine_test,
+)
 from .virtual_test.recording import MeasurementErrors, Recording
+from .virtual_test.target_feedback import FeedbackSettings, s_curve
 
 __all__ = [
-    "ControlledCurve",
+    "AbstractController",
+    "AmplitudeGains",
     "CurveStatus",
-    "DampedModeBranch",
-    "IntegratedMotion",
+    "FeedbackSettings",
+    "Instruments",
     "IntegrationAccuracy",
-    "IsolatedResponses",
     "IsolatedSearch",
+    "Laboratory",
+    "LoopGains",
     "MeasurementErrors",
     "MotionStatus",
-    "NormalModeBranch",
-    "PeriodicMotion",
+    "Playback",
     "Recording",
-    "ResponseBatch",
     "ResponseCurve",
     "ResponseSettings",
+    "Shaker",
     "Stability",
-    "StabilityLoss",
     "StepControl",
     "SweepSimulation",
-    "Tongue",
-    "VirtualTest",
     "damped_normal_mode",
+    "decay_test",
     "floquet_multipliers",
     "forced_response",
     "forced_response_batch",
     "isolated_responses",
     "motions_at_velocities",
+    "multisine_test",
     "nonlinear_normal_mode",
     "normal_mode_at_velocities",
     "periodic_motion",
     "phase_controlled",
     "phase_controlled_test",
     "phase_resonance_test",
+    "phase_sweep",
     "response_at_velocities",
     "response_controlled",
-    "response_controlled_test",
+    "run_test",
+    "s_curve",
     "settled_motion",
     "solve_at_frequency",
+    "steady_states_of",
     "stepped_sine",
+    "stepped_sine_test",
     "velocity_phasors",
 ]

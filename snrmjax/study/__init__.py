@@ -18,8 +18,8 @@ Or with workers that Dask starts and stops (snrmjax[cluster] and dask-jobqueue):
     cluster = SLURMCluster(cores=8, processes=8, memory="16GB", walltime="02:00:00")
     cluster.scale(jobs=20)
     study = sj.study.read_study("study.toml")
-    settings = sj.study.RunSettings(scheduler=cluster.scheduler_address)
-    sj.study.run_study(study, "study.zarr", settings)  # called again, it continues
+    # Called again, it continues:
+    sj.study.run_study(study, "study.zarr", scheduler=cluster.scheduler_address)
 
 Each worker needs the same versions and sees the same folders; it computes with one thread.
 """

@@ -4,32 +4,18 @@ import dataclasses
 import hashlib
 import importlib.metadata
 import inspect
-import json
 from collections.abc import Iterator, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
 import numpy as np
 
-from snrmjax.io.files import shown
 from snrmjax.io.reduction.beam_models import BeamModels
 from snrmjax.study.study import Study
 
 _LONGEST = 64  # numbers of an array that are written out; longer ones are known by their hash
 _PACKAGES = ("snrmjax", "jax", "jaxlib", "numpy")
-
-
-class Difference(NamedTuple):
-    """One place at which two studies differ."""
-
-    place: str
-    here: object
-    there: object
-
-    def __str__(self) -> str:
-        """In words, as messages say it."""
-        return f"`{self.place}` is {shown(self.here)} here and {shown(self.there)} in the store"
 
 
 def description(study: Study) -> dict[str, Any]:
@@ -47,22 +33,18 @@ def description(study: Study) -> dict[str, Any]:
     }
 
 
-def model_hash(study: Study) -> str:
-    """A hash of the base model alone."""
-    beam = isinstance(study.model_of, BeamModels)
-    text = json.dumps({"model": _plain(study.model_of if beam else study.model)}, sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()
-
-
-def differences(here: Any, there: Any) -> list[Difference]:
-    """Where two descriptions differ, in the order of the first."""
-    own, other = dict(_leaves(here)), dict(_leaves(there))
-    found = []
-    for place in [*own, *(place for place in other if place not in own)]:
-        a, b = own.get(place, "absent"), other.get(place, "absent")
-        if not (a == b or (a != a and b != b)):
-            found.append(Difference(place.removeprefix("study."), a, b))
-    return found
+def differences(here: Any, there: Any) -> dict[str, tuple[object, object]]:
+    """What two descriptions have at each place where they differ, in the order of the first."""
+    one, other = dict(_leaves(here)), dict(_leaves(there))
+    both = {
+        place: (one.get(place, "absent"), other.get(place, "absent"))
+        for place in dict.fromkeys([*one, *other])
+    }
+    return {
+        place.removeprefix("study."): (a, b)
+        for place, (a, b) in both.items()
+        if not (a == b or (a != a and b != b))
+    }
 
 
 def _leaves(described: Any, place: str = "") -> Iterator[tuple[str, Any]]:
@@ -85,11 +67,11 @@ def _plain(value: Any) -> Any:
         fields = {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
         return {"kind": getattr(value, "kind", type(value).__name__), **fields}
     if isinstance(value, tuple) and hasattr(value, "_asdict"):
-        return {name: _plain(one) for name, one in value._asdict().items()}
+        return {name: _plain(part) for name, part in value._asdict().items()}
     if isinstance(value, Mapping):
-        return {str(key): _plain(one) for key, one in value.items()}
+        return {str(key): _plain(part) for key, part in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(one) for one in value]
+        return [_plain(part) for part in value]
     if isinstance(value, jax.Array | np.ndarray | np.generic):
         return _plain_array(np.asarray(value))
     if callable(value):

@@ -6,12 +6,19 @@ An immutable plan, files that appear whole, and a data set made of them at the e
 import os
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from snrmjax.study.compute import Progress, ProgressReport, receipts
+from snrmjax.io.files import shown
+from snrmjax.study.execution import (
+    Workers,
+    available_cores,
+    dask_cluster,
+    local_processes,
+    receipts,
+)
 from snrmjax.study.identity import description, differences
 from snrmjax.study.store import (
     StudyFolder,
@@ -22,13 +29,7 @@ from snrmjax.study.store import (
     whole_chunks,
     write_study_plan,
 )
-from snrmjax.study.study import PlannedStudy, Study, planned
-from snrmjax.study.workers import (
-    AbstractWorkers,
-    DaskCluster,
-    LocalProcesses,
-    available_cores,
-)
+from snrmjax.study.study import Ensemble, Study
 
 if TYPE_CHECKING:
     import xarray
@@ -36,11 +37,27 @@ if TYPE_CHECKING:
 _SHOWN = 3  # differences that a refusal lists
 
 
-class Shard(NamedTuple):
-    """One of several parts of a study that are computed apart: the `part`-th of `parts`."""
+class Progress(NamedTuple):
+    """Where a run stands."""
 
-    part: int  # from 1
-    parts: int
+    members: int
+    done: int
+    failed: int
+    seconds: float  # since this run began
+    done_before: int  # members that were there when it began
+
+    @property
+    def per_second(self) -> float:
+        """Members computed a second."""
+        return (self.done - self.done_before) / max(self.seconds, 1e-9)
+
+    @property
+    def seconds_left(self) -> float:
+        """At this pace."""
+        return (self.members - self.done) / max(self.per_second, 1e-9)
+
+
+ProgressReport = Callable[[Progress], None]
 
 
 class StudyRun(NamedTuple):
@@ -64,19 +81,6 @@ class StudyRun(NamedTuple):
         return open_study(self.path)
 
 
-class RunSettings(NamedTuple):
-    """Who computes a study, and whom to tell how it stands."""
-
-    processes: int | None = None  # None: one for each core
-    scheduler: str | None = None  # address of a running Dask scheduler
-    shard: Shard | None = None
-    progress: ProgressReport | None = None  # called after each chunk
-    workers: AbstractWorkers | None = None  # your own, in place of processes or a scheduler
-
-
-HERE = RunSettings()
-
-
 def open_study(path: str | os.PathLike[str]) -> "xarray.Dataset":
     """The data set of a study, its arrays read as they are used.
 
@@ -92,7 +96,16 @@ def open_study(path: str | os.PathLike[str]) -> "xarray.Dataset":
     return xarray.open_zarr(path, chunks=None, consolidated=True)
 
 
-def run_study(study: Study, out: str | os.PathLike[str], settings: RunSettings = HERE) -> StudyRun:
+def run_study(
+    study: Study,
+    out: str | os.PathLike[str],
+    *,
+    processes: int | None = None,
+    scheduler: str | None = None,
+    shard: tuple[int, int] = (1, 1),
+    progress: ProgressReport | None = None,
+    workers: Workers | None = None,
+) -> StudyRun:
     """Compute a study and store it as one data set; the same call continues what was stopped.
 
     Chunks of members are computed by processes of this machine, each on one core, or by a Dask
@@ -100,96 +113,94 @@ def run_study(study: Study, out: str | os.PathLike[str], settings: RunSettings =
     store. Stopping at any moment loses chunks in flight only. Digits do not depend on how many
     processes there are.
 
-    Arguments: `out` is the folder of the data set.
+    Arguments: `out` is the folder of the data set; `processes` of this machine (None: one for each
+    core) or the address of a running Dask `scheduler`; `shard` (i, n) computes the i-th of n parts;
+    `progress` is called after each chunk; `workers` of your own in place of processes.
     Returns a `StudyRun`. A member that fails is a row with its status.
     Raises `ValueError` before anything is written for a study that cannot be run, and for an `out`
     that has another study, that another process is at work on, or that cannot be written;
     `ClusterGone` where the scheduler ends: call again.
     """
-    plan = planned(study)
+    if processes is not None and processes < 1:
+        raise ValueError(f"`processes` must be at least 1, but is {processes}.")
+    if processes is not None and scheduler is not None:
+        raise ValueError("`processes` are of this machine: a scheduler has its own.")
+    if not 1 <= shard[0] <= shard[1]:
+        raise ValueError(f"a shard i/n needs i from 1 to n, but is {shard[0]}/{shard[1]}.")
+    ensemble = study.ensemble()
     described = description(study)
     folder = StudyFolder(Path(os.path.abspath(out)))
-    _check_settings(settings)
     begin = time.perf_counter()
     if is_collected(folder, described):
-        return StudyRun(folder.out, len(plan.table), 0, 0, 0, 0, 0.0)
-    workers = _workers(settings, study.n_chunks)  # a cluster that is not there leaves nothing
-    with closing(workers), _words_for_disk(folder), _locked(folder, settings.shard):
+        return StudyRun(folder.out, len(ensemble.table), 0, 0, 0, 0, 0.0)
+    if workers is None and scheduler is not None:
+        workers = dask_cluster(scheduler)  # one that is not there leaves nothing
+    workers = workers or local_processes(min(processes or len(available_cores()), study.n_chunks))
+    with closing(workers), _words_for_disk(folder), _locked(folder, shard):
         _claim(folder, described)
         whole, damaged = whole_chunks(folder, study.n_chunks)
         for chunk in damaged:
             chunk.unlink()
-        done = _computed(plan, folder, whole, settings, workers)
+        done = _computed(ensemble, folder, whole, workers, shard, progress)
         missing = study.n_chunks - len(whole_chunks(folder, study.n_chunks)[0])
         if not missing:
-            collect_chunks(plan, folder, described)
+            collect_chunks(ensemble, folder, described)
     return StudyRun(
         folder.out,
-        *(len(plan.table), done.failed, done.done - done.done_before),
+        *(len(ensemble.table), done.failed, done.done - done.done_before),
         *(missing, len(damaged), time.perf_counter() - begin),
     )
 
 
 def _computed(
-    plan: PlannedStudy,
+    ensemble: Ensemble,
     folder: StudyFolder,
     whole: list[int],
-    settings: RunSettings,
-    workers: AbstractWorkers,
+    workers: Workers,
+    shard: tuple[int, int],
+    progress: ProgressReport | None,
 ) -> Progress:
-    part, parts = settings.shard or (1, 1)
-    before = sum(len(plan.rows_of(k)) for k in whole)
-    missing = sorted({*range(part - 1, plan.study.n_chunks, parts)} - {*whole})
-    state = Progress(len(plan.table), before, 0, 0.0, before)
+    part, parts = shard
+    before = sum(len(ensemble.rows_of(k)) for k in whole)
+    missing = sorted({*range(part - 1, ensemble.study.n_chunks, parts)} - {*whole})
+    state = Progress(len(ensemble.table), before, 0, 0.0, before)
     begin = time.perf_counter()
-    for receipt in receipts(plan, folder, workers, missing):
-        state = state.with_receipt(receipt, time.perf_counter() - begin)
-        if settings.progress is not None:
-            settings.progress(state)
-    return state
-
-
-def _workers(settings: RunSettings, n_chunks: int) -> AbstractWorkers:
-    if settings.workers is not None:
-        return settings.workers
-    if settings.scheduler is not None:
-        return DaskCluster(settings.scheduler)
-    return LocalProcesses(min(settings.processes or len(available_cores()), n_chunks))
-
-
-def _check_settings(settings: RunSettings) -> None:
-    if settings.processes is not None and settings.processes < 1:
-        raise ValueError(f"`processes` must be at least 1, but is {settings.processes}.")
-    if settings.processes is not None and settings.scheduler is not None:
-        raise ValueError("`processes` are of this machine: a scheduler has its own.")
-    if settings.shard is not None and not 1 <= settings.shard.part <= settings.shard.parts:
-        raise ValueError(
-            f"a shard i/n needs i from 1 to n, but is {settings.shard.part}/{settings.shard.parts}."
+    for receipt in receipts(ensemble, folder, workers, missing):
+        state = state._replace(
+            done=state.done + receipt.members,
+            failed=state.failed + receipt.failed,
+            seconds=time.perf_counter() - begin,
         )
+        if progress is not None:
+            progress(state)
+    return state
 
 
 def _claim(folder: StudyFolder, described: dict) -> None:
     """Make the folder this study's, or see that it is."""
     known = read_study_plan(folder) or stored_description(folder)
-    found = [] if known is None else differences(described, known)
-    if found:
-        further = f" (and {len(found) - _SHOWN} more)" if len(found) > _SHOWN else ""
-        listed = "; ".join(str(one) for one in found[:_SHOWN])
+    other = {} if known is None else differences(described, known)
+    if other:
+        each = [
+            f"`{place}` is {shown(here)} here and {shown(there)} in the store"
+            for place, (here, there) in list(other.items())[:_SHOWN]
+        ]
+        further = f" (and {len(other) - _SHOWN} more)" if len(other) > _SHOWN else ""
         raise ValueError(
-            f"{folder.out} has another study: {listed}{further}. Take another --out, or go back to "
-            "that study."
+            f"{folder.out} has another study: {'; '.join(each)}{further}. Take another --out, or "
+            "go back to that study."
         )
     if not folder.plan.exists():
         write_study_plan(folder, described)
 
 
 @contextmanager
-def _locked(folder: StudyFolder, shard: Shard | None) -> Iterator[None]:
+def _locked(folder: StudyFolder, shard: tuple[int, int]) -> Iterator[None]:
     """Nobody else at work on the same study, or the same shard of it."""
     from filelock import FileLock, Timeout
 
     made = not folder.work.exists()
-    name = ".lock" if shard is None else f".lock-{shard.part}-of-{shard.parts}"
+    name = ".lock" if shard == (1, 1) else ".lock-{}-of-{}".format(*shard)
     folder.work.mkdir(parents=True, exist_ok=True)
     try:
         lock = FileLock(folder.work / name, timeout=0).acquire()

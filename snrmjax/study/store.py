@@ -19,8 +19,8 @@ import numpy as np
 
 from snrmjax.io.files import write_atomically
 from snrmjax.study.computations.base import MEMBER, TEXT, Output, joined
-from snrmjax.study.identity import differences, model_hash
-from snrmjax.study.study import FORCE, PlannedStudy
+from snrmjax.study.identity import differences
+from snrmjax.study.study import FORCE, Ensemble
 
 _BLOCK = 1 << 16  # rows of a ragged variable that are one file
 _TARGET = 1 << 20  # numbers that one file of a member's variable holds at most
@@ -133,9 +133,7 @@ def is_collected(folder: StudyFolder, described: Mapping[str, Any]) -> bool:
     return known.read_text(encoding="utf-8") == _digest(folder.out)
 
 
-def collect_chunks(
-    planned: PlannedStudy, folder: StudyFolder, described: Mapping[str, Any]
-) -> None:
+def collect_chunks(ensemble: Ensemble, folder: StudyFolder, described: Mapping[str, Any]) -> None:
     """Write the data set of all chunks; it appears whole or not at all.
 
     Memory is bounded by a few chunks. Raises `OSError` on a full disk.
@@ -148,7 +146,7 @@ def collect_chunks(
             return
         shutil.rmtree(building, ignore_errors=True)
         try:
-            _write_store(planned, described, building, folder)
+            _write_store(ensemble, described, building, folder)
             digest = _digest(building)
             if folder.out.exists():
                 shutil.rmtree(folder.out)
@@ -169,15 +167,15 @@ def _digest(store: Path) -> str:
 
 
 def _write_store(
-    planned: PlannedStudy, described: Mapping[str, Any], path: Path, folder: StudyFolder
+    ensemble: Ensemble, described: Mapping[str, Any], path: Path, folder: StudyFolder
 ) -> None:
     import zarr
 
-    study = planned.study
+    study = ensemble.study
     group = zarr.create_group(path, zarr_format=2)
-    _write_labels(group, planned)
+    _write_labels(group, ensemble)
     axes = study.computation.axes()
-    sizes = {MEMBER: len(planned.table), **{name: len(axis.values) for name, axis in axes.items()}}
+    sizes = {MEMBER: len(ensemble.table), **{name: len(axis.values) for name, axis in axes.items()}}
     outputs = study.computation.outputs()
     ragged = {one.dimensions[0] for one in outputs.values()} - {MEMBER}
     for dimension in ragged:
@@ -210,7 +208,6 @@ def _write_store(
             "title": study.name,
             "computed": study.computation.kind,
             "study": json.dumps(described, sort_keys=True),
-            "model_hash": model_hash(study),
             **{f"{name}_version": v for name, v in described["versions"].items()},
         }
     )
@@ -244,13 +241,13 @@ def _together(chunks: Iterable[Path]) -> Iterator[dict[str, np.ndarray]]:
         yield joined(waiting)
 
 
-def _write_labels(group: Any, planned: PlannedStudy) -> None:
+def _write_labels(group: Any, ensemble: Ensemble) -> None:
     """Coordinates: the varied quantities, and the axes that all members share."""
     labels = {}
-    for name, column in zip(planned.study.names, planned.table.T, strict=True):
+    for name, column in zip(ensemble.study.names, ensemble.table.T, strict=True):
         unit = next((u for end, u in _UNITS.items() if name.endswith(end)), "")
         labels[name] = (column, Output((MEMBER,), "f8", unit, "varied"))
-    for name, axis in planned.study.computation.axes().items():
+    for name, axis in ensemble.study.computation.axes().items():
         labels[name] = (axis.values, Output((name,), "f8", axis.unit, axis.meaning))
     for name, (values, one) in labels.items():
         _array(group, name, one, values.shape, "f8", _BLOCK)[:] = values

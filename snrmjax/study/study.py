@@ -1,6 +1,7 @@
 """A study: one model, what varies, what is computed; checked before anything runs."""
 
 import difflib
+from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -64,16 +65,36 @@ class Study(eqx.Module):
     @property
     def chunk_size(self) -> int:
         """How many members are computed and stored together."""
-        return self.members_a_chunk or self.computation.members_a_chunk
+        if self.members_a_chunk is None:
+            return self.computation.members_a_chunk
+        return self.members_a_chunk
 
     @property
     def n_chunks(self) -> int:
         """How many chunks there are."""
         return -(-self.n_members // self.chunk_size)
 
+    def ensemble(self) -> "Ensemble":
+        """The members, drawn and checked.
 
-class PlannedStudy(NamedTuple):
-    """A study whose members are drawn and were checked."""
+        Raises `ValueError` for a quantity that the model does not have or that varies twice, for a
+        missing force or a needless one, for too many members, and for the first value that the
+        model cannot have.
+        """
+        if self.seed < 0:
+            raise ValueError(f"`seed` must be zero or positive, but is {self.seed}.")
+        if self.members_a_chunk is not None and self.members_a_chunk < 1:
+            raise ValueError(
+                f"`members_a_chunk` must be at least 1, but is {self.members_a_chunk}."
+            )
+        _check_names(self)
+        table = drawn_members(self.variations, self.sampling, self.seed)
+        _check_values(self, table)
+        return Ensemble(self, table)
+
+
+class Ensemble(NamedTuple):
+    """A study's members: drawn and checked."""
 
     study: Study
     table: Float[np.ndarray, "member name"]
@@ -92,26 +113,10 @@ class PlannedStudy(NamedTuple):
         forces = rows[there][:, [study.names.index(FORCE)]] if FORCE in study.names else None
         seeds = [member_seed(study.seed, numbers[k]) for k in there]
         members = Members([models[k] for k in there], forces, seeds)  # type: ignore[misc]
-        found = study.computation.rows(members) if there else None
-        return found if found and not missing else with_refused(study.computation, found, missing)
-
-
-def planned(study: Study) -> PlannedStudy:
-    """The study with its members drawn and checked.
-
-    Raises `ValueError` for a quantity that the model does not have or that varies twice, for a
-    missing force or a needless one, for too many members, and for the first value that the model
-    cannot have.
-    """
-    if study.seed < 0:
-        raise ValueError(f"`seed` must be zero or positive, but is {study.seed}.")
-    if study.members_a_chunk is not None and study.members_a_chunk < 1:
-        raise ValueError(f"`members_a_chunk` must be at least 1, but is {study.members_a_chunk}.")
-    _check_names(study)
-    number_of_members(study.variations, study.sampling)
-    table = drawn_members(study.variations, study.sampling, study.seed)
-    _check_values(study, table)
-    return PlannedStudy(study, table)
+        outputs = study.computation.rows(members) if there else None
+        if outputs and not missing:
+            return outputs
+        return with_refused(study.computation, outputs, missing)
 
 
 def models_of(study: Study, rows: Float[np.ndarray, "member name"]) -> list[Structure | str]:
@@ -122,8 +127,8 @@ def models_of(study: Study, rows: Float[np.ndarray, "member name"]) -> list[Stru
         return [_made(study.model_of, values) for values in each]
     if not named:
         return [study.model] * len(rows)
-    own, units = zip(*(_own_name(study.names[k]) for k in named), strict=True)
-    together = _varied(study.model, own, rows[:, named] * np.array(units))
+    names, units = zip(*(_in_model(study.names[k]) for k in named), strict=True)
+    together = _varied(study.model, names, rows[:, named] * np.array(units))
     return [taken(together, k) for k in range(len(rows))]
 
 
@@ -131,8 +136,8 @@ def _made(
     model_of: Callable[[dict[str, float]], Structure], values: dict[str, float]
 ) -> Structure | str:
     if isinstance(model_of, BeamModels):
-        own = {name: _own_name(name) for name in values}
-        values = {own[name][0]: value * own[name][1] for name, value in values.items()}
+        named = {_in_model(name): value for name, value in values.items()}
+        values = {name: value * unit for (name, unit), value in named.items()}
     try:
         return model_of(values)
     except ValueError as error:
@@ -141,14 +146,13 @@ def _made(
 
 @eqx.filter_jit
 def _varied(model: Structure, names: tuple[str, ...], values: Array) -> Structure:
-    def one(row: Array) -> Structure:
-        return with_parameters(model, names, row)
+    def numbers(row: Array) -> Structure:
+        return eqx.filter(with_parameters(model, names, row), eqx.is_array)
 
-    arrays = jax.vmap(lambda row: eqx.filter(one(row), eqx.is_array))(jnp.asarray(values))
-    return eqx.combine(arrays, model)
+    return eqx.combine(jax.vmap(numbers)(jnp.asarray(values)), model)
 
 
-def _own_name(name: str) -> tuple[str, float]:
+def _in_model(name: str) -> tuple[str, float]:
     """The model's name of a quantity, and what to multiply its values with."""
     if name.endswith(_IN_HERTZ):
         return f"{name.removesuffix(_IN_HERTZ)}.natural_frequency", HERTZ
@@ -160,34 +164,30 @@ def _check_names(study: Study) -> None:
     for name in names:
         if names.count(name) > 1:
             raise ValueError(f"{name} varies twice.")
-    of_model = [name for name in names if name != FORCE]
+    given = {name: _in_model(name)[0] for name in names if name != FORCE}
+    known = (*parameter_names(study.model), FORCE)
     if study.model_of is None:
-        known = parameter_names(study.model)
-        for name in of_model:
-            if _own_name(name)[0] not in known:
-                near = difflib.get_close_matches(name, (*known, FORCE), n=3, cutoff=0.5)
-                near = near or list(known[:3])
+        for name, in_model in given.items():
+            if in_model not in known:
+                near = difflib.get_close_matches(name, known, n=3, cutoff=0.5) or known[:3]
                 raise ValueError(
                     f"the model does not have the parameter {name!r}; similar ones are "
                     f"{', '.join(near)}."
                 )
     if isinstance(study.model_of, BeamModels):
-        beam, further = study.model_of, (*parameter_names(study.model), FORCE)
-        for name in of_model:
-            check_beam_name(beam.stated, _own_name(name)[0], beam.file, further)
-        if {RADIUS, RISE} <= set(of_model):
+        for in_model in given.values():
+            check_beam_name(study.model_of.stated, in_model, study.model_of.file, known)
+        if {RADIUS, RISE} <= set(given):
             raise ValueError(f"{RADIUS} and {RISE} cannot both vary: one follows from the other.")
-    if _of_model(study):
-        own = [_own_name(name)[0] for name in of_model]
-        for name in own:
-            if own.count(name) > 1:
-                raise ValueError(f"{name} varies twice, in rad/s and in Hz.")
+    if _of_model(study) and len(set(given.values())) < len(given):
+        (twice, _), *_ = Counter(given.values()).most_common(1)
+        raise ValueError(f"{twice} varies twice, in rad/s and in Hz.")
     forces = getattr(study.computation, "forces", None)
-    given = forces is not None and forces.values is not None
-    if FORCE in names and (forces is None or given):
-        why = "`forces_n` is given too" if given else f"{study.computation.kind} has no one force"
+    stated = forces is not None and forces.values is not None
+    if FORCE in names and (forces is None or stated):
+        why = "`forces_n` is given too" if stated else f"{study.computation.kind} has no one force"
         raise ValueError(f"{FORCE} cannot vary: {why}.")
-    if forces is not None and not given and FORCE not in names:
+    if forces is not None and not stated and FORCE not in names:
         raise ValueError(f"{study.computation.kind} needs `forces_n`, or {FORCE} to vary.")
 
 
@@ -210,7 +210,7 @@ def _rules(study: Study, name: str) -> tuple[Rule, ...]:
         return (POSITIVE,)
     if isinstance(study.model_of, BeamModels) and name in study.model_of.parameters:
         return beam_rules(study.model_of.stated, name, study.names)
-    return parameter_rules(study.model, _own_name(name)[0]) if _of_model(study) else ()
+    return parameter_rules(study.model, _in_model(name)[0]) if _of_model(study) else ()
 
 
 def _of_model(study: Study) -> bool:
@@ -220,14 +220,14 @@ def _of_model(study: Study) -> bool:
 
 def _check_unit(study: Study, name: str, values: np.ndarray) -> None:
     """Refuse natural frequencies in Hz where rad/s are expected, and the other way round."""
-    own, unit = _own_name(name)
-    if not _of_model(study) or not own.endswith(".natural_frequency"):
+    in_model, unit = _in_model(name)
+    if not _of_model(study) or not in_model.endswith(".natural_frequency"):
         return
-    given = float(np.asarray(parameter_value(study.model, own))) / unit
+    stated = float(np.asarray(parameter_value(study.model, in_model))) / unit
     middle = float(np.median(values))
-    if not 1 / _STRANGE < middle / given < _STRANGE:
+    if not 1 / _STRANGE < middle / stated < _STRANGE:
         wanted = "Hz" if unit != 1.0 else "rad/s"
         raise ValueError(
-            f"{name} is in {wanted}, {given:.6g} in the model, but its values are about "
+            f"{name} is in {wanted}, {stated:.6g} in the model, but its values are about "
             f"{middle:.6g}: are they in the other unit?"
         )

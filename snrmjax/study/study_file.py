@@ -21,15 +21,14 @@ from snrmjax.study.computations.modes import DampedModes, NormalModes
 from snrmjax.study.computations.responses import Curves, Peaks, ResponseRange
 from snrmjax.study.computations.tests import Diagnoses, Identifications, VirtualTests
 from snrmjax.study.sampling import Method, Sampling
-from snrmjax.study.study import FORCE, Study, planned
+from snrmjax.study.study import FORCE, Study
 from snrmjax.study.variations import (
     AbstractVariation,
-    joint_normal,
-    listed,
-    lognormal,
-    normal,
-    ranged,
-    uniform,
+    Discrete,
+    LogNormal,
+    MultivariateNormal,
+    Normal,
+    Uniform,
 )
 
 _METHODS = get_args(Method)
@@ -37,7 +36,7 @@ _RANGE = ("from_hz", "to_hz")
 _ERRORS = ("amplitude", "phase_deg", "force", "level_gain", "level_phase_deg")
 # Keys that each kind of computation needs and may have, beside those of every study.
 _KEYS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
-    "peaks": (_RANGE, ("forces_n", "harmonics", "stability", "grid_points", "isolated")),
+    "peaks": (_RANGE, ("forces_n", "harmonics", "stability", "grid_points")),
     "curves": (_RANGE, ("forces_n", "harmonics", "stability")),
     "nnm": (("to_hz",), ("harmonics",)),
     "damped_nnm": (("to_velocity_m_s",), ("harmonics",)),
@@ -80,7 +79,7 @@ def read_study(path: FilePath) -> Study:
         model_of=beam,
     )
     try:
-        planned(study)
+        study.ensemble()
     except ValueError as error:
         raise ValueError(f"{file}: {error}") from error
     return study
@@ -109,29 +108,29 @@ def _variation(table: TomlTable) -> AbstractVariation:
 
 
 def _single(table: TomlTable) -> AbstractVariation:
-    name = table.text("parameter")
+    name = (table.text("parameter"),)
     ways = [key for key in ("values", "range", "distribution") if key in table.entries]
     if len(ways) != 1:
         found = " and ".join(f"`{key}`" for key in ways) or "none of them"
         raise ValueError(
-            f"{table.place} ({name}) needs one of `values`, `range`, `distribution`, but has "
+            f"{table.place} ({name[0]}) needs one of `values`, `range`, `distribution`, but has "
             f"{found}."
         )
     if ways == ["values"]:
         table.check_keys(("parameter", "values"))
-        return listed(name, np.array(table.numbers("values", each="value")))
+        return Discrete(name, np.array(table.numbers("values", each="value")))
     if ways == ["range"]:
         table.check_keys(("parameter", "range"), ("points",))
         ends = table.numbers("range", each="end")
         if len(ends) != 2:
             raise table.refusal("range", "two numbers", table.entries["range"])
         points = table.whole("points", 2) if "points" in table.entries else None
-        return ranged(name, ends[0], ends[1], points)
+        return Uniform(name, ends[0], ends[1], points)
     if table.choice("distribution", ("uniform", "normal", "lognormal")) == "uniform":
         table.check_keys(("parameter", "distribution", "low", "high"))
-        return uniform(name, table.number("low"), table.number("high"))
+        return Uniform(name, table.number("low"), table.number("high"))
     table.check_keys(("parameter", "distribution", "mean", "std"))
-    make = normal if table.text("distribution") == "normal" else lognormal
+    make = Normal if table.text("distribution") == "normal" else LogNormal
     return make(name, table.number("mean"), table.number("std"))
 
 
@@ -150,7 +149,9 @@ def _joint(table: TomlTable) -> AbstractVariation:
     ]
     if len(each) != len(names) or any(len(row) != len(names) for row in each):
         raise table.refusal("covariance", f"{len(names)} rows of {len(names)} numbers", rows)
-    return joint_normal(names, np.array(table.numbers("mean", each="entry")), np.array(each))
+    return MultivariateNormal(
+        tuple(names), np.array(table.numbers("mean", each="entry")), np.array(each)
+    )
 
 
 def _computation(
@@ -186,8 +187,7 @@ def _computation(
         raise ValueError(f"{top.place} lacks the key `forces_n`, and {FORCE} does not vary.")
     if kind == "curves":
         return Curves(within, OfForces(forces))
-    grid = top.whole("grid_points", 0, 0)
-    return Peaks(within, OfForces(forces), grid, _flag(top, "isolated", False))
+    return Peaks(within, OfForces(forces), top.whole("grid_points", 0, 0))
 
 
 def _forces(top: TomlTable) -> np.ndarray | None:

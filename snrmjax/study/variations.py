@@ -1,4 +1,4 @@
-"""What varies between the members of a study: values, ranges, distributions, joint normals."""
+"""What varies between the members of a study: listed values and distributions."""
 
 import abc
 from collections.abc import Sequence
@@ -15,9 +15,19 @@ from snrmjax.identify.calibrate.backbone_calibration import BackboneCalibration
 from snrmjax.identify.calibrate.calibrated_model import CalibratedModel
 from snrmjax.model.parameters import parameter_values, stated_stds
 from snrmjax.model.structures import Structure
+from snrmjax.numerics.rules import POSITIVE
 
-_FEWEST, _MOST = 2, 10_000_000
+_FEWEST, _MOST = 2, 10_000_000  # values of a range
 _NORMAL_LIMIT = 1e-12  # quantiles nearer to 0 or 1 than this have no place in a sample
+_ROUNDING = 1e-9  # of correlations, which files give with few digits
+
+
+def _named(names: str | Sequence[str]) -> tuple[str, ...]:
+    return (names,) if isinstance(names, str) else tuple(names)
+
+
+def _array(values: ArrayLike) -> np.ndarray:
+    return np.asarray(values, dtype=np.float64)
 
 
 class AbstractVariation(eqx.Module):
@@ -26,186 +36,176 @@ class AbstractVariation(eqx.Module):
     names: eqx.AbstractVar[tuple[str, ...]]
 
     @abc.abstractmethod
-    def quantiles(self, unit: Float[np.ndarray, "member name"]) -> Float[np.ndarray, "member name"]:
-        """Values at points of the unit cube, every one of which is as likely."""
-
-    @abc.abstractmethod
     def at(self, z: Any, xp: ModuleType = jnp) -> Any:
         """Values at independent standard normal numbers, differentiable; the medians at zero.
 
         Arguments: `z` with a last axis of names; `xp` is NumPy or JAX.
         """
 
+    def quantiles(self, unit: Float[np.ndarray, "member name"]) -> Float[np.ndarray, "member name"]:
+        """Values at points of the unit cube, every one of which is as likely."""
+        from scipy.special import ndtri
+
+        return self.at(ndtri(np.clip(unit, _NORMAL_LIMIT, 1 - _NORMAL_LIMIT)), np)
+
     def grid(self) -> Float[np.ndarray, " value"] | None:
         """The values that a grid goes through; None where there are none."""
         return None
 
+    def _check(self, *positive: str) -> None:
+        """Raise `ValueError` for a field that is not finite, and for one that is not positive."""
+        title = ", ".join(self.names)
+        for key, value in vars(self).items():
+            if key != "names" and value is not None and not np.all(np.isfinite(_array(value))):
+                raise ValueError(f"`{key}` of {title} must be finite, but is {value}.")
+        for key in positive:
+            if not POSITIVE.good(getattr(self, key)):
+                given = f"{getattr(self, key):g}"
+                raise ValueError(f"`{key}` of {title} must be {POSITIVE.expected}, but is {given}.")
 
-class AbstractNormal(AbstractVariation):
-    """Quantities that are functions of standard normal numbers."""
 
-    def quantiles(self, unit: Float[np.ndarray, "member name"]) -> Float[np.ndarray, "member name"]:
-        """See `AbstractVariation.quantiles`."""
-        return self.at(standard_normal(unit), np)
+class Discrete(AbstractVariation):
+    """Values one by one; a sample takes each of them equally often.
 
+    Raises `ValueError` for no values and for one that is not finite.
+    """
 
-class ListedValues(AbstractVariation):
-    """Values one by one; a sample takes each of them equally often."""
+    names: tuple[str, ...] = eqx.field(converter=_named)
+    values: Float[np.ndarray, " value"] = eqx.field(converter=lambda each: _array(each).ravel())
 
-    names: tuple[str, ...]
-    values: Float[np.ndarray, " value"]
-
-    def quantiles(self, unit: Float[np.ndarray, "member name"]) -> Float[np.ndarray, "member name"]:
-        """See `AbstractVariation.quantiles`."""
-        n = len(self.values)
-        return self.values[np.minimum((unit * n).astype(int), n - 1)]
+    def __check_init__(self) -> None:
+        """Raises `ValueError`."""
+        if not self.values.size:
+            raise ValueError(f"`values` of {self.names[0]} must have at least one number.")
+        self._check()
 
     def at(self, z: Any, xp: ModuleType = jnp) -> Any:
-        """Raises `ValueError`: what is listed has no derivative."""
+        """Raises `ValueError`: values one by one have no derivative."""
         raise ValueError(f"{self.names[0]} takes listed values: derivatives need a distribution.")
+
+    def quantiles(self, unit: Float[np.ndarray, "member name"]) -> Float[np.ndarray, "member name"]:
+        """Each value on an equal part of the unit interval."""
+        n = len(self.values)
+        return self.values[np.minimum((unit * n).astype(int), n - 1)]
 
     def grid(self) -> Float[np.ndarray, " value"]:
         """The values."""
         return self.values
 
 
-class ValueRange(AbstractVariation):
-    """Equally spaced values between two ends; a sample takes any value between them."""
+class Uniform(AbstractVariation):
+    """Any value between two ends; a grid goes through `points` of them, equally spaced.
 
-    names: tuple[str, ...]
-    low: float
-    high: float
+    Raises `ValueError` for an empty range and for too few points.
+    """
+
+    names: tuple[str, ...] = eqx.field(converter=_named)
+    low: float = eqx.field(converter=float)
+    high: float = eqx.field(converter=float)
     points: int | None = None
 
-    def quantiles(self, unit: Float[np.ndarray, "member name"]) -> Float[np.ndarray, "member name"]:
-        """See `AbstractVariation.quantiles`."""
-        return self.low + (self.high - self.low) * unit
+    def __check_init__(self) -> None:
+        """Raises `ValueError`."""
+        self._check()
+        name, points = self.names[0], self.points
+        if not self.low < self.high:
+            ends = f"{self.low:g} to {self.high:g}"
+            raise ValueError(f"the range of {name} must rise, but goes from {ends}.")
+        if points is not None and not _FEWEST <= points <= _MOST:
+            raise ValueError(f"`points` of {name} must be from {_FEWEST} to {_MOST}, not {points}.")
 
     def at(self, z: Any, xp: ModuleType = jnp) -> Any:
-        """See `AbstractVariation.at`."""
+        """By the normal distribution's function."""
         return self.low + (self.high - self.low) * jax.scipy.stats.norm.cdf(z)
+
+    def quantiles(self, unit: Float[np.ndarray, "member name"]) -> Float[np.ndarray, "member name"]:
+        """Straight from the unit interval."""
+        return self.low + (self.high - self.low) * unit
 
     def grid(self) -> Float[np.ndarray, " value"] | None:
         """The equally spaced values."""
         return None if self.points is None else np.linspace(self.low, self.high, self.points)
 
 
-class Normal(AbstractNormal):
-    """A normal distribution by mean and standard deviation."""
+class Normal(AbstractVariation):
+    """A normal distribution. Raises `ValueError` for a `std` that is not positive."""
 
-    names: tuple[str, ...]
-    mean: float
-    std: float
+    names: tuple[str, ...] = eqx.field(converter=_named)
+    mean: float = eqx.field(converter=float)
+    std: float = eqx.field(converter=float)
+
+    def __check_init__(self) -> None:
+        """Raises `ValueError`."""
+        self._check("std")
 
     def at(self, z: Any, xp: ModuleType = jnp) -> Any:
-        """See `AbstractVariation.at`."""
+        """Linear in the standard normal number."""
         return self.mean + self.std * z
 
 
-class LogNormal(AbstractNormal):
-    """A lognormal distribution by the mean and standard deviation of the quantity itself."""
+class LogNormal(AbstractVariation):
+    """A lognormal distribution by mean and standard deviation of the quantity itself.
 
-    names: tuple[str, ...]
-    mean: float
-    std: float
+    Raises `ValueError` for `mean` or `std` that is not positive.
+    """
+
+    names: tuple[str, ...] = eqx.field(converter=_named)
+    mean: float = eqx.field(converter=float)
+    std: float = eqx.field(converter=float)
+
+    def __check_init__(self) -> None:
+        """Raises `ValueError`."""
+        self._check("mean", "std")
 
     def at(self, z: Any, xp: ModuleType = jnp) -> Any:
-        """See `AbstractVariation.at`."""
+        """The exponential of a normal number."""
         variance = xp.log1p((self.std / self.mean) ** 2)
         return self.mean * xp.exp(xp.sqrt(variance) * z - variance / 2)
 
 
-class JointNormal(AbstractNormal):
-    """Several quantities that are normal together, by mean and covariance."""
-
-    names: tuple[str, ...]
-    mean: Float[np.ndarray, " name"]
-    covariance: Float[np.ndarray, "name name"]
-
-    def at(self, z: Any, xp: ModuleType = jnp) -> Any:
-        """See `AbstractVariation.at`."""
-        scale = _scale(self.covariance, xp)
-        values, vectors = xp.linalg.eigh(self.covariance / xp.outer(scale, scale))
-        root = scale[:, None] * vectors * xp.sqrt(xp.maximum(values, 0.0))
-        return self.mean + z @ root.T
-
-
-def standard_normal(unit: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-    """Quantiles of the standard normal distribution."""
-    from scipy.special import ndtri
-
-    return ndtri(np.clip(unit, _NORMAL_LIMIT, 1 - _NORMAL_LIMIT))
-
-
-def listed(name: str, values: Float[ArrayLike, " value"]) -> ListedValues:
-    """A quantity that takes given values. Raises `ValueError` for none and for one not finite."""
-    each = np.asarray(values, dtype=np.float64).ravel()
-    if not each.size:
-        raise ValueError(f"`values` of {name} must have at least one number, but is empty.")
-    _finite(name, values=each)
-    return ListedValues((name,), each)
-
-
-def ranged(name: str, low: float, high: float, points: int | None = None) -> ValueRange:
-    """A quantity between two ends. Raises `ValueError` for an empty range or too few points."""
-    _finite(name, low=low, high=high)
-    if not low < high:
-        raise ValueError(f"the range of {name} must rise, but goes from {low:g} to {high:g}.")
-    if points is not None and not _FEWEST <= points <= _MOST:
-        raise ValueError(f"`points` of {name} must be from {_FEWEST} to {_MOST}, not {points}.")
-    return ValueRange((name,), float(low), float(high), points)
-
-
-def normal(name: str, mean: float, std: float) -> Normal:
-    """A normally distributed quantity. Raises `ValueError` for a `std` that is not positive."""
-    _finite(name, mean=mean, std=std)
-    _positive(name, std=std)
-    return Normal((name,), float(mean), float(std))
-
-
-def lognormal(name: str, mean: float, std: float) -> LogNormal:
-    """A lognormal quantity. Raises `ValueError` for `mean` or `std` that is not positive."""
-    _finite(name, mean=mean, std=std)
-    _positive(name, mean=mean, std=std)
-    return LogNormal((name,), float(mean), float(std))
-
-
-def uniform(name: str, low: float, high: float) -> ValueRange:
-    """A quantity that is equally likely between two ends."""
-    return ranged(name, low, high)
-
-
-def joint_normal(
-    names: Sequence[str],
-    mean: Float[ArrayLike, " name"],
-    covariance: Float[ArrayLike, "name name"],
-) -> JointNormal:
-    """Quantities that are normal together, such as a fit's posterior.
+class MultivariateNormal(AbstractVariation):
+    """Several quantities that are normal together, such as a fit's posterior.
 
     Raises `ValueError` where sizes disagree, and for a covariance that is not symmetric, has a
     negative variance or is not positive semidefinite.
     """
-    center, cov = np.asarray(mean, np.float64), np.asarray(covariance, np.float64)
-    title, n = ", ".join(names), len(names)
-    if center.shape != (n,) or cov.shape != (n, n):
-        raise ValueError(
-            f"the joint normal of {title} needs {n} means and a covariance of {n} by {n}, but has "
-            f"{center.shape} and {cov.shape}."
-        )
-    _finite(title, mean=center, covariance=cov)
-    if np.any(np.diag(cov) < 0):
-        k = int(np.argmin(np.diag(cov)))
-        raise ValueError(f"the variance of {names[k]} must not be negative, but is {cov[k, k]:g}.")
-    scale = _scale(cov)
-    relative = cov / np.outer(scale, scale)
-    if not np.allclose(relative, relative.T, rtol=0, atol=1e-9):
-        raise ValueError(f"the covariance of {title} must be symmetric, but is not.")
-    if np.linalg.eigvalsh(relative)[0] < -1e-9 * n:
-        raise ValueError(
-            f"the covariance of {title} must be positive semidefinite, but the smallest eigenvalue "
-            f"of its correlations is {np.linalg.eigvalsh(relative)[0]:.3g}."
-        )
-    return JointNormal(tuple(names), center, (cov + cov.T) / 2)
+
+    names: tuple[str, ...] = eqx.field(converter=_named)
+    mean: Float[np.ndarray, " name"] = eqx.field(converter=_array)
+    covariance: Float[np.ndarray, "name name"] = eqx.field(converter=_array)
+
+    def __check_init__(self) -> None:
+        """Raises `ValueError`."""
+        title, n, variance = ", ".join(self.names), len(self.names), self.covariance
+        if self.mean.shape != (n,) or variance.shape != (n, n):
+            raise ValueError(
+                f"the joint normal of {title} needs {n} means and a covariance of {n} by {n}, but "
+                f"has {self.mean.shape} and {variance.shape}."
+            )
+        self._check()
+        k = int(np.argmin(np.diag(variance)))
+        if variance[k, k] < 0:
+            said = f"{variance[k, k]:g}"
+            raise ValueError(
+                f"the variance of {self.names[k]} must not be negative, but is {said}."
+            )
+        scale = _scale(variance)
+        correlation = variance / np.outer(scale, scale)
+        if not np.allclose(correlation, correlation.T, rtol=0, atol=_ROUNDING):
+            raise ValueError(f"the covariance of {title} must be symmetric, but is not.")
+        smallest = np.linalg.eigvalsh(correlation)[0]
+        if smallest < -_ROUNDING * n:
+            raise ValueError(
+                f"the covariance of {title} must be positive semidefinite, but the smallest "
+                f"eigenvalue of its correlations is {smallest:.3g}."
+            )
+
+    def at(self, z: Any, xp: ModuleType = jnp) -> Any:
+        """By the symmetric root of the correlations."""
+        scale = _scale(self.covariance, xp)
+        values, vectors = xp.linalg.eigh(self.covariance / xp.outer(scale, scale))
+        root = scale[:, None] * vectors * xp.sqrt(xp.maximum(values, 0.0))
+        return self.mean + z @ root.T
 
 
 def stated_variations(model: Structure) -> tuple[Normal, ...]:
@@ -213,13 +213,13 @@ def stated_variations(model: Structure) -> tuple[Normal, ...]:
 
     Raises `ValueError` where none does.
     """
-    own, stds = parameter_values(model), stated_stds(model)
+    values, stds = parameter_values(model), stated_stds(model)
     if not stds:
         raise ValueError("the model states no standard deviation of its parameters.")
-    return tuple(normal(name, own[name], std) for name, std in stds.items())
+    return tuple(Normal((name,), values[name], std) for name, std in stds.items())
 
 
-def posterior_variation(calibrated: CalibratedModel | BackboneCalibration) -> JointNormal:
+def posterior_variation(calibrated: CalibratedModel | BackboneCalibration) -> MultivariateNormal:
     """The fitted parameters of a calibration with their covariance, normally distributed.
 
     Raises `ValueError` for a calibration that did not converge.
@@ -228,22 +228,10 @@ def posterior_variation(calibrated: CalibratedModel | BackboneCalibration) -> Jo
         raise ValueError(
             f"the calibration did not converge ({calibrated.status}): its covariance says nothing."
         )
-    return joint_normal(calibrated.names, calibrated.values, calibrated.covariance)
+    return MultivariateNormal(calibrated.names, calibrated.values, calibrated.covariance)
 
 
 def _scale(covariance: Any, xp: ModuleType = np) -> Any:
     """Standard deviations, one for a quantity that does not vary."""
     std = xp.sqrt(xp.diag(covariance))
     return xp.where(std > 0, std, 1.0)
-
-
-def _finite(name: str, **numbers: ArrayLike) -> None:
-    for key, value in numbers.items():
-        if not np.all(np.isfinite(np.asarray(value, dtype=np.float64))):
-            raise ValueError(f"`{key}` of {name} must be finite, but is {value}.")
-
-
-def _positive(name: str, **numbers: float) -> None:
-    for key, value in numbers.items():
-        if not value > 0:
-            raise ValueError(f"`{key}` of {name} must be positive, but is {value:g}.")

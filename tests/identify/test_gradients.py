@@ -8,14 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from truths.derivatives import check_derivatives, numbers
+from truths.shape_preserving import ShapePreservingCurve
 
 import snrmjax as sj
 from snrmjax.identify.calibrate.inverse_force import inverse_force
-from snrmjax.identify.curves.families import FAMILIES
 from snrmjax.identify.curves.splines import Spline
 from snrmjax.identify.pointwise.backbone import Backbone
 from snrmjax.identify.pointwise.inversion import PointStatus
-from snrmjax.methods.steady.mode_synthesis import ShapePreservingCurve
 
 FREQUENCY = np.array([490.0, 497.0, 500.0, 506.0, 512.0, 495.0])
 FORCE = np.array([1.0, 1.0, 2.0, 2.0, 1.5, 0.7])
@@ -204,11 +203,10 @@ class TestInversion:
 
         check_derivatives(of, 4 * N)
 
-    @pytest.mark.parametrize("broken", [None, 0.0, np.nan])
+    @pytest.mark.parametrize("broken", [0.0, pytest.param(np.nan, marks=pytest.mark.long)])
     def test_closed_form(self, broken):
         own = VELOCITY[:, 0] - RESIDUAL
-        if broken is not None:
-            own[2] = broken
+        own[2] = broken
 
         def of(relative):
             size, phase, frequency = relative.reshape(3, N)
@@ -217,13 +215,12 @@ class TestInversion:
                 *sj.identify.closed_form(CONSTANT, FREQUENCY * (1 + 1e-2 * frequency), velocity)
             )
 
-        check_derivatives(of, 3 * N, failed=[] if broken is None else [2, N + 2, 2 * N + 2])
+        check_derivatives(of, 3 * N, failed=[2, N + 2, 2 * N + 2])
 
-    @pytest.mark.parametrize("broken", [None, 0.0, np.nan])
+    @pytest.mark.parametrize("broken", [0.0, pytest.param(np.nan, marks=pytest.mark.long)])
     def test_phasor(self, broken):
         velocity = VELOCITY[:, 0].copy()
-        if broken is not None:
-            velocity[2] = broken
+        velocity[2] = broken
 
         def of(relative):
             size, phase, force = relative[:-1].reshape(3, N)
@@ -235,7 +232,7 @@ class TestInversion:
             )
             return numbers(*jax.tree.leaves(points)[:4])
 
-        check_derivatives(of, 3 * N + 1, failed=[] if broken is None else [2, N + 2, 2 * N + 2])
+        check_derivatives(of, 3 * N + 1, failed=[2, N + 2, 2 * N + 2])
 
     def test_amplitude_and_phase_with_both_roots_and_without_any(self):
         """A batch of members with one root, with two, with none, and with nothing measured."""
@@ -301,23 +298,6 @@ def test_backbone_curves(curve, argument):
         return numbers(*(of(at) for of in (*curves, backbone.modal_damping)))
 
     check_derivatives(of, 16)
-
-
-@pytest.mark.parametrize("kind", FAMILIES)
-def test_curves_of_a_joint_fit(kind):
-    family = FAMILIES[kind]
-    amplitude = np.linspace(0.1, 1.0, 12)
-    weight = np.ones(12)
-    order = family.orders[-1]
-    curve = family.starts(order, "velocity", amplitude, 10 + amplitude**2, weight)[0]
-    at = np.array([0.07, 0.33, 0.55, 0.93])
-    n = curve.parameters.shape[0]
-
-    def of(relative):
-        moved = eqx.tree_at(lambda c: c.parameters, curve, curve.parameters + relative[:n])
-        return moved(at * (1 + relative[n:]))
-
-    check_derivatives(of, n + len(at))
 
 
 @pytest.mark.long

@@ -339,7 +339,7 @@ BAD = {
     ),
     "mode of interest 0": (
         swapped("mode_of_interest = 1", "mode_of_interest = 0"),
-        ["`mode_of_interest`", "from 1", "(2)", "model.toml", "0"],
+        ["`mode_of_interest`", "from 1", "model.toml", "0"],
     ),
     "mode of interest 3": (
         swapped("mode_of_interest = 1", "mode_of_interest = 3"),

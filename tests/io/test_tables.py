@@ -149,8 +149,8 @@ def test_accepts_with_a_note(tmp_path, content, note):
     reading = read(tmp_path, content)
     plain = read(tmp_path, TABLE)
     np.testing.assert_array_equal(reading.velocity, plain.velocity)
-    assert any(re.search(note, text) for text in reading.notes)
-    assert all("\n" not in text and text.endswith(".") for text in reading.notes)
+    assert any(re.search(note, text) for text in map(str, reading.notes))
+    assert all("\n" not in text and text.endswith(".") for text in map(str, reading.notes))
 
 
 def test_a_model_gives_the_sensors_and_is_all_that_an_identification_needs(tmp_path):
@@ -202,8 +202,8 @@ def test_an_amplitude_alone_has_no_phase(tmp_path):
     states = reading
     np.testing.assert_array_equal(states.velocity[:, 0], [0.2, 0.3])
     assert np.all(states.phase_unknown)
-    assert any("amplitude of the velocity alone" in note for note in reading.notes)
-    assert any("`phase_std_deg`" in note for note in reading.notes)
+    assert any("amplitude of the velocity alone" in str(note) for note in reading.notes)
+    assert any("`phase_std_deg`" in str(note) for note in reading.notes)
     # What is written is read as the same.
     write_steady_states(tmp_path / "again.csv", states)
     assert np.all(read_steady_states(tmp_path / "again.csv").phase_unknown)
@@ -269,6 +269,69 @@ def swapped(old, new, table=TABLE):
     return table.replace(old, new, 1)
 
 
+# A column's name that is not of the format, and the column that it must have meant.
+MISNAMED = {
+    "frequency_hz": ["frequency_rad_s", "frequency_khz", "frequency", "Frequency [Hz]", "freq_hz"],
+    "level": ["Level", "lvl"],
+    "force_n": ["force_mn", "force", "load"],
+    "velocity_re_m_s": ["velocity_re_mm_s", "velocity_re"],
+    "velocity_im_m_s": ["velocity_im", "velocity_im_rms"],
+}
+FURTHER_MISNAMED = {
+    "frequency_rad_s": "frequency_hz",
+    "velocity_std_percent": "velocity_std_m_s",
+    "phase_std_rad": "phase_std_deg",
+    "force_std_mn": "force_std_n",
+    "harmonic_std": "harmonic_std_m_s",
+    "velocity_h0_re_m_s": "velocity_h0_m_s",
+    "velocity_h2_m_s": "velocity_h2_re_m_s",
+    "velocity_h2_im": "velocity_h2_im_m_s",
+    "velocity_h2_re_mm_s": "velocity_h2_re_m_s",
+    "velocity_h1_re_m_s": "velocity_re_m_s",
+    "velocity_h02_re_m_s": "velocity_h2_re_m_s",
+    "velocity_H2_re_m_s": "velocity_h2_re_m_s",
+}
+
+
+@pytest.mark.parametrize(
+    ("content", "name", "expected"),
+    [
+        *(
+            (TABLE.replace(column, name, 1), name, column)
+            for column, names in MISNAMED.items()
+            for name in names
+        ),
+        *((with_column(name, [1, 1, 1]), name, one) for name, one in FURTHER_MISNAMED.items()),
+    ],
+)
+def test_refuses_a_misnamed_column_by_the_one_that_is_meant(
+    tmp_path, content, name, expected, check_message
+):
+    with pytest.raises(ValueError, match=re.escape(f"`{expected}`")) as error:
+        read(tmp_path, content)
+    known_by_likeness = name not in ("load",)
+    check_message(error, ["beam.csv", *([f"`{name}`"] * known_by_likeness)])
+
+
+FINITE, POINT = "a finite number", "a number with a point as decimal sign and no thousands"
+NO_FREQUENCIES = {
+    **dict.fromkeys(['"80,5"', '"1,080.5"', "1 080.5", "1_000", "1.080.5"], POINT),
+    **dict.fromkeys(["nan", "NaN", "inf", "-Infinity", "1e400"], FINITE),
+    **dict.fromkeys(["abc", "80.5 Hz", "", "٨٠", "８０", "−3", "0x50", "8+1j", "True"], "a number"),
+    **dict.fromkeys(["-3.2", "0", "1e-400"], "positive"),
+    "1.7e308": "below 1e300 Hz",  # in rad/s it is no number
+}
+
+
+@pytest.mark.parametrize("field", NO_FREQUENCIES)
+def test_refuses_what_is_no_frequency_by_its_row(tmp_path, field, check_message):
+    content = TABLE.replace("80.5", field, 1)
+    with pytest.raises(ValueError, match="`frequency_hz` must be") as error:
+        read(tmp_path, content)
+    shown = field.strip('"') or "an empty field"
+    check_message(error, [f"must be {NO_FREQUENCIES[field]}", "row 4 of beam.csv has", shown])
+
+
 BAD = {
     "empty file": ("", ["beam.csv", "empty"]),
     "only blank lines": ("\n \n", ["beam.csv", "empty"]),
@@ -276,68 +339,19 @@ BAD = {
     "no header": (TABLE.split("\n", 1)[1], ["row 1", "header", "beam.csv", "'1'"]),
     "semicolons": (TABLE.replace(",", ";"), ["beam.csv", "commas", "semicolons"]),
     "tabs": (TABLE.replace(",", "\t"), ["beam.csv", "commas", "tabs"]),
-    "level missing": (swapped("level", "lvl"), ["beam.csv", "`level`", "is it `lvl`"]),
     "frequency missing": (swapped("frequency_hz", "x"), ["beam.csv", "lacks", "`frequency_hz`"]),
-    "frequency in rad/s": (
-        swapped("frequency_hz", "frequency_rad_s"),
-        ["`frequency_rad_s`", "beam.csv", "`frequency_hz`"],
-    ),
-    "frequency in kHz": (swapped("frequency_hz", "frequency_khz"), ["expected `frequency_hz`"]),
-    "frequency without unit": (swapped("frequency_hz", "frequency"), ["expected `frequency_hz`"]),
-    "frequency in brackets": (
-        swapped("frequency_hz", "Frequency [Hz]"),
-        ["`Frequency [Hz]`", "expected `frequency_hz`"],
-    ),
-    "abbreviated": (swapped("frequency_hz", "freq_hz"), ["`frequency_hz`", "`freq_hz`"]),
-    "upper case": (swapped("level", "Level"), ["`Level`", "expected `level`"]),
-    "force in mN": (swapped("force_n", "force_mn"), ["`force_mn`", "expected `force_n`"]),
-    "force without unit": (swapped("force_n", "force"), ["`force`", "expected `force_n`"]),
     "drive in mV": (swapped("force_n", "drive_mv"), ["`drive_mv`", "expected `drive_v`"]),
-    "no force": (swapped("force_n", "load"), ["beam.csv", "`force_n`", "`drive_v`"]),
     "force and drive": (
         with_column("drive_v", [1, 2, 3]),
         ["beam.csv", "either", "`force_n`", "`drive_v`"],
-    ),
-    "velocity in mm/s": (
-        swapped("velocity_re_m_s", "velocity_re_mm_s"),
-        ["`velocity_re_mm_s`", "expected `velocity_re_m_s`"],
-    ),
-    "velocity without unit": (
-        swapped("velocity_im_m_s", "velocity_im"),
-        ["`velocity_im`", "expected `velocity_im_m_s`"],
     ),
     "amplitude and real part": (
         "level,frequency_hz,force_n,velocity_m_s,velocity_re_m_s\n1,79,0.1,0.1,0.1\n",
         ["lacks", "`velocity_im_m_s`", "is it `velocity_m_s`"],
     ),
-    "amplitude and imaginary part": (
-        "level,frequency_hz,force_n,velocity_m_s,velocity_im_m_s\n1,79,0.1,0.1,0.1\n",
-        ["lacks", "`velocity_re_m_s`", "is it `velocity_m_s`"],
-    ),
     "zero amplitude": (
         "level,frequency_hz,force_n,velocity_m_s\n1,79,0.1,0.1\n1,80,0.1,0\n",
         ["`velocity_m_s`", "positive", "row 3"],
-    ),
-    "negative amplitude": (
-        "level,frequency_hz,force_n,velocity_m_s\n1,79,0.1,-0.1\n",
-        ["`velocity_m_s`", "positive", "row 2"],
-    ),
-    "std in percent": (
-        with_column("velocity_std_percent", [1, 1, 1]),
-        ["`velocity_std_percent`", "expected `velocity_std_m_s`"],
-    ),
-    "phase std in rad": (
-        with_column("phase_std_rad", [1, 1, 1]),
-        ["`phase_std_rad`", "expected `phase_std_deg`"],
-    ),
-    "force std in mN": (with_column("force_std_mn", [1, 1, 1]), ["expected `force_std_n`"]),
-    "harmonic std without unit": (
-        with_column("harmonic_std", [1, 1, 1]),
-        ["expected `harmonic_std_m_s`"],
-    ),
-    "right and wrong unit": (
-        with_column("frequency_rad_s", [1, 1, 1]),
-        ["`frequency_rad_s`", "expected `frequency_hz`"],
     ),
     "doubled column": (
         with_column("level", [1, 1, 1]),
@@ -359,85 +373,20 @@ BAD = {
         with_column("velocity_h2_im_m_s", [4, 5, ""], with_column("velocity_h2_re_m_s", [1, 2, 3])),
         ["`velocity_h2_im_m_s`", "`velocity_h2_re_m_s`", "row 4", "empty"],
     ),
-    "mean with a real part": (
-        with_column("velocity_h0_re_m_s", [1, 1, 1]),
-        ["`velocity_h0_re_m_s`", "expected `velocity_h0_m_s`"],
-    ),
-    "harmonic without part": (
-        with_column("velocity_h2_m_s", [1, 1, 1]),
-        ["`velocity_h2_m_s`", "expected `velocity_h2_re_m_s`"],
-    ),
-    "harmonic without unit": (
-        with_column("velocity_h2_im", [1, 1, 1]),
-        ["`velocity_h2_im`", "expected `velocity_h2_im_m_s`"],
-    ),
-    "harmonic in mm/s": (
-        with_column("velocity_h2_re_mm_s", [1, 1, 1]),
-        ["`velocity_h2_re_mm_s`", "expected `velocity_h2_re_m_s`"],
-    ),
-    "harmonic 1": (
-        with_column("velocity_h1_re_m_s", [1, 1, 1]),
-        ["`velocity_h1_re_m_s`", "expected `velocity_re_m_s`"],
-    ),
-    "harmonic with a leading zero": (
-        with_column("velocity_h02_re_m_s", [1, 1, 1]),
-        ["`velocity_h02_re_m_s`", "expected `velocity_h2_re_m_s`"],
-    ),
-    "capital harmonic": (
-        with_column("velocity_H2_re_m_s", [1, 1, 1]),
-        ["`velocity_H2_re_m_s`", "expected `velocity_h2_re_m_s`"],
-    ),
     "field missing": (swapped(",-0.003", ""), ["row 3", "beam.csv", "5 fields", "has 4"]),
     "field too many": (swapped("-0.003", "-0.003,1"), ["row 3", "beam.csv", "5 fields", "has 6"]),
     "decimal commas": (swapped("80.5", "80,5"), ["row 4", "beam.csv", "has 6", "point"]),
-    "quoted decimal comma": (
-        swapped("80.5", '"80,5"'),
-        ["`frequency_hz`", "row 4", "'80,5'", "point as decimal sign"],
-    ),
-    "thousands separators": (
-        swapped("80.5", '"1,080.5"'),
-        ["`frequency_hz`", "row 4", "'1,080.5'", "no thousands separators"],
-    ),
-    "thousands spaces": (
-        swapped("80.5", "1 080.5"),
-        ["`frequency_hz`", "row 4", "'1 080.5'", "no thousands separators"],
-    ),
-    "underscore": (
-        swapped("80.5", "1_000"),
-        ["`frequency_hz`", "row 4", "'1_000'", "no thousands separators"],
-    ),
-    "two points": (swapped("80.5", "1.080.5"), ["`frequency_hz`", "row 4", "'1.080.5'"]),
     "blank line inside": (swapped("\n1,80.0", "\n\n1,80.0"), ["row 3", "beam.csv", "blank"]),
     "blank lines inside": (swapped("\n1,80.0", "\n\n \n1,80.0"), ["row 3", "beam.csv", "blank"]),
     "blank line first": ("\n" + TABLE, ["row 1", "beam.csv", "blank"]),
     "line of commas": (TABLE + ",,,,\n", ["`level`", "row 5", "beam.csv", "an empty field"]),
-    "text as a frequency": (swapped("80.5", "abc"), ["`frequency_hz`", "row 4", "'abc'"]),
     "units row": (
         swapped("\n1,79", "\n-,Hz,N,m/s,m/s\n1,79"),
         ["`level`", "a number", "row 2", "'-'"],
     ),
-    "number with unit": (swapped("80.5", "80.5 Hz"), ["`frequency_hz`", "row 4", "'80.5 Hz'"]),
-    "empty field": (swapped("80.5", ""), ["`frequency_hz`", "row 4", "an empty field"]),
-    "nan frequency": (swapped("80.5", "nan"), ["`frequency_hz`", "finite", "row 4", "'nan'"]),
-    "NaN velocity": (swapped("0.004", "NaN"), ["`velocity_im_m_s`", "row 4", "'NaN'"]),
     "infinite force": (swapped("0.2", "inf"), ["`force_n`", "row 4", "'inf'"]),
-    "minus infinity": (swapped("0.004", "-Infinity"), ["`velocity_im_m_s`", "'-Infinity'"]),
-    "too large": (swapped("0.004", "1e400"), ["`velocity_im_m_s`", "finite", "row 4", "1e400"]),
-    "too large in rad/s": (swapped("80.5", "1.7e308"), ["`frequency_hz`", "row 4", "1.7e308"]),
-    "Arabic digits": (swapped("80.5", "٨٠"), ["`frequency_hz`", "row 4", "'٨٠'"]),
-    "full-width digits": (swapped("80.5", "８０"), ["`frequency_hz`", "row 4"]),
-    "unicode minus": (swapped("-0.003", "−0.003"), ["`velocity_im_m_s`", "row 3", "'−0.003'"]),
-    "hexadecimal": (swapped("80.5", "0x50"), ["`frequency_hz`", "row 4", "'0x50'"]),
-    "complex": (swapped("0.03", "0.03+1j"), ["`velocity_re_m_s`", "row 4", "'0.03+1j'"]),
-    "truth value": (swapped("80.5", "True"), ["`frequency_hz`", "row 4", "'True'"]),
-    "negative frequency": (
-        swapped("80.5", "-3.2"),
-        ["`frequency_hz` must be positive, but row 4 of beam.csv has -3.2."],
-    ),
-    "zero frequency": (swapped("80.5", "0"), ["`frequency_hz`", "positive", "row 4", "0"]),
-    "vanishing frequency": (swapped("80.5", "1e-400"), ["`frequency_hz`", "positive", "1e-400"]),
     "negative force": (swapped("0.2", "-0.2"), ["`force_n`", "positive", "row 4", "-0.2"]),
-    "zero force": (swapped("0.2", "0.0"), ["`force_n`", "positive", "row 4", "0.0"]),
+    "NaN velocity": (swapped("0.004", "NaN"), ["`velocity_im_m_s`", "row 4", "'NaN'"]),
     "zero drive": (
         swapped("0.2", "0.0", swapped("force_n", "drive_v")),
         ["`drive_v`", "positive", "row 4"],
@@ -452,15 +401,12 @@ BAD = {
         with_column("harmonic_std_m_s", [1, -1, 1]),
         ["`harmonic_std_m_s`", "row 3"],
     ),
-    "text as std": (with_column("velocity_std_m_s", [1, "?", 1]), ["`velocity_std_m_s`", "'?'"]),
     "nan as std": (with_column("velocity_std_m_s", [1, "nan", 1]), ["`velocity_std_m_s`", "'nan'"]),
     "order above 1": (
         with_column("order", [0, 1.5, 1]),
         ["`order`", "from 0 to 1", "row 3", "1.5"],
     ),
-    "order below 0": (with_column("order", [-0.1, 0, 1]), ["`order`", "row 2", "-0.1"]),
     "broken level": (swapped("\n2,", "\n2.5,"), ["`level`", "whole number", "row 4", "2.5"]),
-    "level in words": (swapped("\n2,", "\nhigh,"), ["`level`", "row 4", "'high'"]),
     "endless level": (swapped("\n2,", "\n1e400,"), ["`level`", "row 4", "1e400"]),
     "enormous level": (swapped("\n2,", "\n99999999999999999999,"), ["`level`", "15 digits"]),
     "zero velocities": (
@@ -476,7 +422,6 @@ BAD = {
     "NUL bytes": (TABLE.encode() + b"\0", ["beam.csv", "not a UTF-8 text file"]),
     "UTF-16": (TABLE.encode("utf-16"), ["beam.csv", "not a UTF-8 text file"]),
     "Latin-1": (with_column("comment", ["ü", 1, 1]).encode("latin-1"), ["beam.csv", "not a UTF-8"]),
-    "picture": (b"\x89PNG\r\n\x1a\n\xff\xfe", ["beam.csv", "not a UTF-8"]),
     "empty sensor": (swapped(",b\n", ",\n", SENSORS), ["`sensor`", "row 3", "an empty field"]),
     "two force stds": (
         with_column("force_std_n", [0.01, 0.02, 1, 1, 1, 1], SENSORS),

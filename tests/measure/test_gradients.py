@@ -46,7 +46,7 @@ def of_indicators(relative, data):
     changed = dataclasses.replace(data, velocity=velocity)
     return numbers(
         sj.measure.appropriation_of(changed),
-        sj.measure.mode_indicator(velocity),
+        sj.measure.nnm_appropriation(velocity[..., None], (1,)),
         sj.measure.nnm_appropriation(changed.harmonics * (1 + 1j * relative[6]), (2, 3)),
     )
 
@@ -84,25 +84,12 @@ def of_fits(relative, records):
     return numbers(fit.amplitude, *stated, fit.noise_std, fit.residual_rms)
 
 
-def of_refined_fits(relative, records):
-    given = (TIME, moved_records(relative, records), OMEGA * (1 + 1e-3 * relative[4]), (1, 2, 3))
-    fit = sj.measure.fit_harmonics(*given, refine_frequency=True)
-    return numbers(fit.amplitude, fit.frequency, fit.frequency_std)
-
-
-@pytest.mark.parametrize(
-    ("function", "broken"),
-    [
-        *((of_fits, broken) for broken in (False, True)),
-        (of_refined_fits, True),
-        pytest.param(of_refined_fits, False, marks=pytest.mark.long),
-    ],
-)
-def test_harmonic_fits(function, broken):
+@pytest.mark.parametrize("broken", [False, True])
+def test_harmonic_fits(broken):
     records = RECORDS.copy()
     if broken:
         records[1, 5] = np.nan
-    check_derivatives(function, 5, records, failed=[1] if broken else [])
+    check_derivatives(of_fits, 5, records, failed=[1] if broken else [])
 
 
 def of_calibrations(relative, drive, data):

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 import snrmjax  # noqa: F401
-from snrmjax.measure.harmonic_fit import HarmonicFitStatus, fit_harmonics
-from snrmjax.measure.records import fit_records, steady_state_from_records
+from snrmjax.measure.records import steady_state_from_records
 
 OMEGA = 2 * np.pi * 80.0
 PERIOD = 2 * np.pi / OMEGA
@@ -40,27 +39,21 @@ class TestRecords:
             self.time,
             force,
             velocity,
-            1.003 * OMEGA,
+            OMEGA,
             level=4,
             harmonic_order=(0, 1, 2, 3),
             sensors=("a", "b"),
-            refine_frequency=True,
         )
-        # The solver's tolerance on the frequency, 1e-9 of 4π/duration.
-        np.testing.assert_allclose(data.frequency, [OMEGA], rtol=1e-9)
-        np.testing.assert_allclose(data.force, [2.0], rtol=1e-9)
-        np.testing.assert_allclose(data.velocity[0], self.relative(VELOCITY)[:, 1], atol=1e-9)
+        assert data.frequency.tolist() == [OMEGA]
+        np.testing.assert_allclose(data.force, [2.0], rtol=1e-12)  # rounding, as below
+        np.testing.assert_allclose(data.velocity[0], self.relative(VELOCITY)[:, 1], atol=1e-12)
         assert data.harmonic_order == (0, 2, 3)
         np.testing.assert_allclose(
-            data.harmonics[0], self.relative(VELOCITY)[:, [0, 2, 3]], atol=1e-9
+            data.harmonics[0], self.relative(VELOCITY)[:, [0, 2, 3]], atol=1e-12
         )
         assert data.level.tolist() == [4]
         assert data.sensors == ("a", "b")
         assert data.measured.all()
-        fit = fit_records(self.time, force, velocity, OMEGA, ORDERS)
-        np.testing.assert_allclose(fit.force_harmonics, self.relative(FORCE), atol=1e-12)
-        np.testing.assert_allclose(fit.velocity_harmonics, self.relative(VELOCITY), atol=1e-12)
-        np.testing.assert_allclose(fit.force_distortion, np.hypot(0.01, 0.02), rtol=1e-11)
 
     def test_fundamental_only(self):
         data = steady_state_from_records(
@@ -98,42 +91,15 @@ class TestRecords:
             # 400 scores scatter by 3.5 %; the largest of the 15 spreads here stays below 10 %.
             np.testing.assert_allclose(z_spread(score), 1.0, rtol=0.1)
 
-    def test_shared_frequency_covers(self, z_spread):
-        force, velocity = noisy_records(self.time, np.random.default_rng(16), 200)
-        fits = [
-            fit_records(self.time, f, v, 1.002 * OMEGA, ORDERS, refine_frequency=True).force
-            for f, v in zip(force, velocity, strict=True)
-        ]
-        scores = [float((fit.frequency - OMEGA) / fit.frequency_std) for fit in fits]
-        # 200 scores scatter by 5 %.
-        np.testing.assert_allclose(z_spread(scores), 1.0, rtol=0.15)
-
-    def test_shared_frequency_is_better_than_its_parts(self):
-        force, velocity = noisy_records(self.time, np.random.default_rng(13), 1)
-        fit = fit_records(self.time, force[0], velocity[0], OMEGA, ORDERS, refine_frequency=True)
-        alone = [
-            fit_harmonics(self.time, record, OMEGA, ORDERS, refine_frequency=True)
-            for record in (force[0], *velocity[0])
-        ]
-        weight = np.array([float(one.frequency_std) ** -2 for one in alone])
-        expected = np.sum(weight * [float(one.frequency) for one in alone]) / np.sum(weight)
-        # The solver's tolerance, 1e-9 of 4π/duration, is reached along different roundings.
-        np.testing.assert_allclose(fit.force.frequency, expected, rtol=1e-9)
-        np.testing.assert_allclose(fit.velocity.frequency, [expected] * 2, rtol=1e-9)
-        np.testing.assert_allclose(fit.force.frequency_std, np.sum(weight) ** -0.5, rtol=1e-6)
-
     def test_a_dead_sensor_is_not_measured(self):
         force, velocity = noisy_records(self.time, np.random.default_rng(14), 1)
         velocity[0, 0, 3] = np.nan
-        for refine in (False, True):
-            data = steady_state_from_records(
-                self.time, force[0], velocity[0], OMEGA, refine_frequency=refine
-            )
-            assert data.measured.tolist() == [[False, True]]
-            assert data.velocity[0, 0] == 0
-            assert np.isnan(data.velocity_std[0, 0])
-            assert np.isnan(data.harmonics[0, 0]).all()
-            assert np.isfinite(data.velocity_std[0, 1])
+        data = steady_state_from_records(self.time, force[0], velocity[0], OMEGA)
+        assert data.measured.tolist() == [[False, True]]
+        assert data.velocity[0, 0] == 0
+        assert np.isnan(data.velocity_std[0, 0])
+        assert np.isnan(data.harmonics[0, 0]).all()
+        assert np.isfinite(data.velocity_std[0, 1])
 
     def test_what_cannot_be_fitted_is_refused(self):
         force, velocity = noisy_records(self.time, np.random.default_rng(15), 1)
@@ -144,11 +110,6 @@ class TestRecords:
             steady_state_from_records(self.time, force, np.nan * velocity, OMEGA)
         with pytest.raises(ValueError, match=r"record longer"):
             steady_state_from_records(1e-3 * self.time, force, velocity, OMEGA)
-        noise = np.random.default_rng(17).standard_normal((3, N_SAMPLES))
-        fit = fit_records(self.time, noise[0], noise[1:], OMEGA, ORDERS, refine_frequency=True)
-        assert fit.force.status == HarmonicFitStatus.FREQUENCY_NOT_FOUND
-        assert np.isnan(fit.force.frequency_std)
-        assert np.isnan(fit.velocity.amplitude).all()
 
     @pytest.mark.parametrize(
         ("change", "message"),
@@ -167,4 +128,4 @@ class TestRecords:
             "harmonic_order": ORDERS,
         }
         with pytest.raises(ValueError, match=message):
-            fit_records(**(given | change))
+            steady_state_from_records(**(given | change))

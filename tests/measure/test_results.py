@@ -12,10 +12,6 @@ TIME = np.linspace(0.0, 0.21, 64)
 def test_a_harmonic_fit():
     records = np.stack([2.0 * np.cos(OMEGA * TIME), np.full(64, np.nan)])
     fit = sj.measure.fit_harmonics(TIME, records, OMEGA, (1, 2))
-    lines = repr(fit).splitlines()
-    assert lines[0] == "HarmonicFit: 2 records, harmonics 0, 1, 2"
-    assert lines[1].strip() == "1 fitted at 20 to 20 Hz"
-    assert "1: a sample is not finite" in lines[-1]
     data = fit.to_xarray()
     assert data.frequency_hz.attrs["units"] == "Hz"
     np.testing.assert_allclose(data.amplitude_re.sel(record=0, harmonic=1), 2.0)
@@ -25,7 +21,7 @@ def test_a_harmonic_fit():
 
 def test_a_force_calibration():
     line = sj.measure.calibrate_force([0.01, 0.02, 0.03], [1.0, 2.1, 2.9])
-    assert repr(line).splitlines()[1].strip().startswith("gain 95 ± ")
+    np.testing.assert_allclose(line.to_xarray().gain, 95.0)
     assert line.to_xarray().residual_std_n.attrs["units"] == "N"
     assert isinstance(line.plot(), Figure)
 
@@ -39,9 +35,6 @@ def test_an_equivalent_force():
         np.repeat([1, 2], 8), frequency, np.full(16, np.nan), velocity, drive=0.1 * force
     )
     found = sj.measure.equivalent_force(data, modes)
-    lines = repr(found).splitlines()
-    assert lines[0] == "EquivalentForce: 2 of 2 levels found"
-    assert lines[1].strip().startswith("level 1: 0.1 V, 1 ± ")
     table = found.to_pandas()
     np.testing.assert_allclose(table.force_n, [1.0, 2.0], rtol=1e-6)
     assert table.status.tolist() == ["successful", "successful"]

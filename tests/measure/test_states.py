@@ -144,8 +144,10 @@ def test_lists_and_arrays_are_alike():
             np.testing.assert_array_equal(as_list, as_array)
     time = np.linspace(0.0, 0.5, 200)
     record = np.cos(OMEGA * time)
-    fit = sj.measure.fit_records(list(time), list(record), [list(record)], OMEGA, [1, 3])
-    np.testing.assert_allclose(fit.force.harmonic(1), 1.0, rtol=1e-9)
+    state = sj.measure.steady_state_from_records(
+        list(time), list(record), [list(record)], OMEGA, harmonic_order=[1, 3]
+    )
+    np.testing.assert_allclose(state.force, 1.0, rtol=1e-9)
     points = sj.identify.invert_phasor([6.0], [500.0], [0.6 + 0.0j], [0.0])
     np.testing.assert_allclose(points.natural_frequency, [500.0])
     np.testing.assert_allclose(sj.identify.closed_form([6.0], [500.0], [0.6 + 0.0j])[1], [0.01])

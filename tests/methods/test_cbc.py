@@ -15,9 +15,9 @@ def laboratory():
     shape = 1 / np.sqrt(MASS)
     modes = sj.model.linear_modes([REST], [RATIO], [[shape]], [shape])
     potential = sj.model.polynomial_potential({"1111": CUBIC * shape**2 / 4}, 1)
-    shaker = sj.methods.Shaker(3.0, 8.0, mass=0.05, damping=1.0, stiffness=500.0)
+    shaker = sj.simulate.Shaker(3.0, 8.0, mass=0.05, damping=1.0, stiffness=500.0)
     beam = sj.model.structure(modes, potential)
-    return sj.methods.Laboratory(beam, shaker, sj.methods.Instruments(), 6000.0)
+    return sj.simulate.Laboratory(beam, shaker, sj.simulate.Instruments(), 6000.0)
 
 
 def stiffness(velocity, omega):
@@ -29,8 +29,8 @@ def stiffness(velocity, omega):
 
 def test_it_holds_the_branch_that_an_open_loop_jumps_over(laboratory):
     omega = 1.03 * REST
-    settings = sj.methods.FeedbackSettings(20.0)
-    curve = sj.methods.s_curve(laboratory, omega, np.linspace(0.1, 1.2, 12), settings)
+    settings = sj.simulate.FeedbackSettings(20.0)
+    curve = sj.simulate.s_curve(laboratory, omega, np.linspace(0.1, 1.2, 12), settings)
     assert (curve.invasive < settings.invasive).all()
     exact = np.abs(stiffness(curve.velocity, omega)) * curve.velocity
     np.testing.assert_allclose(curve.force, exact, rtol=0.02, atol=0.01 * exact.max())
@@ -43,7 +43,7 @@ def test_it_holds_the_branch_that_an_open_loop_jumps_over(laboratory):
 def test_the_backbone_does_not_depend_on_the_gain(laboratory):
     found = [
         sj.methods.control_based_continuation(
-            laboratory, np.array(targets), sj.methods.FeedbackSettings(gain)
+            laboratory, np.array(targets), sj.simulate.FeedbackSettings(gain)
         )
         for gain, targets in ((20.0, [0.3, 0.6]), (40.0, [0.25, 0.5]))
     ]
@@ -58,24 +58,24 @@ def test_the_backbone_does_not_depend_on_the_gain(laboratory):
 
 
 def test_what_is_not_held_is_said(laboratory):
-    impatient = sj.methods.FeedbackSettings(20.0, invasive=1e-9)
+    impatient = sj.simulate.FeedbackSettings(20.0, invasive=1e-9)
     result = sj.methods.control_based_continuation(laboratory, np.array([0.3]), impatient)
     assert list(result.status) == [int(MethodStatus.NOT_LOCKED)]
     with pytest.raises(ValueError, match="`amplitudes` must be positive"):
         sj.methods.control_based_continuation(laboratory, np.array([-0.3]), impatient)
     with pytest.raises(ValueError, match="settings of the feedback must be positive"):
-        sj.methods.s_curve(laboratory, REST, np.array([0.3]), sj.methods.FeedbackSettings(0.0))
+        sj.simulate.s_curve(laboratory, REST, np.array([0.3]), sj.simulate.FeedbackSettings(0.0))
 
 
 def test_a_followed_fundamental_holds_the_same_branch_and_too_fast_a_filter_is_seen(laboratory):
     omega = 1.03 * REST
-    settings = sj.methods.FeedbackSettings(20.0, filter_rate=80.0)
-    curve = sj.methods.s_curve(laboratory, omega, np.linspace(0.1, 1.2, 6), settings)
+    settings = sj.simulate.FeedbackSettings(20.0, filter_rate=80.0)
+    curve = sj.simulate.s_curve(laboratory, omega, np.linspace(0.1, 1.2, 6), settings)
     exact = np.abs(stiffness(curve.velocity, omega)) * curve.velocity
     np.testing.assert_allclose(curve.force, exact, rtol=0.02, atol=0.01 * exact.max())
     assert curve.invasive.max() < 1e-3
     wild = settings._replace(gain=200.0, filter_rate=800.0)
-    lost = sj.methods.s_curve(laboratory, omega, np.array([0.3, 0.6]), wild)
+    lost = sj.simulate.s_curve(laboratory, omega, np.array([0.3, 0.6]), wild)
     assert np.isnan(lost.force).all()
 
 
@@ -85,16 +85,18 @@ def linear():
     modes = sj.model.linear_modes([REST], [RATIO], [[shape]], [shape])
 
     def at(force_noise, velocity_noise, potential=None):
-        instruments = sj.methods.Instruments(force_noise=force_noise, velocity_noise=velocity_noise)
-        shaker = sj.methods.Shaker(0.1, 0.1)
-        return sj.methods.Laboratory(
+        instruments = sj.simulate.Instruments(
+            force_noise=force_noise, velocity_noise=velocity_noise
+        )
+        shaker = sj.simulate.Shaker(0.1, 0.1)
+        return sj.simulate.Laboratory(
             sj.model.structure(modes, potential), shaker, instruments, 2000.0
         )
 
     return at
 
 
-FILTERED = sj.methods.FeedbackSettings(20.0, filter_rate=60.0)
+FILTERED = sj.simulate.FeedbackSettings(20.0, filter_rate=60.0)
 
 
 def test_a_phase_that_is_left_does_not_move_the_frequency(linear):

@@ -58,7 +58,7 @@ def test_all_methods_find_a_linear_oscillator(folder):
     np.testing.assert_allclose([float(row["damping_ratio"]) for row in found], 0.005, rtol=0.03)
     summary = json.loads((folder / "out" / "summary.json").read_text())
     assert set(summary["stopped"]) == {"resonant_decay", "restoring_force", "ssm", "pnlss"}
-    assert "ssm needs a time record (free decay), and the data have none." in done.output
+    assert "ssm: a time record (free decay) is needed, and the data have none." in done.output
     # Without stated noise only the scatter about a line gives a band.
     assert summary["bands"][0].startswith("the bands of response-controlled modal fit hold noise")
     assert summary["bands"][0][1:] in (folder / "out" / "report.html").read_text()

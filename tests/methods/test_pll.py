@@ -20,8 +20,8 @@ def beam():
 
 
 def laboratory(beam, **noise):
-    shaker = sj.methods.Shaker(3.0, 8.0, mass=0.05, damping=1.0, stiffness=500.0)
-    return sj.methods.Laboratory(beam, shaker, sj.methods.Instruments(**noise), 6000.0)
+    shaker = sj.simulate.Shaker(3.0, 8.0, mass=0.05, damping=1.0, stiffness=500.0)
+    return sj.simulate.Laboratory(beam, shaker, sj.simulate.Instruments(**noise), 6000.0)
 
 
 def backbone(velocity):
@@ -46,11 +46,11 @@ def test_it_climbs_the_backbone_on_a_shaker_whose_force_drops(beam):
 def test_gains_do_not_move_the_answer_and_bad_ones_say_so(beam):
     lab = laboratory(beam)
     one = sj.methods.phase_locked_loop(lab, VOLTAGES[1:3])
-    gains = sj.methods.LoopGains(2 * np.pi * 3.0, 2 * np.pi * 0.25)
+    gains = sj.simulate.LoopGains(2 * np.pi * 3.0, 2 * np.pi * 0.25)
     other = sj.methods.phase_locked_loop(lab, VOLTAGES[1:3], gains=gains, settle_cycles=500)
     np.testing.assert_allclose(one.natural_frequency, other.natural_frequency, rtol=1e-5)
     np.testing.assert_allclose(one.damping_ratio, other.damping_ratio, rtol=1e-4)
-    wild = sj.methods.LoopGains(2 * np.pi * 0.2, 2 * np.pi * 40.0)
+    wild = sj.simulate.LoopGains(2 * np.pi * 0.2, 2 * np.pi * 40.0)
     lost = sj.methods.phase_locked_loop(lab, VOLTAGES[1:3], gains=wild)
     assert list(lost.status) == 2 * [int(MethodStatus.NOT_LOCKED)]
     assert "did not hold its target" in repr(lost)
@@ -70,6 +70,8 @@ def test_settings_that_make_no_sense_are_refused(beam):
     with pytest.raises(ValueError, match="`voltages` must be positive"):
         sj.methods.phase_locked_loop(laboratory(beam), np.array([1.0, -1.0]))
     with pytest.raises(ValueError, match="`sampling_rate` times `substeps` must be 20 times"):
-        sj.methods.Laboratory(beam, sj.methods.Shaker(), sj.methods.Instruments(), 100.0)
+        sj.simulate.Laboratory(beam, sj.simulate.Shaker(), sj.simulate.Instruments(), 100.0)
     with pytest.raises(ValueError, match="must not be negative"):
-        sj.methods.Laboratory(beam, sj.methods.Shaker(mass=-1.0), sj.methods.Instruments(), 2000.0)
+        sj.simulate.Laboratory(
+            beam, sj.simulate.Shaker(mass=-1.0), sj.simulate.Instruments(), 2000.0
+        )

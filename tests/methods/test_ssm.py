@@ -108,7 +108,7 @@ def test_bands_cover(decay, noise, seeds):
 def test_bad_records_are_refused(decay):
     time, velocity = decay
     for times, record, words in (
-        (time[:300], velocity[:300], "ssm needs 12 cycles, or 5 in which"),
+        (time[:300], velocity[:300], "12 cycles are needed, or 5 in which"),
         (time, np.clip(velocity, -0.2, 0.2), "it is clipped"),
         (time[::8], velocity[::8], "samples a cycle"),
         (time**1.1, velocity, "evenly spaced"),

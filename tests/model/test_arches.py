@@ -181,7 +181,7 @@ def test_a_force_in_one_place_works_where_it_is_seen():
         ({"thickness": 0.0}, "`thickness` must be positive, but is 0"),
         ({"rise": -1e-3}, "`rise` must be zero or positive, but is -0.001"),
         ({"rise": 0.05}, "`rise` must be at most a tenth of the length, 0.03048 m"),
-        ({"young": np.inf}, "`young` must be positive"),
+        ({"young": np.inf}, "`young` must be finite"),
         ({"width": np.ones(2)}, "`width` must be one number"),
         ({"damping_ratio": 1.0}, "`damping_ratio` must be from 0 to below 1"),
         ({"damping_ratio": [0.1] * 3}, "`damping_ratio` must be one number or 2"),

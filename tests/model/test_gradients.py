@@ -3,7 +3,6 @@
 import dataclasses
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from truths.derivatives import check_derivatives, numbers
 
@@ -36,18 +35,13 @@ def of_averages(relative):
     amplitude, frequency = AMPLITUDE * (1 + relative[:3]), FREQUENCY * (1 + relative[3:6])
     size = 1 + relative[6]
 
-    def law(q, v):
-        return size * (1e10 * q**3 + 0.3 * v * jnp.abs(v))
-
     slider = sj.model.make_effect(
         "jenkins_slider", {"stiffness": 1e4 * size, "slip_displacement": 3e-4 * (1 + relative[7])}
     )
     drag = sj.model.make_effect("quadratic_damping", {"coefficient": 0.3 * size})
     return numbers(
-        *sj.model.averaged_force(law, amplitude, frequency),
         sj.model.averaged_effect(drag, amplitude, frequency).damping,
         *sj.model.averaged_effect(slider, amplitude, frequency),
-        sj.model.averaged_response(500.0 * size, 0.01, law, amplitude, frequency),
     )
 
 

@@ -182,10 +182,10 @@ GOOD = {
         ({"damping_ratio": [0.01]}, r"`damping_ratio` must be a vector of 2.*\(1,\)"),
         ({"mode_shape": [[2.0]]}, r"`mode_shape` must have shape \(sensors, 2 modes\).*\(1, 1\)"),
         ({"mode_shape": np.zeros((0, 2))}, "`mode_shape`"),
-        ({"mode_shape": [[2.0, np.nan]]}, "`mode_shape` must be finite, but entry 1 is nan"),
+        ({"mode_shape": [[2.0, np.nan]]}, "`mode_shape` must be finite, but entry .0, 1. is nan"),
         (
             {"rigid_body": RigidBodyModes([[np.inf]], [1.0])},
-            "`rigid_body.shape` must be finite, but entry 0",
+            "`rigid_body.shape` must be finite, but entry .0, 0.",
         ),
         ({"participation": [3.0]}, "`participation` must be a vector of 2"),
         ({"participation": [3.0, np.inf]}, "`participation` must be finite.*entry 1 is inf"),

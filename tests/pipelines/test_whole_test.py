@@ -130,7 +130,7 @@ def test_steps_left_out_at_import_are_counted(tmp_path):
     told = ("--force", "load", "--response", "tip", "--sensor", "tip", "--record", "steps")
     code, said = run_import(tmp_path / "run1.mat", *told, "--out", folder)
     assert code == 0, said
-    assert "7 of 10 steps used; left out: 3 unsettled." in " ".join(said.split())
+    assert "7 of 10 steps used; left out: 3 unsettled" in " ".join(said.split())
     files = read_test_files(folder)
     assert _used_steps(files, []) == StepCounts(7, {"unsettled": 3})
     assert steps_of_map(folder / "map.toml") == files.steps_at_import

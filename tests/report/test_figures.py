@@ -15,7 +15,8 @@ from truths.beam_forces import FORCES
 from truths.printed_page import unreadable
 
 import snrmjax as sj
-from snrmjax.io.results import with_amplitude, write_backbone
+from snrmjax.identify.pointwise.points_result import BackbonePoints
+from snrmjax.io.results import write_backbone
 from snrmjax.io.units import DEGREE, HERTZ
 from snrmjax.report import style as drawing
 from snrmjax.report.figures import identification as plot
@@ -204,8 +205,7 @@ def test_other_amplitudes_are_the_velocitys_at_each_frequency(
 
 def test_another_amplitude_is_added_to_a_table_and_nothing_else_changes(tmp_path, identification):
     write_backbone(tmp_path / "old.csv", identification)
-    write_backbone(tmp_path / "new.csv", identification)
-    with_amplitude(tmp_path / "new.csv", "velocity_m_s", "displacement_m", -1)
+    write_backbone(tmp_path / "new.csv", identification, added=("displacement_m", -1))
     old = (tmp_path / "old.csv").read_text().splitlines()
     new = (tmp_path / "new.csv").read_text().splitlines()
     assert [line.rsplit(",", 1)[0] for line in new] == old
@@ -237,7 +237,7 @@ def test_many_points_are_drawn_small(identification, backbone):
 
 ARRAYS = [
     field.name
-    for field in dataclasses.fields(sj.identify.BackbonePoints)
+    for field in dataclasses.fields(BackbonePoints)
     if field.name not in ("sensor", "argument")
 ]
 

@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from scipy.interpolate import CubicSpline
 
 import snrmjax as sj
+from snrmjax.identify.pointwise.prediction_result import Resonance
 from snrmjax.io.units import HERTZ
 from snrmjax.report import html as reports
 from snrmjax.report.figures.identification import backbone_figure, response_figure
@@ -89,7 +90,7 @@ def identification(data, modes):
 
 
 def resonance(force, velocity, frequency_hz, *, continued=False):
-    return sj.identify.Resonance(force, 1e-3, frequency_hz * HERTZ, 0.019, velocity, continued)
+    return Resonance(force, 1e-3, frequency_hz * HERTZ, 0.019, velocity, continued)
 
 
 def simulated(force, velocities, frequencies_hz, events):

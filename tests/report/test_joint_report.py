@@ -215,7 +215,7 @@ def test_advised_states_are_marked_and_listed(told, figures, sections):
     turned = [line.get_ydata() for line in phases.lines if line.get_marker() == "o"]
     np.testing.assert_allclose(np.ravel(turned), [a.phase / DEGREE for a in told.advice])
     rows = sections[2].tables[0].rows
-    assert [row[-1] for row in rows] == [one.reason for one in told.advice]
+    assert [row[-1] for row in rows] == [str(one.reason) for one in told.advice]
     close_to(rows[0][2], told.advice[0].frequency / HERTZ)
 
 

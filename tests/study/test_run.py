@@ -10,17 +10,16 @@ import pytest
 from filelock import FileLock
 
 import snrmjax as sj
-from snrmjax.study.compute import LOST
-from snrmjax.study.run import RunSettings, Shard
-from snrmjax.study.workers import WorkerDied
+from snrmjax.study.execution import LOST, WorkerDied
 
 from .conftest import InThisProcess, peak_velocity
 
 DAMPING = np.linspace(0.01, 0.03, 7)
 
 
-def here(**settings):
-    return RunSettings(workers=settings.pop("workers", InThisProcess()), **settings)
+def run_here(study, out, executor=None, **settings):
+    workers = (executor or InThisProcess()).workers
+    return sj.study.run_study(study, out, workers=workers, **settings)
 
 
 def identical(one, other):
@@ -33,7 +32,7 @@ def finished(tmp_path_factory, request):
     """A study that nothing disturbed."""
     study = request.getfixturevalue("study_of_module")
     out = tmp_path_factory.mktemp("study") / "study.zarr"
-    sj.study.run_study(study, out, here())
+    run_here(study, out)
     return out
 
 
@@ -43,7 +42,7 @@ def study_of_module(linear_model, linear_peaks):
         "damping of a linear mode",
         linear_model,
         linear_peaks([0.5]),
-        (sj.study.ranged("mode_1.damping_ratio", 0.01, 0.03, 7),),
+        (sj.study.Uniform("mode_1.damping_ratio", 0.01, 0.03, 7),),
         members_a_chunk=3,
     )
 
@@ -74,9 +73,9 @@ def test_every_member_has_the_peak_of_its_own_damping(finished):
 
 
 def test_several_forces_are_a_dimension(linear_model, linear_peaks, tmp_path):
-    varied = (sj.study.listed("mode_1.damping_ratio", [0.01, 0.02]),)
+    varied = (sj.study.Discrete("mode_1.damping_ratio", [0.01, 0.02]),)
     study = sj.study.Study("forces", linear_model, linear_peaks([0.5, 1.0, 2.0]), varied)
-    data = sj.study.run_study(study, tmp_path / "s.zarr", here()).open()
+    data = run_here(study, tmp_path / "s.zarr").open()
     assert dict(data.sizes) == {"member": 2, "force_n": 3, "fold": 0}
     expected = peak_velocity(np.array([0.5, 1.0, 2.0]), np.array([[0.01], [0.02]]))
     np.testing.assert_allclose(data.peak_velocity_m_s, expected, rtol=1e-9)
@@ -84,12 +83,12 @@ def test_several_forces_are_a_dimension(linear_model, linear_peaks, tmp_path):
 
 def test_force_and_frequency_in_hertz_vary_together(linear_model, linear_peaks, tmp_path):
     varied = (
-        sj.study.listed("force_n", [0.5, 1.0]),
-        sj.study.listed("mode_1.frequency_hz", [48.0, 52.0]),
+        sj.study.Discrete("force_n", [0.5, 1.0]),
+        sj.study.Discrete("mode_1.frequency_hz", [48.0, 52.0]),
     )
     sampling = sj.study.Sampling("list")
     study = sj.study.Study("both", linear_model, linear_peaks(), varied, sampling)
-    data = sj.study.run_study(study, tmp_path / "s.zarr", here()).open()
+    data = run_here(study, tmp_path / "s.zarr").open()
     np.testing.assert_allclose(data.resonance_frequency_hz, [48.0, 52.0], rtol=1e-9)
     expected = peak_velocity(np.array([0.5, 1.0]), 0.02) * 50 / np.array([48.0, 52.0])
     np.testing.assert_allclose(data.resonance_velocity_m_s, expected, rtol=1e-9)
@@ -99,9 +98,9 @@ def test_curves_are_ragged_rows_that_members_point_to(linear_model, study_of_mod
     within = study_of_module.computation.within
     forces = study_of_module.computation.forces
     curves = sj.study.Curves(within, forces)
-    varied = (sj.study.listed("mode_1.damping_ratio", [0.01, 0.03]),)
+    varied = (sj.study.Discrete("mode_1.damping_ratio", [0.01, 0.03]),)
     study = sj.study.Study("curves", linear_model, curves, varied, members_a_chunk=1)
-    data = sj.study.run_study(study, tmp_path / "s.zarr", here()).open()
+    data = run_here(study, tmp_path / "s.zarr").open()
     for k, damping in enumerate((0.01, 0.03)):
         begin, n = int(data.first_point[k]), int(data.n_points[k])
         rows = slice(begin, begin + n)
@@ -116,7 +115,7 @@ def test_curves_are_ragged_rows_that_members_point_to(linear_model, study_of_mod
 
 def test_what_is_there_is_not_computed_again(study_of_module, finished, tmp_path):
     out, workers = copied(finished, tmp_path), InThisProcess()
-    again = sj.study.run_study(study_of_module, out, here(workers=workers))
+    again = run_here(study_of_module, out, workers)
     assert again.complete
     assert (again.computed, workers.done) == (0, [])
 
@@ -134,7 +133,7 @@ def test_a_damaged_chunk_is_found_and_computed_again(study_of_module, finished, 
     else:
         file.rename(file.with_name(".abc.tmp"))
     workers = InThisProcess()
-    again = sj.study.run_study(study_of_module, out, here(workers=workers))
+    again = run_here(study_of_module, out, workers)
     assert (again.computed, workers.done) == (3, ["compute_chunk"])
     assert identical(finished, out)
     assert len(list(chunk_files(out)[0].parent.iterdir())) == 3
@@ -144,19 +143,19 @@ def test_a_damaged_data_set_is_made_again_from_its_chunks(study_of_module, finis
     out, workers = copied(finished, tmp_path), InThisProcess()
     file = out / "peak_velocity_m_s" / "0"
     file.write_bytes(file.read_bytes()[:-1] + b"x")
-    sj.study.run_study(study_of_module, out, here(workers=workers))
+    run_here(study_of_module, out, workers)
     assert workers.done == []
     assert identical(finished, out)
 
 
 def test_shards_make_the_same_data_set(study_of_module, finished, tmp_path):
     out = tmp_path / finished.name
-    first = sj.study.run_study(study_of_module, out, here(shard=Shard(2, 2)))
+    first = run_here(study_of_module, out, shard=(2, 2))
     assert not first.complete
     assert first.missing_chunks == 2
     with pytest.raises(ValueError, match="is not complete"):
         first.open()
-    assert sj.study.run_study(study_of_module, out, here(shard=Shard(1, 2))).complete
+    assert run_here(study_of_module, out, shard=(1, 2)).complete
     assert identical(finished, out)
 
 
@@ -168,7 +167,7 @@ def test_a_chunk_whose_process_dies_by_chance_is_computed(study_of_module, finis
             raise WorkerDied("killed")
 
     out = tmp_path / finished.name
-    sj.study.run_study(study_of_module, out, here(workers=InThisProcess(before)))
+    run_here(study_of_module, out, InThisProcess(before))
     assert identical(finished, out)
 
 
@@ -178,9 +177,7 @@ def test_a_member_that_kills_its_process_is_a_row_with_a_status(study_of_module,
         if 4 in numbers:
             raise WorkerDied("killed")
 
-    run = sj.study.run_study(
-        study_of_module, tmp_path / "s.zarr", here(workers=InThisProcess(before))
-    )
+    run = run_here(study_of_module, tmp_path / "s.zarr", InThisProcess(before))
     data = run.open()
     assert run.failed == 1
     assert data.status.values[4] == LOST
@@ -192,12 +189,12 @@ def test_a_member_that_kills_its_process_is_a_row_with_a_status(study_of_module,
 
 def test_another_study_is_refused_with_what_differs(linear_model, linear_peaks, finished, tmp_path):
     out = copied(finished, tmp_path)
-    varied = (sj.study.ranged("mode_1.damping_ratio", 0.01, 0.03, 7),)
+    varied = (sj.study.Uniform("mode_1.damping_ratio", 0.01, 0.03, 7),)
     other = sj.study.Study(
         "damping of a linear mode", linear_model, linear_peaks([0.6]), varied, members_a_chunk=3
     )
     with pytest.raises(ValueError, match=r"forces\.values\[0\]` is 0.6 here and 0.5 in the store"):
-        sj.study.run_study(other, out, here())
+        run_here(other, out)
     assert identical(finished, out)
 
 
@@ -205,7 +202,7 @@ def test_another_version_is_refused(study_of_module, finished, tmp_path, monkeyp
     out = copied(finished, tmp_path)
     monkeypatch.setattr("importlib.metadata.version", lambda name: "99")
     with pytest.raises(ValueError, match=r"versions\.jax` is '99' here"):
-        sj.study.run_study(study_of_module, out, here())
+        run_here(study_of_module, out)
 
 
 def test_one_process_at_a_time(study_of_module, finished, tmp_path):
@@ -214,7 +211,7 @@ def test_one_process_at_a_time(study_of_module, finished, tmp_path):
         FileLock(f"{out}.parts/.lock"),
         pytest.raises(ValueError, match="another process is at work"),
     ):
-        sj.study.run_study(study_of_module, out, here())
+        run_here(study_of_module, out)
 
 
 def test_a_disk_that_is_full_costs_nothing_that_is_done(study_of_module, finished, tmp_path):
@@ -224,25 +221,23 @@ def test_a_disk_that_is_full_costs_nothing_that_is_done(study_of_module, finishe
 
     out = tmp_path / finished.name
     with pytest.raises(ValueError, match=r"No space left on device\. What is done stays"):
-        sj.study.run_study(study_of_module, out, here(workers=InThisProcess(before)))
+        run_here(study_of_module, out, InThisProcess(before))
     workers = InThisProcess()
-    sj.study.run_study(study_of_module, out, here(workers=workers))
+    run_here(study_of_module, out, workers)
     assert workers.done == ["compute_chunk"]
     assert identical(finished, out)
 
 
 def test_a_worker_ends_with_the_process_that_started_it():
     # Without anybody who would tell it its core: the queue is empty for ever.
-    code = "import queue; from snrmjax.study.workers import settle; settle(2**30, queue.Queue())"
+    code = "import queue; from snrmjax.study.execution import settle; settle(2**30, queue.Queue())"
     assert subprocess.run([sys.executable, "-c", code], timeout=60, check=False).returncode == 1
 
 
 def test_a_scheduler_that_is_not_there_leaves_nothing(study_of_module, tmp_path, monkeypatch):
-    monkeypatch.setattr("snrmjax.study.workers.DaskCluster.patience", "1s")
+    monkeypatch.setattr("snrmjax.study.execution._PATIENCE", "1s")
     with pytest.raises(ValueError, match="no Dask scheduler answers at 127"):
-        sj.study.run_study(
-            study_of_module, tmp_path / "s.zarr", RunSettings(scheduler="127.0.0.1:9")
-        )
+        sj.study.run_study(study_of_module, tmp_path / "s.zarr", scheduler="127.0.0.1:9")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -250,23 +245,23 @@ def test_a_folder_that_is_no_study_is_left_alone(study_of_module, tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes.txt").write_text("keep")
     with pytest.raises(ValueError, match="no data set of a study"):
-        sj.study.run_study(study_of_module, tmp_path / "mine", here())
+        run_here(study_of_module, tmp_path / "mine")
     assert [p.name for p in tmp_path.iterdir()] == ["mine"]
 
 
 def test_without_its_chunks_the_data_set_stands_alone(study_of_module, finished, tmp_path):
     out, workers = copied(finished, tmp_path), InThisProcess()
     shutil.rmtree(f"{out}.parts")
-    assert sj.study.run_study(study_of_module, out, here(workers=workers)).complete
+    assert run_here(study_of_module, out, workers).complete
     assert workers.done == []
 
 
 def test_a_model_may_be_made_of_other_numbers(linear_model, linear_peaks, tmp_path):
-    varied = (sj.study.listed("loss_factor", [0.02, 0.08]),)
+    varied = (sj.study.Discrete("loss_factor", [0.02, 0.08]),)
     study = sj.study.Study(
         "loss factor", linear_model, linear_peaks([0.5]), varied, model_of=of_loss_factor
     )
-    data = sj.study.run_study(study, tmp_path / "s.zarr", here()).open()
+    data = run_here(study, tmp_path / "s.zarr").open()
     expected = peak_velocity(0.5, np.array([0.01, 0.04]))
     np.testing.assert_allclose(data.peak_velocity_m_s, expected, rtol=1e-9)
 

@@ -9,38 +9,37 @@ from snrmjax.model.parameters import with_stated_std
 from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
 from snrmjax.study.sampling import Sampling, drawn_members, member_seed, number_of_members
 from snrmjax.study.variations import (
-    joint_normal,
-    listed,
-    lognormal,
-    normal,
+    Discrete,
+    LogNormal,
+    MultivariateNormal,
+    Normal,
+    Uniform,
     posterior_variation,
-    ranged,
     stated_variations,
-    uniform,
 )
 
 MEAN, COVARIANCE = np.array([3.0, -1.0]), np.array([[0.04, 0.03], [0.03, 0.09]])
 
 
 def test_a_grid_is_every_combination_with_the_last_quantity_fastest():
-    varied = (listed("a", [1.0, 2.0]), ranged("b", 0.0, 1.0, 3))
+    varied = (Discrete("a", [1.0, 2.0]), Uniform("b", 0.0, 1.0, 3))
     rows = drawn_members(varied, Sampling("grid"), 0)
     expected = [[1, 0], [1, 0.5], [1, 1], [2, 0], [2, 0.5], [2, 1]]
     np.testing.assert_array_equal(rows, expected)
 
 
 def test_a_list_takes_the_values_side_by_side():
-    varied = (listed("a", [1.0, 2.0]), listed("b", [5.0, 7.0]))
+    varied = (Discrete("a", [1.0, 2.0]), Discrete("b", [5.0, 7.0]))
     np.testing.assert_array_equal(drawn_members(varied, Sampling("list"), 0), [[1, 5], [2, 7]])
 
 
 @pytest.mark.parametrize("method", ["latin_hypercube", "sobol", "random"])
 def test_samples_follow_their_distributions(method):
     varied = (
-        uniform("a", -1.0, 3.0),
-        normal("b", 2.0, 0.5),
-        lognormal("c", 4.0, 2.0),
-        joint_normal(["d", "e"], MEAN, COVARIANCE),
+        Uniform("a", -1.0, 3.0),
+        Normal("b", 2.0, 0.5),
+        LogNormal("c", 4.0, 2.0),
+        MultivariateNormal(["d", "e"], MEAN, COVARIANCE),
     )
     rows = drawn_members(varied, Sampling(method, 4000), 11)
     # Of the quantity itself: scipy's lognormal by the mean and deviation of its logarithm.
@@ -61,10 +60,10 @@ def test_samples_follow_their_distributions(method):
 @pytest.mark.parametrize(
     "one",
     [
-        uniform("a", -1.0, 3.0),
-        normal("b", 2.0, 0.5),
-        lognormal("c", 4.0, 2.0),
-        joint_normal(["d", "e"], MEAN, COVARIANCE),
+        Uniform("a", -1.0, 3.0),
+        Normal("b", 2.0, 0.5),
+        LogNormal("c", 4.0, 2.0),
+        MultivariateNormal(["d", "e"], MEAN, COVARIANCE),
     ],
     ids=["uniform", "normal", "lognormal", "joint"],
 )
@@ -106,12 +105,12 @@ def test_a_models_own_deviations_and_a_calibrations_posterior_vary():
 
 
 def test_values_in_a_sample_are_taken_equally_often():
-    rows = drawn_members((listed("a", [1.0, 2.0, 4.0]),), Sampling("latin_hypercube", 300), 0)
+    rows = drawn_members((Discrete("a", [1.0, 2.0, 4.0]),), Sampling("latin_hypercube", 300), 0)
     assert np.unique(rows, return_counts=True)[1].tolist() == [100, 100, 100]
 
 
 def test_the_seed_decides_and_nothing_else():
-    varied = (uniform("a", 0.0, 1.0),)
+    varied = (Uniform("a", 0.0, 1.0),)
     first = drawn_members(varied, Sampling("sobol", 10), 1)
     np.testing.assert_array_equal(first, drawn_members(varied, Sampling("sobol", 10), 1))
     assert not np.array_equal(first, drawn_members(varied, Sampling("sobol", 10), 2))
@@ -123,11 +122,11 @@ def test_the_seed_decides_and_nothing_else():
     ("varied", "sampling", "words"),
     [
         ((), Sampling("grid"), "at least one quantity"),
-        ((uniform("a", 0, 1),), Sampling("grid"), "a has a distribution"),
-        ((uniform("a", 0, 1),), Sampling("sobol"), "needs `members`"),
-        ((listed("a", [1.0, 2.0]),), Sampling("grid", 3), "has 2 members"),
-        ((listed("a", [1.0]), listed("b", [1.0, 2.0])), Sampling("list"), "a 1, b 2"),
-        (tuple(ranged(n, 0, 1, 10**6) for n in "ab"), Sampling("grid"), "1e+12"),
+        ((Uniform("a", 0, 1),), Sampling("grid"), "a has a distribution"),
+        ((Uniform("a", 0, 1),), Sampling("sobol"), "needs `members`"),
+        ((Discrete("a", [1.0, 2.0]),), Sampling("grid", 3), "has 2 members"),
+        ((Discrete("a", [1.0]), Discrete("b", [1.0, 2.0])), Sampling("list"), "a 1, b 2"),
+        (tuple(Uniform(n, 0, 1, 10**6) for n in "ab"), Sampling("grid"), "1e+12"),
     ],
 )
 def test_members_that_make_no_sense_are_refused_before_they_are_drawn(varied, sampling, words):
@@ -138,16 +137,16 @@ def test_members_that_make_no_sense_are_refused_before_they_are_drawn(varied, sa
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: listed("a", []), "is empty"),
-        (lambda: listed("a", [1.0, np.nan]), "must be finite"),
-        (lambda: ranged("a", 2.0, 2.0), "must rise"),
-        (lambda: ranged("a", 0.0, 1.0, 1), "`points` of a"),
-        (lambda: normal("a", 0.0, -1.0), "`std` of a must be positive"),
-        (lambda: lognormal("a", -1.0, 1.0), "`mean` of a must be positive"),
-        (lambda: joint_normal(["a", "b"], MEAN, np.eye(3)), "2 by 2"),
-        (lambda: joint_normal(["a", "b"], MEAN, np.diag([1.0, -1.0])), "variance of b"),
-        (lambda: joint_normal(["a", "b"], MEAN, [[1.0, 2.0], [2.0, 1.0]]), "semidefinite"),
-        (lambda: joint_normal(["a", "b"], MEAN, [[1.0, 0.5], [0.1, 1.0]]), "symmetric"),
+        (lambda: Discrete("a", []), "at least one number"),
+        (lambda: Discrete("a", [1.0, np.nan]), "must be finite"),
+        (lambda: Uniform("a", 2.0, 2.0), "must rise"),
+        (lambda: Uniform("a", 0.0, 1.0, 1), "`points` of a"),
+        (lambda: Normal("a", 0.0, -1.0), "`std` of a must be positive"),
+        (lambda: LogNormal("a", -1.0, 1.0), "`mean` of a must be positive"),
+        (lambda: MultivariateNormal(["a", "b"], MEAN, np.eye(3)), "2 by 2"),
+        (lambda: MultivariateNormal(["a", "b"], MEAN, np.diag([1.0, -1.0])), "variance of b"),
+        (lambda: MultivariateNormal(["a", "b"], MEAN, [[1.0, 2.0], [2.0, 1.0]]), "semidefinite"),
+        (lambda: MultivariateNormal(["a", "b"], MEAN, [[1.0, 0.5], [0.1, 1.0]]), "symmetric"),
     ],
 )
 def test_variations_that_make_no_sense_are_refused(make, words):

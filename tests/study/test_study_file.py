@@ -6,7 +6,7 @@ import pytest
 import snrmjax as sj
 from snrmjax.cli import main
 from snrmjax.simulate.balance.labelled import HERTZ
-from snrmjax.study.variations import LogNormal, ValueRange
+from snrmjax.study.variations import LogNormal, Uniform
 
 MODEL = """
 [[mode]]
@@ -67,7 +67,7 @@ def test_a_study_file_says_what_the_object_has(folder):
     assert study.name == "peaks"
     assert (study.seed, study.n_members, study.n_chunks) == (7, 8, 2)
     assert study.names == ("mode_1.damping_ratio", "coulomb_friction.force")
-    assert [type(one) for one in study.variations] == [ValueRange, LogNormal]
+    assert [type(one) for one in study.variations] == [Uniform, LogNormal]
     within = study.computation.within
     assert within.ends == pytest.approx((40 * HERTZ, 60 * HERTZ))
     assert within.harmonic_order == 3
@@ -99,7 +99,10 @@ def test_a_study_file_says_what_the_object_has(folder):
         (HEAD + VARY.replace("0.01", "nan"), "finite"),
         (HEAD + VARY.replace("0.01,", "-0.01,"), "from 0 to below 1"),
         (HEAD + VARY + "values = [0.1]\n", "`values` and `range`"),
-        (HEAD + VARY.replace("range = [0.01, 0.03]\npoints = 3", "values = []"), "is empty"),
+        (
+            HEAD + VARY.replace("range = [0.01, 0.03]\npoints = 3", "values = []"),
+            "at least one number",
+        ),
         (HEAD + VARY.replace("points = 3", "points = 1"), "`points`"),
         (HEAD + VARY.replace("\npoints = 3", ""), "needs `members`"),
         (HEAD + NORMAL + "mean = 0.02\nstd = 0.001\n[sample]\nmethod = 'grid'\n", "has a distr"),

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from snrmjax.condense.elements.beam import Beam
@@ -13,7 +14,9 @@ from snrmjax.condense.elements.strain_energy import (
     strain_energy,
     tangent_stiffness,
 )
+from snrmjax.condense.load_cases import ReductionBasis, StaticCases
 from snrmjax.numerics.blocks import mapped
+from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.status import Status
 
 _ITERATIONS = 25
@@ -66,21 +69,44 @@ def static_solutions(beam: Beam, load: Float[Array, "case dof"]) -> StaticSoluti
     fixed_beam = jax.lax.stop_gradient(beam)
     loads = load[:, free]
     start, stiffness, status, fraction = mapped(
-        lambda one: _followed(fixed_beam, one), jax.lax.stop_gradient(loads)
+        lambda load: _followed(fixed_beam, load), jax.lax.stop_gradient(loads)
     )
 
-    def polished(u: Array, k: Array, one: Array, good: Array) -> tuple[Array, Array]:
+    def polished(u: Array, k: Array, load: Array, good: Array) -> tuple[Array, Array]:
         # Newton steps with a fixed matrix: nothing but rounding in value, and each makes one more
         # order of derivatives whole.
         factor = jax.scipy.linalg.lu_factor(k)
         for _ in range(2):
-            u = u - jax.scipy.linalg.lu_solve(factor, _free_force(beam, u) - one)
+            u = u - jax.scipy.linalg.lu_solve(factor, _free_force(beam, u) - load)
         whole = jnp.where(good, jnp.zeros(beam.n_dof).at[free].set(u), jnp.nan)
         return whole, strain_energy(beam, whole)
 
     rows = start, stiffness, loads, status == StaticStatus.CONVERGED
     displacement, energy = mapped(polished, *rows)
     return StaticSolutions(displacement, energy, status, fraction)
+
+
+@compiled
+def static_cases(
+    beam: Beam, basis: ReductionBasis, force: Float[Array | np.ndarray, "case mode"]
+) -> StaticCases:
+    """Run load cases F = M Φ f with all displacements and the strain energy.
+
+    Cases that diverge or snap through are marked as not converged; `static_solutions` says which.
+    Differentiable by `beam`, by `basis` (as `beam_modes(beam, …)` gives it) and by `force`.
+
+    Arguments: `force` f in kg^1/2 m/s², one row a case, such as from `modal_loads`.
+    """
+    loads = jnp.asarray(force)
+    # The filter is ΦᵀM.
+    found = static_solutions(beam, loads @ basis.filter)
+    return StaticCases(
+        force=loads,
+        modal_displacement=found.displacement @ basis.filter.T,
+        converged=found.converged,
+        energy=found.energy,
+        displacement=found.displacement,
+    )
 
 
 class _Path(NamedTuple):

@@ -13,9 +13,10 @@ from snrmjax.identify.pointwise.inversion_result import PointStatus
 from snrmjax.identify.pointwise.points_result import BackbonePoints
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.least_squares import inverse_of
 from snrmjax.numerics.levenberg_marquardt import MinimisationStatus, StepRule, minimise
-from snrmjax.numerics.result import Variable
+from snrmjax.numerics.result import Variable, quantity
 from snrmjax.simulate.balance.labelled import HERTZ
 from snrmjax.simulate.solutions.mode_at_velocities import normal_mode_at_velocities
 
@@ -44,24 +45,28 @@ class BackboneCalibration(AbstractCalibration):
     """
 
     measured: MeasuredBackbone
-    fitted: Float[np.ndarray, " point"]  # rad/s, at the measured velocities
-    fitted_std: Float[np.ndarray, " point"]  # rad/s
-    residuals: Float[np.ndarray, " point"]
+    # At the measured velocities.
+    fitted: Float[np.ndarray, " point"] = quantity(
+        "point", "Hz", "fitted", name="fitted_frequency_hz"
+    )
+    fitted_std: Float[np.ndarray, " point"] = quantity(
+        "point", "Hz", "its 1σ", name="fitted_frequency_std_hz"
+    )
+    residuals: Float[np.ndarray, " point"] = quantity(
+        "point", "1", "residual in units of 1σ", name="residual"
+    )
 
     def data_in_words(self) -> str:
         """See `AbstractCalibration`."""
         return f"{len(self.fitted)} points of a backbone"
 
     def variables(self) -> dict[str, Variable]:
-        """The parameters, and the backbone, measured and fitted."""
-        at, told = ("point",), self.measured.frequency / HERTZ
+        """Those of the fields, with the measured backbone."""
+        point, hertz = ("point",), self.measured.frequency / HERTZ
         return {
             **super().variables(),
-            "velocity_m_s": Variable(at, self.measured.velocity, "m/s", "velocity amplitude"),
-            "natural_frequency_hz": Variable(at, told, "Hz", "measured natural frequency"),
-            "fitted_frequency_hz": Variable(at, self.fitted / HERTZ, "Hz", "fitted"),
-            "fitted_frequency_std_hz": Variable(at, self.fitted_std / HERTZ, "Hz", "its 1σ"),
-            "residual": Variable(at, self.residuals, "1", "residual in units of 1σ"),
+            "velocity_m_s": Variable(point, self.measured.velocity, "m/s", "velocity amplitude"),
+            "natural_frequency_hz": Variable(point, hertz, "Hz", "measured natural frequency"),
         }
 
 
@@ -124,14 +129,14 @@ def calibrate_to_backbone(
 
     def sizes(slope: np.ndarray) -> np.ndarray:
         """1σ of every point's frequency."""
-        own = np.ones(n) if points.frequency_std is None else points.frequency_std
+        frequency_std = np.ones(n) if points.frequency_std is None else points.frequency_std
         across = 0.0 if points.velocity_std is None else slope * points.velocity_std
-        return np.hypot(own, across)
+        return np.hypot(frequency_std, across)
 
     def linear(unknown: np.ndarray, sigma: np.ndarray | None) -> _Linear:
         values = begin * np.exp(unknown)
-        told = _told(model_of, settings, values, points.velocity)
-        frequency, by_value, slope = (np.asarray(part) for part in told)
+        modal = _told(model_of, settings, values, points.velocity)
+        frequency, by_value, slope = (np.asarray(part) for part in modal)
         sigma = sizes(slope) if sigma is None else sigma
         rows = (frequency - points.frequency) / sigma, (values - begin) / prior
         slopes = by_value * values / sigma[:, None], np.diag(values / prior)
@@ -162,29 +167,29 @@ def _told(
 
     def frequency(values: Array, shift: Array) -> tuple[Array, Array]:
         model = model_of(dict(zip(names, values, strict=True)))
-        found = normal_mode_at_velocities(
+        modes = normal_mode_at_velocities(
             model, velocity + shift, harmonic_order=harmonic_order, steps=steps
         )
-        return found.frequency, found.frequency
+        return modes.frequency, modes.frequency
 
     # One motion does not feel another's velocity: all may be shifted at once.
-    by, told = jax.jacfwd(frequency, argnums=(0, 1), has_aux=True)(values, jnp.zeros(()))
-    return told, *by
+    by, frequencies = jax.jacfwd(frequency, argnums=(0, 1), has_aux=True)(values, jnp.zeros(()))
+    return frequencies, *by
 
 
 def _checked(measured: MeasuredBackbone | BackbonePoints) -> MeasuredBackbone:
     """Points that are numbers, in the order in which they came."""
     if isinstance(measured, BackbonePoints):
-        found = np.asarray(measured.status) == int(PointStatus.OK)
-        std = np.asarray(measured.natural_frequency_std)[found]
+        solved = np.asarray(measured.status) == int(PointStatus.OK)
+        std = np.asarray(measured.natural_frequency_std)[solved]
         points = MeasuredBackbone(
-            np.asarray(measured.backbone_velocity)[found],
-            np.asarray(measured.natural_frequency)[found],
+            np.asarray(measured.backbone_velocity)[solved],
+            np.asarray(measured.natural_frequency)[solved],
             std if np.all(np.isfinite(std)) and std.size else None,
         )
     else:
-        own: Any = [None if part is None else _vector(part) for part in measured]
-        points = MeasuredBackbone(*own)
+        parts: Any = [None if part is None else _vector(part) for part in measured]
+        points = MeasuredBackbone(*parts)
     n = len(points.velocity)
     for name, values in points._asdict().items():
         if values is None:
@@ -201,6 +206,10 @@ def _checked(measured: MeasuredBackbone | BackbonePoints) -> MeasuredBackbone:
 
 def _vector(values: Float[ArrayLike, " point"]) -> Float[np.ndarray, " point"]:
     return np.atleast_1d(np.asarray(values, dtype=np.float64))
+
+
+def _chosen(names: tuple[str, ...], which: np.ndarray) -> tuple[str, ...]:
+    return tuple(name for name, there in zip(names, which, strict=True) if there)
 
 
 def _outcome(
@@ -224,22 +233,17 @@ def _outcome(
             relative = relative * reduced
         covariance = relative * values * values[:, None]
         if stated and reduced > 1 + margin:
-            notes.append(
-                f"residuals are {np.sqrt(reduced):.2g} times the stated errors: they are "
-                "understated or the model lacks something; the standard deviations are widened."
-            )
-        vague = [k for k, size in enumerate(np.sqrt(np.diag(relative))) if not size < 1]
-        if vague:
-            listed = ", ".join(names[k] for k in vague)
-            notes.append(f"the backbone says next to nothing about {listed}: state `prior_std`.")
+            notes.append(Fact("calibration_noise", scale=float(np.sqrt(reduced))))
+        vague = ~(np.diag(relative) < 1)
+        if vague.any():
+            notes.append(Fact("parameters_hardly_known", names=_chosen(names, vague)))
     if end.status == MinimisationStatus.NOT_FINITE:
-        notes.append("the start has no such mode at some velocities: begin nearer.")
+        notes.append(Fact("no_mode_at_start"))
     elif not end.status.found_minimum:
-        notes.append("the fit did not converge: begin nearer, or fit fewer parameters.")
+        notes.append(Fact("calibration_not_converged"))
     at_limit = np.abs(np.abs(end.point) - _FURTHEST) < 1e-9
     if at_limit.any():
-        listed = ", ".join(name for name, there in zip(names, at_limit, strict=True) if there)
-        notes.append(f"{listed} ended ten times off the start: begin nearer, or state `prior_std`.")
+        notes.append(Fact("parameters_at_limit", names=_chosen(names, at_limit)))
     by_value = linear.jacobian[:n] * sigma[:, None] / values
     variance = np.einsum("ki,ij,kj->k", by_value, covariance, by_value)
     return BackboneCalibration(

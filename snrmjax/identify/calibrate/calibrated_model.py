@@ -8,8 +8,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from snrmjax.model.structures import Structure
+from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
-from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
 
 
 class AbstractCalibration(AbstractResult):
@@ -22,13 +23,16 @@ class AbstractCalibration(AbstractResult):
     coordinates: ClassVar[tuple[str, ...]] = ("parameter",)
 
     model: Structure  # with the fitted values
-    values: Float[np.ndarray, " parameter"]  # SI units, rad/s for frequencies
-    covariance: Float[np.ndarray, "parameter parameter"]
-    reduced_chi_square: float
-    names: tuple[str, ...] = eqx.field(static=True)
+    # SI units, rad/s for frequencies.
+    values: Float[np.ndarray, " parameter"] = quantity("parameter", "SI", "value", name="value")
+    covariance: Float[np.ndarray, "parameter parameter"] = quantity(
+        "parameter other_parameter", "SI", "covariance of the values"
+    )
+    reduced_chi_square: float = setting()
+    names: tuple[str, ...] = quantity("parameter", "", "name", name="parameter", static=True)
     noise_stated: bool = eqx.field(static=True)
-    status: MinimisationStatus = eqx.field(static=True)
-    notes: tuple[str, ...] = eqx.field(static=True)
+    status: MinimisationStatus = setting()
+    notes: tuple[Fact, ...] = setting()
 
     @property
     def std(self) -> Float[np.ndarray, " parameter"]:
@@ -62,22 +66,12 @@ class AbstractCalibration(AbstractResult):
         )
 
     def variables(self) -> dict[str, Variable]:
-        """See `AbstractResult`."""
-        per, across = ("parameter",), ("parameter", "other_parameter")
-        return {
-            "parameter": Variable(per, np.array(self.names), "", "parameter"),
-            "value": Variable(per, self.values, "SI", "fitted value"),
-            "std": Variable(per, self.std, "SI", "1σ"),
-            "covariance": Variable(across, self.covariance, "SI", "covariance of the values"),
-        }
+        """Those of the fields, with 1σ of the values."""
+        return {**super().variables(), "std": Variable(("parameter",), self.std, "SI", "1σ")}
 
     def attributes(self) -> dict[str, str | float | int]:
-        """See `AbstractResult`."""
-        return {
-            "status": str(self.status),
-            "reduced_chi_square": self.reduced_chi_square,
-            "notes": "\n".join(self.notes),
-        }
+        """How the fit ended, and what it has to tell."""
+        return {**super().attributes(), "status": str(self.status)}
 
 
 class CalibratedModel(AbstractCalibration):
@@ -89,23 +83,13 @@ class CalibratedModel(AbstractCalibration):
     much its velocities were found to be too large and to lead.
     """
 
-    residuals: Float[np.ndarray, "state column"]
-    state_converged: Bool[np.ndarray, " state"]
-    level_gain: Float[np.ndarray, " level"]  # relative
-    level_phase: Float[np.ndarray, " level"]  # rad
+    residuals: Float[np.ndarray, "state column"] = quantity(
+        "state column", "1", "residual in units of 1σ", name="residual"
+    )
+    state_converged: Bool[np.ndarray, " state"] = quantity("state", "1", "has weight")
+    level_gain: Float[np.ndarray, " level"] = quantity("level", "1", "velocities too large by")
+    level_phase: Float[np.ndarray, " level"] = quantity("level", "deg", "velocities lead by")
 
     def data_in_words(self) -> str:
         """See `AbstractCalibration`."""
         return f"{int(np.sum(self.state_converged))} of {len(self.state_converged)} steady states"
-
-    def variables(self) -> dict[str, Variable]:
-        """See `AbstractResult`."""
-        states, level = ("state", "column"), ("level",)
-        lead = np.degrees(self.level_phase)
-        return {
-            **super().variables(),
-            "residual": Variable(states, self.residuals, "1", "residual in units of 1σ"),
-            "state_converged": Variable(("state",), self.state_converged, "1", "has weight"),
-            "level_gain": Variable(level, self.level_gain, "1", "velocities too large by"),
-            "level_phase_deg": Variable(level, lead, "deg", "velocities lead by"),
-        }

@@ -6,14 +6,13 @@ the harmonic balance is solved for the rest of the motion and for the force: sin
 folds. The residual is the difference of that force from the measured one.
 """
 
+import dataclasses
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import lineax as lx
 import numpy as np
-import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 from snrmjax.identify.calibrate.calibrated_model import CalibratedModel
@@ -36,8 +35,14 @@ from snrmjax.model.parameters import (
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import mapped
 from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.least_squares import inverse_of
-from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
+from snrmjax.numerics.levenberg_marquardt import (
+    MinimisationStatus,
+    Minimum,
+    StepRule,
+    minimise,
+)
 
 
 class _Round(NamedTuple):
@@ -45,23 +50,21 @@ class _Round(NamedTuple):
 
     In the first rounds, far from the truth, what the data say little about stays within a relative
     step of about `step`, and harmonics, which mislead there, have a relative error of
-    `harmonic_error`. `tolerance` is that of the solver, relative and in 1σ.
+    `harmonic_error`. A round ends with a step that lowers χ² by less than `settled`.
     """
 
     step: float
     harmonic_error: float
-    tolerance: float
+    settled: float
 
 
 _ROUNDS = (
     _Round(0.1, 1.0, 1e-3),
     _Round(0.3, 0.1, 1e-3),
     _Round(np.inf, 0.0, 1e-3),
-    _Round(np.inf, 0.0, 1e-8),
+    _Round(np.inf, 0.0, 1e-12),
 )
-# Unknowns in units of so many 1σ: the solver's damping, one unit's worth at first, is then light.
-_LIGHT = 30.0
-_STEPS = 60
+_RULE = StepRule(steps=60)
 
 
 class _Settings(NamedTuple):
@@ -93,8 +96,8 @@ class _Aim(NamedTuple):
 
     def parameters(self, unknowns: Float[Array, " unknown"]) -> Float[Array, " parameter"]:
         """The parameters themselves."""
-        own = unknowns[: self.values.shape[0]]
-        return jnp.where(self.values != 0, self.values * (1 + own), own)
+        changes = unknowns[: self.values.shape[0]]
+        return jnp.where(self.values != 0, self.values * (1 + changes), changes)
 
     def misses(self, unknowns: Float[Array, " unknown"]) -> Float[Array, " unknown"]:
         """Residuals of the unknowns themselves."""
@@ -128,8 +131,8 @@ def calibrate_model(
     complex force with which the model has the measured frequency and fundamental velocity
     (`inverse_force`), and of the differences at other sensors and of harmonics with a stated
     error. The covariance of a state's residuals follows from the stated errors of force, velocity
-    and phase; it is taken anew where a fit ended. Levenberg–Marquardt (optimistix), with the
-    balance's exact derivatives.
+    and phase; it is taken anew where a fit ended. Levenberg–Marquardt, with the balance's exact
+    derivatives.
 
     Arguments: `model` gives the start and all that is not fitted; `parameters` are out of
     `parameter_names`. `level_gain_std` (relative) and `level_phase_std` (rad) are 1σ of errors
@@ -224,8 +227,8 @@ def _slopes(
 ) -> _Slopes:
     def one(state: CalibrationStates, start: Array) -> _Slopes:
         def both(unknowns: Array, error: Array) -> tuple:
-            found = _columns(model, state, settings, aim, unknowns, error, start)
-            return found, found
+            columns_and_point = _columns(model, state, settings, aim, unknowns, error, start)
+            return columns_and_point, columns_and_point
 
         slopes = jax.jacfwd(both, argnums=(0, 1), has_aux=True)
         (columns, points), (value, point) = slopes(unknowns, jnp.zeros_like(state.error))
@@ -234,46 +237,12 @@ def _slopes(
     return mapped(one, states, near)
 
 
-@compiled
-def _fit(
-    model: Structure,
-    states: CalibrationStates,
-    settings: _Settings,
-    aim: _Aim,
-    start: Float[Array, " unknown"],
-    slopes: _Slopes,
-    whiten: Float[Array, "state column column"],
-    unit: Float[Array, " unknown"],
-    hold: Float[Array, " unknown"],
-    tolerance: Float[Array, ""],
-) -> tuple[Array, Array, Array]:
-    """The unknowns that fit best, solutions near theirs, and whether the solver converged."""
+class _Linear(NamedTuple):
+    """The whitened problem at some unknowns."""
 
-    def near(change: Array) -> Array:
-        return jax.lax.stop_gradient(slopes.points + slopes.points_by_unknown @ change)
-
-    def residuals(y: Array, _: None = None) -> Array:
-        unknowns = start + y * unit
-
-        def one(state: CalibrationStates, begin: Array) -> Array:
-            none = jnp.zeros_like(state.error)
-            return _columns(model, state, settings, aim, unknowns, none, begin)[0]
-
-        # A state that is lost on the way is NaN: the solver then takes a smaller step.
-        of_states = whitened_columns(whiten, mapped(one, states, near(y * unit)))
-        rest = jnp.append(aim.misses(unknowns), hold * y * unit)
-        return jnp.append(of_states.reshape(-1), rest)
-
-    limits: dict[str, Any] = {"rtol": tolerance, "atol": tolerance}
-    solver: optx.AbstractLeastSquaresSolver = optx.LevenbergMarquardt(
-        **limits, linear_solver=lx.QR()
-    )
-    solution: optx.Solution = optx.least_squares(
-        residuals, solver, jnp.zeros_like(start), max_steps=_STEPS, throw=False
-    )
-    change = solution.value * unit
-    good = jnp.asarray(solution.result == optx.RESULTS.successful)
-    return start + change, near(change), good
+    residuals: Float[np.ndarray, " row"]
+    jacobian: Float[np.ndarray, "row unknown"]
+    slopes: _Slopes
 
 
 class _Fitted(NamedTuple):
@@ -287,40 +256,63 @@ class _Fitted(NamedTuple):
 def _fitted(model: Structure, states: CalibrationStates, settings: _Settings, aim: _Aim) -> _Fitted:
     """Fit, whiten anew where the fit ended, and fit again."""
     subject = (model, states, settings)
-    unknowns = jnp.zeros(len(settings.names) + settings.n_levels * len(settings.shared))
-    slopes = _slopes(*subject, aim, unknowns, _grown(*subject, aim.values))
+    unknowns = np.zeros(len(settings.names) + settings.n_levels * len(settings.shared))
     status, relative = MinimisationStatus.NOT_FITTED, np.asarray(aim.values) != 0
-    for turn, (step, harmonic_error, tolerance) in enumerate(_ROUNDS):
+    slopes = _slopes(*subject, aim, jnp.asarray(unknowns), _grown(*subject, aim.values))
+    for turn, (step, harmonic_error, settled) in enumerate(_ROUNDS):
         lost = ~np.isfinite(np.asarray(slopes.points[:, -1]))
         if turn and lost.any():
-            again = jnp.where(
-                lost[:, None], _grown(*subject, aim.parameters(unknowns)), slopes.points
-            )
-            slopes = _slopes(*subject, aim, unknowns, again)
-        whiten = state_whitener(states, slopes.by_error, jnp.asarray(harmonic_error))
-        # Every unknown in its own unit: the solver's damping then treats them alike.
-        size = np.linalg.norm(_jacobian(whiten, slopes, aim), axis=0)
-        unit = jnp.asarray(_LIGHT / np.where(size > 0, size, 1.0))
-        hold = jnp.asarray(np.append(relative / step, np.zeros(len(unknowns) - len(relative))))
-        unknowns, near, ended = _fit(
-            *subject, aim, unknowns, slopes, whiten, unit, hold, jnp.asarray(tolerance)
-        )
-        slopes = _slopes(*subject, aim, unknowns, near)
-        status = MinimisationStatus.CONVERGED if bool(ended) else MinimisationStatus.STEP_LIMIT
-    if not np.any(np.asarray(whiten)):
+            grown = _grown(*subject, aim.parameters(jnp.asarray(unknowns)))
+            again = jnp.where(lost[:, None], grown, slopes.points)
+            slopes = _slopes(*subject, aim, jnp.asarray(unknowns), again)
+        whiten = np.asarray(state_whitener(states, slopes.by_error, jnp.asarray(harmonic_error)))
+        hold = np.append(relative / step, np.zeros(len(unknowns) - len(relative)))
+        end = _settled(subject, aim, unknowns, slopes, whiten, hold, settled)
+        unknowns, slopes, status = end.point, end.linearised.slopes, end.status
+    if not np.any(whiten):
         status = MinimisationStatus.NOT_FINITE
     return _Fitted(
-        unknowns=np.asarray(unknowns),
-        residuals=whitened_columns(*map(np.asarray, (whiten, slopes.columns))),
+        unknowns=unknowns,
+        residuals=whitened_columns(whiten, np.asarray(slopes.columns)),
         jacobian=_jacobian(whiten, slopes, aim),
-        usable=np.any(np.asarray(whiten) != 0, axis=(1, 2)),
+        usable=np.any(whiten != 0, axis=(1, 2)),
         status=status,
     )
 
 
-def _jacobian(whiten: Array, slopes: _Slopes, aim: _Aim) -> np.ndarray:
-    own, by_unknown = np.asarray(whiten), np.asarray(slopes.by_unknown)
-    of_states = whitened_columns(own, by_unknown).reshape(-1, by_unknown.shape[-1])
+def _settled(
+    subject: tuple[Structure, CalibrationStates, _Settings],
+    aim: _Aim,
+    begin: Float[np.ndarray, " unknown"],
+    slopes: _Slopes,
+    whiten: Float[np.ndarray, "state column column"],
+    hold: Float[np.ndarray, " unknown"],
+    settled: float,
+) -> Minimum[_Linear]:
+    """The best unknowns with states whitened like this, held near where they begin."""
+
+    def linear(unknowns: np.ndarray, at: _Slopes) -> _Linear:
+        columns = whitened_columns(whiten, np.asarray(at.columns)).reshape(-1)
+        misses = np.asarray(aim.misses(jnp.asarray(unknowns)))
+        jacobian = np.concatenate([_jacobian(whiten, at, aim), np.diag(hold)])
+        return _Linear(np.concatenate([columns, misses, hold * (unknowns - begin)]), jacobian, at)
+
+    def evaluate(trials: np.ndarray) -> list[_Linear]:
+        # A state that is lost on the way is NaN: a smaller step is then taken.
+        near = [slopes.points + slopes.points_by_unknown @ (trial - begin) for trial in trials]
+        return [
+            linear(trial, _slopes(*subject, aim, jnp.asarray(trial), start))
+            for trial, start in zip(trials, near, strict=True)
+        ]
+
+    anywhere = np.full(len(begin), -np.inf), np.full(len(begin), np.inf)
+    rule = dataclasses.replace(_RULE, settled=settled)
+    return minimise(evaluate, begin[None], [linear(begin, slopes)], anywhere, rule)[0]
+
+
+def _jacobian(whitener: np.ndarray, slopes: _Slopes, aim: _Aim) -> np.ndarray:
+    by_unknown = np.asarray(slopes.by_unknown)
+    of_states = whitened_columns(whitener, by_unknown).reshape(-1, by_unknown.shape[-1])
     values, weight = np.asarray(aim.values), np.asarray(aim.weight)
     of_parameters = np.where(values != 0, values, 1.0) * weight
     shared = np.ones(by_unknown.shape[-1] - len(values))
@@ -330,26 +322,26 @@ def _jacobian(whiten: Array, slopes: _Slopes, aim: _Aim) -> np.ndarray:
 def _result(
     model: Structure, n_states: int, chosen: ComparedColumns, settings: _Settings, aim: _Aim
 ) -> CalibratedModel:
-    found = _fitted(model, chosen.states, settings, aim)
-    names, p, usable = settings.names, len(settings.names), found.usable
+    fit = _fitted(model, chosen.states, settings, aim)
+    names, p, usable = settings.names, len(settings.names), fit.usable
     known = np.asarray(chosen.states.known) & usable[:, None]
     freedom = int(known.sum()) + int(np.sum(np.asarray(aim.weight) > 0)) - p
-    square = np.sum(found.residuals**2) + np.sum(
-        np.asarray(aim.misses(jnp.asarray(found.unknowns))) ** 2
+    square = np.sum(fit.residuals**2) + np.sum(
+        np.asarray(aim.misses(jnp.asarray(fit.unknowns))) ** 2
     )
     reduced = float(square) / freedom if freedom > 0 else np.nan
-    values = np.asarray(aim.parameters(jnp.asarray(found.unknowns)))
+    values = np.asarray(aim.parameters(jnp.asarray(fit.unknowns)))
     unit = np.where(np.asarray(aim.values) != 0, np.asarray(aim.values), 1.0)
-    covariance = _inverse_of_square(found.jacobian)[:p, :p] * unit * unit[:, None]
+    covariance = _inverse_of_square(fit.jacobian)[:p, :p] * unit * unit[:, None]
     scatter = float(np.sqrt(2 / max(freedom, 1)))  # 1σ of the reduced χ²
     if not chosen.noise_stated or not reduced <= 1 + 3 * scatter:
         covariance = covariance * reduced
     std = np.sqrt(np.diag(covariance))
-    level = found.unknowns[p:].reshape(settings.n_levels, -1) * np.asarray(aim.level_std)
+    level = fit.unknowns[p:].reshape(settings.n_levels, -1) * np.asarray(aim.level_std)
     shared = dict(zip(settings.shared, level.T, strict=True))
     nothing = np.zeros(settings.n_levels)
     residuals = np.full((n_states, known.shape[1]), np.nan)
-    residuals[chosen.rows] = np.where(known, found.residuals, np.nan)
+    residuals[chosen.rows] = np.where(known, fit.residuals, np.nan)
     converged = np.zeros(n_states, dtype=bool)
     converged[chosen.rows] = usable
     fitted = with_parameters(model, names, jnp.asarray(values))
@@ -364,36 +356,27 @@ def _result(
         reduced_chi_square=reduced,
         names=names,
         noise_stated=chosen.noise_stated,
-        status=found.status,
-        notes=(*chosen.notes, *_notes(chosen, names, found, reduced, 3 * scatter)),
+        status=fit.status,
+        notes=(*chosen.notes, *_notes(chosen, names, fit, reduced, 3 * scatter)),
     )
 
 
 def _notes(
-    chosen: ComparedColumns, names: tuple[str, ...], found: _Fitted, reduced: float, margin: float
-) -> list[str]:
+    chosen: ComparedColumns, names: tuple[str, ...], fit: _Fitted, reduced: float, margin: float
+) -> list[Fact]:
     notes = []
-    if found.status == MinimisationStatus.NOT_FINITE:
-        notes.append("no balanced motion was found for any state: nothing was fitted.")
-    elif not found.status.found_minimum:
-        notes.append(
-            f"the fit did not converge within {_STEPS} steps: values and standard deviations are "
-            "not those of a minimum; start nearer, or fit fewer parameters."
-        )
-    if not found.usable.all():
-        lost = ", ".join(str(k) for k in chosen.rows[~found.usable])
-        notes.append(f"no balanced motion was found for the states {lost}: they have no weight.")
-    times = f"{np.sqrt(reduced):.2g} times the stated noise"
-    if chosen.noise_stated and not reduced <= 1 + margin:
-        notes.append(
-            f"residuals are {times}: it is understated or the model lacks something; the standard "
-            "deviations are widened accordingly."
-        )
-    if chosen.noise_stated and reduced < 1 - margin:
-        notes.append(f"residuals are only {times}: it is overstated.")
-    blind = [name for name, slope in zip(names, found.jacobian.T, strict=False) if not slope.any()]
+    if fit.status == MinimisationStatus.NOT_FINITE:
+        notes.append(Fact("no_motion_for_calibration"))
+    elif not fit.status.found_minimum:
+        notes.append(Fact("calibration_not_converged"))
+    if not fit.usable.all():
+        notes.append(Fact("states_without_motion", states=tuple(chosen.rows[~fit.usable].tolist())))
+    if chosen.noise_stated and not abs(reduced - 1) <= margin:
+        notes.append(Fact("calibration_noise", scale=float(np.sqrt(reduced))))
+    slopes = zip(names, fit.jacobian.T, strict=False)
+    blind = tuple(name for name, slope in slopes if not slope.any())
     if blind:
-        notes.append(f"the data say nothing about {', '.join(blind)}.")
+        notes.append(Fact("parameters_without_data", names=blind))
     return notes
 
 

@@ -12,6 +12,7 @@ from snrmjax.measure.states import SteadyStates, check_force, relative_errors
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import taken
 from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.facts import Fact
 
 OneKind = TypeVar("OneKind", Array, np.ndarray)
 
@@ -47,7 +48,7 @@ class ComparedColumns(NamedTuple):
     orders: tuple[int, ...]  # harmonics that are compared
     phase_unknown: Bool[np.ndarray, "state sensor"]
     noise_stated: bool
-    notes: tuple[str, ...]
+    notes: tuple[Fact, ...]
 
 
 def calibration_states(
@@ -68,15 +69,15 @@ def calibration_states(
             f"{list(model.modes.sensors)}."
         )
     check_force(data, "a comparison with a model")
-    notes: list[str] = []
+    notes = []
     # Operations of JAX compile for every number of states.
-    told: Any = jax.tree.map(np.asarray, data)
+    host: Any = jax.tree.map(np.asarray, data)
     r = reference_sensor(model.modes)
-    sensors = [r, *(s for s in range(len(told.sensors)) if s != r)]
-    velocity = told.velocity[:, sensors]
+    sensors = [r, *(s for s in range(len(host.sensors)) if s != r)]
+    velocity = host.velocity[:, sensors]
     size = np.abs(velocity)
-    measured = told.measured[:, sensors] & np.isfinite(size) & (size > 0)
-    force, frequency = told.force, told.frequency
+    measured = host.measured[:, sensors] & np.isfinite(size) & (size > 0)
+    force, frequency = host.force, host.frequency
     rows = np.flatnonzero(measured[:, 0] & np.isfinite(force) & (force > 0) & (frequency > 0))
     if not rows.size:
         raise ValueError(
@@ -84,47 +85,47 @@ def calibration_states(
             "that sees the mode of interest best."
         )
     velocity, measured = np.where(measured, velocity, 0.0)[rows], measured[rows]
-    told = taken(told, rows)
-    errors = np.asarray(relative_errors(told))[:, sensors]
+    host = taken(host, rows)
+    errors = np.asarray(relative_errors(host))[:, sensors]
     stated = bool(np.all(errors[measured][:, 1:] > 0))  # NaN is not
     if not stated:
-        stated_for = "not all are" if np.any(errors[measured][:, 1:] > 0) else "none is"
+        in_part = bool(np.any(errors[measured][:, 1:] > 0))
         errors = np.broadcast_to([0.0, ASSUMED_ERROR, ASSUMED_ERROR], errors.shape)
-        notes.append(f"every point is given the same relative error, as {stated_for} stated.")
+        notes.append(Fact("equal_errors_assumed", some_stated=in_part))
     errors = np.where(measured[..., None], errors, 0.0)
-    places = [k for k, h in enumerate(told.harmonic_order) if 1 < h <= harmonic_order]
-    harmonics = told.harmonics[:, sensors][..., places]
-    std = told.harmonic_std[:, sensors] / np.abs(velocity[:, :1])
+    places = [k for k, h in enumerate(host.harmonic_order) if 1 < h <= harmonic_order]
+    harmonics = host.harmonics[:, sensors][..., places]
+    std = host.harmonic_std[:, sensors] / np.abs(velocity[:, :1])
     there = np.isfinite(np.abs(harmonics)) & (measured & (std > 0))[..., None]
-    unknown = np.asarray(told.phase_unknown)[:, sensors]
+    unknown = np.asarray(host.phase_unknown)[:, sensors]
     unknown = measured & (unknown | unknown[:, :1])
     velocity = np.where(unknown, np.abs(velocity), velocity)
     harmonics = np.where(unknown[..., None], np.abs(harmonics), harmonics)
     errors[..., 2] = np.where(unknown, 0.0, errors[..., 2])
     if places and not there.any():
-        notes.append("harmonics are left out: no error is stated for them.")
+        notes.append(Fact("harmonics_without_error"))
         harmonics, there, places = harmonics[..., :0], there[..., :0], []
     n = len(rows)
     real = np.concatenate([np.ones((n, 1), bool), measured[:, 1:], there.reshape(n, -1)], axis=1)
     alone = [unknown, np.repeat(unknown, len(places), axis=1)]
     known = np.stack([real, real & ~np.concatenate(alone, axis=1)], axis=2).reshape(n, -1)
     # Each part of a complex error has half its square.
-    own = np.where(there, std[..., None] / np.sqrt(2), 0.0).reshape(n, -1)
-    order = told.order
-    levels, level = np.unique(told.level, return_inverse=True)
+    own_std = np.where(there, std[..., None] / np.sqrt(2), 0.0).reshape(n, -1)
+    order = host.order
+    levels, level = np.unique(host.level, return_inverse=True)
     columns: list[Any] = [
         level,
-        told.frequency,
-        told.force,
+        host.frequency,
+        host.force,
         np.where(np.isfinite(order), order, np.asarray(model.test_order)),
         velocity,
         np.where(there, harmonics, 0.0),
         np.concatenate([errors[:, 0, :1], *np.moveaxis(errors, 2, 0)[1:]], 1),
-        np.repeat(np.pad(own, ((0, 0), (len(sensors), 0))), 2, axis=1),
+        np.repeat(np.pad(own_std, ((0, 0), (len(sensors), 0))), 2, axis=1),
         known,
     ]
     parts = jax.device_put(CalibrationStates(*columns), may_alias=False)
-    orders = tuple(told.harmonic_order[k] for k in places)
+    orders = tuple(host.harmonic_order[k] for k in places)
     own_places = (tuple(sensors), orders, unknown)
     return ComparedColumns(parts, rows, len(levels), *own_places, stated, tuple(notes))
 
@@ -145,9 +146,9 @@ def state_whitener(
     scaled = jnp.where(good, by_error, 1.0) * states.error[:, None, :]
     size = jnp.abs(states.harmonics).reshape(len(by_error), -1) / jnp.abs(states.velocity[:, :1])
     wide = jnp.pad(size, ((0, 0), (states.velocity.shape[1], 0)))
-    own = states.own_std**2 + harmonic_error**2 * jnp.repeat(wide, 2, axis=1) ** 2
-    own = jnp.where(states.known, own, 1.0)
-    covariance = scaled @ scaled.transpose(0, 2, 1) + jax.vmap(jnp.diag)(own)
+    alone = states.own_std**2 + harmonic_error**2 * jnp.repeat(wide, 2, axis=1) ** 2
+    alone = jnp.where(states.known, alone, 1.0)
+    covariance = scaled @ scaled.transpose(0, 2, 1) + jax.vmap(jnp.diag)(alone)
     # Rounding must not make it singular.
     floor = 1e-14 * jnp.trace(covariance, axis1=1, axis2=2)[:, None, None]
     eye = jnp.eye(covariance.shape[1])

@@ -9,12 +9,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
 from snrmjax.identify.calibrate.calibration_states import CalibrationStates, calibration_states
-from snrmjax.identify.pointwise.inversion_result import spans
 from snrmjax.measure.states import SteadyStates, check_phases
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import mapped
 from snrmjax.numerics.compiled import compiled
-from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.result import AbstractResult, Variable, quantity
 from snrmjax.simulate.balance.prescribed_motion import PrescribedMotion, prescribed_motion
 
 
@@ -25,29 +24,21 @@ class InverseForce(AbstractResult):
 
     force: Complex[Array, " state"]  # N, as recorded, relative to the phase of the measured force
     velocity: Complex[Array, "state harmonic sensor"]  # m/s, as recorded, h = 0…H
-    converged: Bool[Array, " state"]
-
-    def summary(self) -> tuple[str, ...]:
-        """See `AbstractResult`."""
-        found = int(np.sum(np.asarray(self.converged)))
-        return (
-            f"InverseForce: {found} of {len(self.converged)} motions found",
-            f"force {spans(np.abs(np.asarray(self.force)))} N",
-        )
+    converged: Bool[Array, " state"] = quantity("state", "1", "whether a motion was found")
 
     def variables(self) -> dict[str, Variable]:
-        """See `AbstractResult`."""
+        """Real and imaginary parts of forces and velocities."""
         force, velocity = np.asarray(self.force), np.asarray(self.velocity)
+        state, where = ("state",), ("state", "harmonic", "sensor")
         n, orders = velocity.shape[:2]
-        where = ("state", "harmonic", "sensor")
         return {
-            "state": Variable(("state",), np.arange(n), "1", "steady state"),
+            "state": Variable(state, np.arange(n), "1", "steady state"),
             "harmonic": Variable(("harmonic",), np.arange(orders), "1", "harmonic order"),
-            "force_re_n": Variable(("state",), force.real, "N", "force in phase with the measured"),
-            "force_im_n": Variable(("state",), force.imag, "N", "force 90° ahead of it"),
+            "force_re_n": Variable(state, force.real, "N", "force in phase with the measured"),
+            "force_im_n": Variable(state, force.imag, "N", "force 90° ahead of it"),
             "velocity_re_m_s": Variable(where, velocity.real, "m/s", "velocity, real part"),
             "velocity_im_m_s": Variable(where, velocity.imag, "m/s", "velocity, imaginary part"),
-            "converged": Variable(("state",), self.converged, "1", "whether a motion was found"),
+            **super().variables(),
         }
 
 
@@ -74,13 +65,13 @@ def inverse_force(model: Structure, data: SteadyStates, *, harmonic_order: int =
     """
     check_phases(data, "an inverse force")
     chosen = calibration_states(model, data, harmonic_order)
-    found = _needed(model, chosen.states, chosen.sensors[0], harmonic_order)
+    solved = _needed(model, chosen.states, chosen.sensors[0], harmonic_order)
     n, rows = data.n_states, chosen.rows
-    nothing = jnp.full((n, *found.velocity.shape[1:]), jnp.nan, dtype=jnp.complex128)
+    nothing = jnp.full((n, *solved.velocity.shape[1:]), jnp.nan, dtype=jnp.complex128)
     return InverseForce(
-        force=nothing[:, 0, 0].at[rows].set(found.force),
-        velocity=nothing.at[rows].set(found.velocity),
-        converged=jnp.zeros(n, dtype=bool).at[rows].set(found.converged),
+        force=nothing[:, 0, 0].at[rows].set(solved.force),
+        velocity=nothing.at[rows].set(solved.velocity),
+        converged=jnp.zeros(n, dtype=bool).at[rows].set(solved.converged),
     )
 
 
@@ -111,8 +102,8 @@ class StateWithErrors(NamedTuple):
     def velocity(self) -> Complex[Array, " sensor"]:
         """Fundamentals freed of the errors, in m/s."""
         n = self.state.velocity.shape[0]
-        own = jnp.exp(self.error[1 : n + 1] + 1j * self.error[n + 1 :])
-        return self.state.velocity * self.factor * own
+        factors = jnp.exp(self.error[1 : n + 1] + 1j * self.error[n + 1 :])
+        return self.state.velocity * self.factor * factors
 
     def harmonics(self, orders: tuple[int, ...]) -> Complex[Array, "sensor harmonic"]:
         """Harmonics freed of the errors, in m/s: a phase is an error of time, h times as large."""
@@ -147,8 +138,8 @@ def residual_columns(
     seen = seen[:, np.array(sensors)]
     higher = seen[np.array(orders, dtype=int)].T - harmonics
     missed = jnp.append((seen[1] - velocity)[1:], higher.reshape(-1)) / jnp.abs(state.velocity[0])
-    own = (force - state.force * jnp.exp(erring.error[0])) / state.force
-    each = jnp.append(own, missed)
+    force_misfit = (force - state.force * jnp.exp(erring.error[0])) / state.force
+    each = jnp.append(force_misfit, missed)
     parts = jnp.stack([each.real, each.imag], axis=1).reshape(-1)
     return jnp.where(state.known, parts, 0.0)
 

@@ -32,18 +32,18 @@ def residual_autocorrelation(
     Reference: for the sum up to the first negative one, Geyer, Stat. Sci. 7 (1992) 473,
     doi:10.1214/ss/1177011137.
     """
-    found = []
+    correlations = []
     for part in residuals.T:
         neighbours, pairs = _correlation(part, levels, 1)
         if neighbours * np.sqrt(pairs) <= _CERTAIN or np.mean(part**2) < _NOTHING**2:
-            found.append(0.0)
+            correlations.append(0.0)
             continue
-        total, lag, own = 1.0, 1, neighbours
-        while own > 0:
-            total, lag = total + 2 * own, lag + 1
-            own = _correlation(part, levels, lag)[0]
-        found.append(min(max(neighbours, (total - 1) / (total + 1)), _LARGEST))
-    return np.array(found)
+        total, lag, correlation = 1.0, 1, neighbours
+        while correlation > 0:
+            total, lag = total + 2 * correlation, lag + 1
+            correlation = _correlation(part, levels, lag)[0]
+        correlations.append(min(max(neighbours, (total - 1) / (total + 1)), _LARGEST))
+    return np.array(correlations)
 
 
 def share_told_by(

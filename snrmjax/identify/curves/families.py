@@ -6,12 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.special import expit
 
 from snrmjax.identify.curves.family_base import (
     AbstractFamily,
     Argument,
     Coefficient,
+    Terms,
     linear_start,
 )
 from snrmjax.identify.curves.splines import SmoothingSpline, Spline
@@ -23,7 +23,7 @@ class SumOfPowers(AbstractFamily):
     named: ClassVar[dict[str, float]]  # the terms and their powers, where their number is fixed
 
     @classmethod
-    def terms(cls, order: int) -> dict[str, float]:
+    def powers(cls, order: int) -> dict[str, float]:
         """Names of the terms and their powers."""
         return cls.named
 
@@ -32,32 +32,14 @@ class SumOfPowers(AbstractFamily):
         """Number of terms beside the first."""
         return self.parameters.shape[0] - 1
 
-    def __call__(self, amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    def terms(self) -> Terms:
         """See `AbstractFamily`."""
-        x = jnp.asarray(amplitude) / self.scale
-        terms = [
-            p * _power(x, power)
-            for p, power in zip(self.parameters, self.terms(self.order).values(), strict=True)
-        ]
-        return sum(terms[1:], terms[0])
+        return Terms.of_powers(list(self.powers(self.order).values()))
 
     def coefficients(self) -> tuple[Coefficient, ...]:
         """See `AbstractFamily`."""
-        pairs = self.terms(self.order).items()
+        pairs = self.powers(self.order).items()
         return tuple(Coefficient(name, power, True) for name, power in pairs)
-
-    def values_and_slopes(
-        self, amplitude: Float[np.ndarray, " point"]
-    ) -> tuple[Float[np.ndarray, " point"], Float[np.ndarray, "point parameter"]]:
-        """See `AbstractCurve`."""
-        x, parameters = amplitude / float(self.scale), np.asarray(self.parameters)
-        powers = np.array([*self.terms(self.order).values()])
-        some = np.where(x > 0, x, 1.0)[:, None] ** powers
-        columns = np.where(x[:, None] > 0, some, powers == 0)
-        values = columns @ parameters
-        # Dry friction: its equivalent damping grows without bound towards rest.
-        dry = float(np.sum(parameters[powers < 0]))
-        return np.where((x > 0) | (dry == 0), values, np.copysign(np.inf, dry)), columns
 
     @classmethod
     def starts(
@@ -70,18 +52,9 @@ class SumOfPowers(AbstractFamily):
     ) -> list[AbstractFamily]:
         """See `AbstractFamily`."""
         scale = float(np.max(amplitude))
-        columns = np.stack([(amplitude / scale) ** p for p in cls.terms(order).values()], axis=1)
+        columns = np.stack([(amplitude / scale) ** p for p in cls.powers(order).values()], axis=1)
         start = linear_start(columns, values, weight)
         return [cls(jnp.asarray(start), jnp.asarray(scale, dtype=jnp.float64), argument)]
-
-
-def _power(x: Array, power: float) -> Array:
-    if power == 0:
-        return jnp.ones_like(x)
-    if power < 0:
-        # Dry friction: its equivalent damping grows without bound towards rest.
-        return jnp.where(x > 0, jnp.where(x > 0, x, 1.0) ** power, jnp.inf)
-    return x ** (int(power) if float(power).is_integer() else power)
 
 
 class Polynomial(SumOfPowers):
@@ -96,7 +69,7 @@ class Polynomial(SumOfPowers):
         return self.order
 
     @classmethod
-    def terms(cls, order: int) -> dict[str, float]:
+    def powers(cls, order: int) -> dict[str, float]:
         """See `SumOfPowers`."""
         return {"at_zero": 0.0} | {f"power_{2 * k}": 2.0 * k for k in range(1, order + 1)}
 
@@ -138,27 +111,14 @@ class PowerLaw(AbstractFamily):
     largest_exponent: ClassVar[float] = 6.0
     tried: ClassVar[tuple[float, ...]] = (0.5, 1.0, 2.0, 4.0)
 
-    def __call__(self, amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    def terms(self) -> Terms:
         """See `AbstractFamily`."""
-        x = jnp.asarray(amplitude) / self.scale
-        known = x > 0
-        power = jnp.exp(self.exponent * jnp.log(jnp.where(known, x, 1.0)))
-        return self.parameters[0] + self.parameters[1] * jnp.where(known, power, 0.0)
-
-    def values_and_slopes(
-        self, amplitude: Float[np.ndarray, " point"]
-    ) -> tuple[Float[np.ndarray, " point"], Float[np.ndarray, "point parameter"]]:
-        """See `AbstractCurve`."""
-        x, parameters = amplitude / float(self.scale), np.asarray(self.parameters)
-        exponent = float(self.largest_exponent * expit(parameters[2]))
-        term, share = x**exponent, exponent / self.largest_exponent
-        by_logit = exponent * (1 - share) * parameters[1] * term * np.log(np.where(x > 0, x, 1.0))
-        values = parameters[0] + parameters[1] * term
-        return values, np.stack([np.ones_like(x), term, by_logit], axis=1)
-
-    def prior_residuals(self) -> Float[Array, " row"]:
-        """See `AbstractCurve`."""
-        return self.parameters[2:] / self.odds_std
+        plain = Terms.of_powers([0.0, 0.0], 3)
+        return plain._replace(
+            is_free=np.array([False, True]),
+            largest_exponent=self.largest_exponent,
+            prior=np.array([[0.0, 0.0, 1 / self.odds_std]]),
+        )
 
     @property
     def exponent(self) -> Float[Array, ""]:
@@ -184,13 +144,13 @@ class PowerLaw(AbstractFamily):
     ) -> list[AbstractFamily]:
         """See `AbstractFamily`."""
         scale = float(np.max(amplitude))
-        found: list[AbstractFamily] = []
+        members: list[AbstractFamily] = []
         for power in cls.tried:
             columns = np.stack([np.ones(len(values)), (amplitude / scale) ** power], axis=1)
             share = power / cls.largest_exponent
             start = [*linear_start(columns, values, weight), np.log(share / (1 - share))]
-            found.append(cls(jnp.asarray(start), jnp.asarray(scale, dtype=jnp.float64), argument))
-        return found
+            members.append(cls(jnp.asarray(start), jnp.asarray(scale, dtype=jnp.float64), argument))
+        return members
 
 
 class ViscousMicroslip(PowerLaw):
@@ -212,7 +172,9 @@ class FamilyTable(dict[str, type[AbstractFamily]]):
     def __repr__(self) -> str:
         """One line for each family."""
         width = max((len(kind) for kind in self), default=0)
-        texts = {kind: (one.__doc__ or "").strip().split("\n")[0] for kind, one in self.items()}
+        texts = {
+            kind: (family.__doc__ or "").strip().split("\n")[0] for kind, family in self.items()
+        }
         return "\n".join(f"{kind:{width}}  {text}" for kind, text in texts.items())
 
 

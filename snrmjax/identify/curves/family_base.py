@@ -1,20 +1,20 @@
-"""What every family of smooth curves of amplitude has, for the joint fit.
+"""What every curve of amplitude is made of: powers and hats, on the host and in programs alike.
 
-Every member is ω̃²(amplitude) in rad²/s² or 2ζ̃ω̃(amplitude) in 1/s. Its parameters are what its
-terms contribute at the largest measured amplitude, so that all have the unit of the value.
+Every member of a family is ω̃²(amplitude) in rad²/s² or 2ζ̃ω̃(amplitude) in 1/s. Its parameters are
+what its terms contribute at the largest measured amplitude, so that all have the unit of the value.
 """
 
 from abc import abstractmethod
-from typing import ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
+from scipy.special import expit
 
 Argument = Literal["displacement", "velocity"]
-
 
 _KIND_WORDS = {
     "polynomial": "even polynomial",
@@ -24,6 +24,8 @@ _KIND_WORDS = {
     "viscous_coulomb": "viscous and Coulomb damping",
     "viscous_microslip": "viscous and microslip damping",
 }
+_FAR = 1e6  # (amplitude/scale)² of a knot that is none
+_SIZE = 12  # parameters and powers in programs; a larger family takes a multiple of it
 
 
 class Coefficient(NamedTuple):
@@ -32,6 +34,100 @@ class Coefficient(NamedTuple):
     name: str
     power: float  # of the amplitude that the coefficient multiplies
     is_value: bool  # False: a number without unit, such as an exponent
+
+
+class Terms(NamedTuple):
+    """Σ c_k x^e_k + Σ d_k h_k(x²) with `hats` h_k, coefficients linear in the parameters."""
+
+    exponents: Float[Array | np.ndarray, " term"]
+    is_free: Bool[Array | np.ndarray, " term"]  # the exponent is the third parameter's
+    largest_exponent: Float[Array, ""] | float  # of a free one; its share is a logistic function
+    knots: Float[Array | np.ndarray, " knot"]
+    mix: Float[Array | np.ndarray, "basis parameter"]  # from parameters to coefficients
+    prior: Float[Array | np.ndarray, "row parameter"]  # what is expected near zero, in its 1σ
+
+    @classmethod
+    def of_powers(cls, exponents: list[float], n_parameters: int | None = None) -> "Terms":
+        """Powers alone, each with its parameter; further parameters are none's."""
+        n = len(exponents) if n_parameters is None else n_parameters
+        powers, free = np.array(exponents, dtype=float), np.zeros(len(exponents), dtype=bool)
+        return cls(powers, free, 1.0, np.zeros(0), np.eye(len(exponents), n), np.zeros((0, n)))
+
+
+class Linearised(NamedTuple):
+    """A curve at some amplitudes, with its derivatives."""
+
+    value: Any
+    by_parameters: Any  # one more axis
+    by_amplitude: Any
+
+
+class _Drawn(NamedTuple):
+    """A curve at some x, and what its derivatives are made of."""
+
+    value: Any
+    basis: Any  # one more axis
+    by_x: Any
+    by_third: Any  # by the third parameter, beside what it does to the coefficients
+
+
+def _drawn(x: Any, parameters: Any, terms: Terms, xp: Any) -> _Drawn:
+    """By NumPy or JAX, as `xp` says."""
+    n, has_third = len(terms.exponents), parameters.shape[0] > 2
+    bent, by_u = hats(x**2, terms.knots, xp)
+    x = x[..., None]
+    known = x > 0
+    inside = xp.where(known, x, 1.0)
+    share = (expit if xp is np else jax.nn.sigmoid)(parameters[2]) if has_third else 0.0
+    exponents = xp.where(terms.is_free, terms.largest_exponent * share, terms.exponents)
+    powers = inside**exponents
+    at_rest = xp.where(exponents == 0, 1.0, 0.0)
+    rising = xp.where(known, exponents * powers / inside, xp.where(exponents == 1, 1.0, 0.0))
+    basis = xp.concatenate([xp.where(known, powers, at_rest), bent], axis=-1)
+    slopes = xp.concatenate([rising, 2 * x * by_u], axis=-1)
+    coefficients = terms.mix @ parameters
+    by_exponent = xp.where(known & terms.is_free, powers * xp.log(inside), 0.0) @ coefficients[:n]
+    by_third = terms.largest_exponent * share * (1 - share) * by_exponent
+    # Dry friction: its equivalent damping grows without bound towards rest.
+    dry = xp.sum(xp.where(terms.exponents < 0, coefficients[:n], 0.0))
+    endless = (dry != 0) & (x[..., 0] <= 0)
+    value = xp.where(endless, xp.copysign(xp.inf, dry), basis @ coefficients)
+    return _Drawn(value, basis, slopes @ coefficients, by_third)
+
+
+@jax.custom_jvp
+def _value(x: Array, parameters: Array, terms: Terms) -> Array:
+    return _drawn(x, parameters, terms, jnp).value
+
+
+@_value.defjvp
+def _value_and_slope(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    """One basis serves all directions, where automatic rules would draw its powers for each.
+
+    Terms have no derivative: they are chosen, not fitted.
+    """
+    (x, parameters, terms), (by_x, by_parameters, _) = primals, tangents
+    drawn = _drawn(x, parameters, terms, jnp)
+    slope = drawn.by_x * by_x + drawn.basis @ (terms.mix @ by_parameters)
+    if parameters.shape[0] > 2:
+        slope = slope + drawn.by_third * by_parameters[2]
+    return _value(x, parameters, terms), slope
+
+
+def hats(u: Any, knots: Any, xp: Any) -> tuple[Any, Any]:
+    """Functions whose second derivative is a hat over three successive knots, and their slopes.
+
+    Straight outside of their hat and made of clipped differences: nothing large cancels, as it
+    does in sums of truncated powers. Arguments: `xp` NumPy or JAX's.
+    """
+    u = u[..., None]
+    left, middle, right = knots[:-2], knots[1:-1], knots[2:]
+    rise, fall = middle - left, right - middle
+    up, down = xp.clip(u - left, 0.0, rise), xp.clip(u - middle, 0.0, fall)
+    past, beyond = xp.maximum(u - middle, 0.0), xp.maximum(u - right, 0.0)
+    value = up**3 / (6 * rise) + 0.5 * (rise * past + down**2 + fall * beyond)
+    value = value - down**3 / (6 * fall)
+    return value, 0.5 * up**2 / rise + down - 0.5 * down**2 / fall
 
 
 class AbstractCurve(eqx.Module):
@@ -44,28 +140,41 @@ class AbstractCurve(eqx.Module):
     def __call__(self, amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
         """Value at the amplitude that is its own, exact in the limit of zero."""
 
-    def values_and_slopes(
-        self, amplitude: Float[np.ndarray, " point"]
-    ) -> tuple[Float[np.ndarray, " point"], Float[np.ndarray, "point parameter"]]:
-        """Values and their derivatives by the parameters, on the host.
+    def linearised(self, amplitude: Float[np.ndarray, " point"]) -> Linearised:
+        """Values and derivatives by the parameters and by the amplitude, on the host."""
+        return Linearised(*map(np.asarray, _by_program(self, jnp.asarray(amplitude))))
 
-        What `jax.jacfwd` says, which is taken where a curve has nothing of its own: programs of
-        many curves that are drawn once each would take longer to compile than all else.
-        """
-        at = jnp.asarray(amplitude)
 
-        def of(parameters: Array) -> Array:
-            return eqx.tree_at(lambda f: f.parameters, self, parameters)(at)
+@eqx.filter_jit
+def _by_program(curve: AbstractCurve, at: Array) -> Linearised:
+    def of(parameters: Array, at: Array) -> Array:
+        return eqx.tree_at(lambda f: f.parameters, curve, parameters)(at)
 
-        return np.asarray(self(at)), np.asarray(jax.jacfwd(of)(self.parameters))
+    # Every amplitude has its own value: one push forward along ones gives all slopes.
+    value, slope = jax.jvp(lambda at: of(curve.parameters, at), (at,), (jnp.ones_like(at),))
+    return Linearised(value, jax.jacfwd(of)(curve.parameters, at), slope)
 
-    def prior_residuals(self) -> Float[Array, " row"]:
-        """What is expected to be near zero of a curve, in its own 1σ; of most curves nothing."""
-        return jnp.zeros(0)
 
-    @abstractmethod
+class PackedCurve(AbstractCurve):
+    """Terms of any family in arrays of one size: one compiled program then serves them all.
+
+    What a family does not have is multiplied by zero: parameters beyond its own move nothing.
+    """
+
+    made_of: Terms
+    of_velocity: Bool[Array, ""]
+
+    def __call__(self, amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+        """See `AbstractCurve`."""
+        return _value(jnp.asarray(amplitude) / self.scale, self.parameters, self.made_of)
+
     def amplitude(self, displacement: Array, velocity: Array) -> Array:
         """The one of the two amplitudes that this curve is a function of."""
+        return jnp.where(self.of_velocity, velocity, displacement)
+
+    def prior_residuals(self) -> Float[Array, " row"]:
+        """What is expected to be near zero of a curve, in its own 1σ."""
+        return jnp.asarray(self.made_of.prior @ self.parameters)
 
 
 class AbstractFamily(AbstractCurve):
@@ -74,6 +183,52 @@ class AbstractFamily(AbstractCurve):
     kind: ClassVar[str]
     orders: ClassVar[tuple[int, ...]]  # sizes that a selection by data tries, simplest first
     argument: Argument = eqx.field(static=True)
+
+    @abstractmethod
+    def terms(self) -> Terms:
+        """What the curve is made of, over the amplitude by `scale`."""
+
+    @abstractmethod
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        """What the parameters are called and the power of amplitude that each belongs to."""
+
+    @classmethod
+    @abstractmethod
+    def starts(
+        cls,
+        order: int,
+        argument: Argument,
+        amplitude: Float[np.ndarray, " point"],
+        values: Float[np.ndarray, " point"],
+        weight: Float[np.ndarray, " point"],
+    ) -> list["AbstractFamily"]:
+        """Members near scattered points: one where the family is linear, several elsewhere."""
+
+    @property
+    def size(self) -> int | None:
+        """The size that is said beside the family's name; None where there is but one."""
+        return None
+
+    def __call__(self, amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+        """See `AbstractCurve`."""
+        return packed(self)(amplitude)
+
+    def linearised(self, amplitude: Float[np.ndarray, " point"]) -> Linearised:
+        """See `AbstractCurve`; nothing compiles."""
+        scale, terms = float(self.scale), jax.tree.map(np.asarray, self.terms())
+        drawn = _drawn(np.asarray(amplitude) / scale, np.asarray(self.parameters), terms, np)
+        columns = drawn.basis @ terms.mix
+        if columns.shape[-1] > 2:
+            columns[..., 2] += drawn.by_third
+        return Linearised(drawn.value, columns, drawn.by_x / scale)
+
+    def amplitude(self, displacement: Array, velocity: Array) -> Array:
+        """The one of the two amplitudes that this curve is a function of."""
+        return displacement if self.argument == "displacement" else velocity
+
+    def prior_residuals(self) -> Float[Array, " row"]:
+        """What is expected to be near zero of a curve, in its own 1σ."""
+        return jnp.asarray(self.terms().prior @ self.parameters)
 
     @property
     def label(self) -> str:
@@ -93,30 +248,38 @@ class AbstractFamily(AbstractCurve):
             sized = f", {self.size} {'term' if self.size == 1 else 'terms'} beside the constant"
         return f"{_KIND_WORDS.get(self.kind, self.kind)} of {self.argument}{sized}"
 
-    @property
-    def size(self) -> int | None:
-        """The size that is said beside the family's name; None where there is but one."""
-        return None
 
-    def amplitude(self, displacement: Array, velocity: Array) -> Array:
-        """See `AbstractCurve`."""
-        return displacement if self.argument == "displacement" else velocity
+def packed(family: AbstractFamily, room: int = 0) -> PackedCurve:
+    """The same curve in arrays of one size, with room for so many parameters at least.
 
-    @abstractmethod
-    def coefficients(self) -> tuple[Coefficient, ...]:
-        """What the parameters are called and the power of amplitude that each belongs to."""
+    On the host, where nothing compiles for one more size, if it can be.
+    """
+    terms, parameters = family.terms(), family.parameters
+    traced = any(isinstance(a, jax.core.Tracer) for a in jax.tree.leaves((terms, parameters)))
+    xp: Any = jnp if traced else np
+    n, k, h = parameters.shape[0], len(terms.exponents), max(len(terms.knots) - 2, 0)
+    size, powers = (-(-most // _SIZE) * _SIZE for most in (max(n, room), k))
 
-    @classmethod
-    @abstractmethod
-    def starts(
-        cls,
-        order: int,
-        argument: Argument,
-        amplitude: Float[np.ndarray, " point"],
-        values: Float[np.ndarray, " point"],
-        weight: Float[np.ndarray, " point"],
-    ) -> list["AbstractFamily"]:
-        """Members near scattered points: one where the family is linear, several elsewhere."""
+    def filled(rows: Any, *lengths: int) -> Array:
+        rows = xp.asarray(rows)
+        added = [(0, to - now) for to, now in zip(lengths, rows.shape, strict=True)]
+        return jnp.asarray(xp.pad(rows, added))
+
+    far = _FAR * np.arange(1.0, size + 3)[len(terms.knots) :]
+    mix = [filled(terms.mix[:k], powers, size), filled(terms.mix[k : k + h], size, size)]
+    return PackedCurve(
+        parameters=filled(parameters, size),
+        scale=family.scale,
+        made_of=Terms(
+            exponents=filled(terms.exponents, powers),
+            is_free=filled(terms.is_free, powers),
+            largest_exponent=jnp.asarray(terms.largest_exponent),
+            knots=jnp.asarray(xp.concatenate([terms.knots, far])),
+            mix=jnp.asarray(xp.concatenate(mix)),
+            prior=filled(terms.prior, size, size),
+        ),
+        of_velocity=jnp.asarray(family.argument == "velocity"),
+    )
 
 
 def linear_start(

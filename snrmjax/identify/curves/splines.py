@@ -1,15 +1,21 @@
 """Curves through values at knots: natural cubic splines in the squared amplitude."""
 
 import itertools
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from snrmjax.identify.curves.family_base import AbstractFamily, Argument, Coefficient, linear_start
+from snrmjax.identify.curves.family_base import (
+    AbstractFamily,
+    Argument,
+    Coefficient,
+    Terms,
+    hats,
+    linear_start,
+)
 
 
 class Spline(AbstractFamily):
@@ -24,10 +30,10 @@ class Spline(AbstractFamily):
     knots: Float[Array, " knot"]  # of (amplitude/scale)²
     mix: Float[Array, "term knot"]  # from values at the knots to coefficients of 1, u and `hats`
 
-    def __call__(self, amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    def terms(self) -> Terms:
         """See `AbstractFamily`."""
-        u = (jnp.asarray(amplitude) / self.scale) ** 2
-        return _drawn(u, self.mix @ self.parameters, self.knots)
+        line, free = np.array([0.0, 2.0]), np.zeros(2, dtype=bool)
+        return Terms(line, free, 1.0, self.knots, self.mix, np.zeros((0, len(self.knots))))
 
     @property
     def size(self) -> int | None:
@@ -38,14 +44,6 @@ class Spline(AbstractFamily):
         """See `AbstractFamily`."""
         n = self.parameters.shape[0]
         return tuple(Coefficient(f"knot_{k}", 0.0, True) for k in range(n))
-
-    def values_and_slopes(
-        self, amplitude: Float[np.ndarray, " point"]
-    ) -> tuple[Float[np.ndarray, " point"], Float[np.ndarray, "point knot"]]:
-        """See `AbstractCurve`."""
-        u = (amplitude / float(self.scale)) ** 2
-        columns = spline_terms(u, np.asarray(self.knots)) @ np.asarray(self.mix)
-        return columns @ np.asarray(self.parameters), columns
 
     @classmethod
     def starts(
@@ -65,7 +63,7 @@ class Spline(AbstractFamily):
             knots = np.linspace(0.0, 1.0, order) ** 2
         unit = jax.device_put(scale)
         blank = cls.through(knots, np.zeros(order), unit, argument)
-        start = linear_start(blank.values_and_slopes(amplitude)[1], values, weight)
+        start = linear_start(blank.linearised(amplitude).by_parameters, values, weight)
         return [eqx.tree_at(lambda f: f.parameters, blank, jax.device_put(start))]
 
     @classmethod
@@ -79,24 +77,6 @@ class Spline(AbstractFamily):
         """The spline through values at knots, which are squares of amplitude/scale."""
         mix = jax.device_put(np.linalg.inv(spline_terms(knots, knots)))
         return cls(jax.device_put(values), scale, argument, jax.device_put(knots), mix)
-
-
-@jax.custom_jvp
-def _drawn(u: Array, coefficients: Array, knots: Array) -> Array:
-    line = jnp.stack([jnp.ones_like(u), u], axis=-1)
-    return jnp.concatenate([line, hats(u, knots)[0]], axis=-1) @ coefficients
-
-
-@_drawn.defjvp
-def _drawn_and_slope(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    """One set of hats serves all directions, where automatic rules would draw them for each.
-
-    Knots have no derivative: they are chosen, not fitted.
-    """
-    u, coefficients, knots = primals
-    by_u, by_coefficients, _ = tangents
-    slope = coefficients[1] + hats(u, knots)[1] @ coefficients[2:]
-    return _drawn(u, coefficients, knots), slope * by_u + _drawn(u, by_coefficients, knots)
 
 
 class SmoothingSpline(Spline):
@@ -115,9 +95,10 @@ class SmoothingSpline(Spline):
     bends: Float[Array, "bend knot"]  # from values at the knots
     bend_std: Float[Array, "*bend"]  # 1σ of the bends, one for all or each its own
 
-    def prior_residuals(self) -> Float[Array, " row"]:
-        """See `AbstractCurve`."""
-        return self.bends @ self.parameters / self.bend_std
+    def terms(self) -> Terms:
+        """See `AbstractFamily`."""
+        # One 1σ for all bends, or one each.
+        return super().terms()._replace(prior=self.bends / self.bend_std[..., None])
 
     @classmethod
     def through(
@@ -142,9 +123,9 @@ def amplitudes_apart(
     Arguments: `amplitude` relative to the largest; of more than `most` even picks.
     """
     apart = [1.0]
-    for one in np.sort(amplitude)[::-1]:
-        if 0 < one * ratio <= apart[-1]:
-            apart.append(float(one))
+    for size in np.sort(amplitude)[::-1]:
+        if 0 < size * ratio <= apart[-1]:
+            apart.append(float(size))
     pick = np.linspace(0, len(apart) - 1, min(most, len(apart)))
     return np.array(apart)[np.round(pick).astype(int)][::-1]
 
@@ -165,25 +146,8 @@ def bends_of(knots: Float[np.ndarray, " knot"]) -> Float[np.ndarray, "bend knot"
     return matrix / np.sqrt(reach / mean)[:, None]
 
 
-def hats(u: Array | np.ndarray, knots: Float[Array | np.ndarray, " knot"]) -> tuple[Array, Array]:
-    """Functions whose second derivative is a hat over three successive knots, and their slopes.
-
-    Straight outside of their hat and made of clipped differences: nothing large cancels, as it
-    does in sums of truncated powers. On the host for arrays of the host.
-    """
-    xp: Any = np if isinstance(u, np.ndarray) else jnp
-    u = u[..., None]
-    left, middle, right = knots[:-2], knots[1:-1], knots[2:]
-    rise, fall = middle - left, right - middle
-    up, down = xp.clip(u - left, 0.0, rise), xp.clip(u - middle, 0.0, fall)
-    past, beyond = xp.maximum(u - middle, 0.0), xp.maximum(u - right, 0.0)
-    value = up**3 / (6 * rise) + 0.5 * (rise * past + down**2 + fall * beyond)
-    value = value - down**3 / (6 * fall)
-    return value, 0.5 * up**2 / rise + down - 0.5 * down**2 / fall
-
-
 def spline_terms(
     u: Float[np.ndarray, " point"], knots: Float[np.ndarray, " knot"]
 ) -> Float[np.ndarray, "point term"]:
     """1, u and the `hats` at some points u, on the host."""
-    return np.column_stack([np.ones_like(u), u, hats(u, knots)[0]])
+    return np.column_stack([np.ones_like(u), u, hats(u, knots, np)[0]])

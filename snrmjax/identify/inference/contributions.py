@@ -1,15 +1,12 @@
 """What the uncertainty of a joint fit comes from: shares of every source of error."""
 
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from snrmjax.identify.curves.family_base import AbstractCurve
-from snrmjax.identify.curves.packed_curve import packed
 from snrmjax.identify.inference.fitted_curves import values_at_displacement
 from snrmjax.identify.inference.table_result import AbstractTable
 from snrmjax.identify.joint.force_balance import (
@@ -18,15 +15,15 @@ from snrmjax.identify.joint.force_balance import (
     slopes_by_error,
     weighting_at,
 )
-from snrmjax.identify.joint.free_unknowns import Unravel, padded_problem
-from snrmjax.identify.joint.joint_fit import JointFit
-from snrmjax.identify.joint.residuals import (
+from snrmjax.identify.joint.free_unknowns import (
+    Unravel,
     all_residuals,
+    padded_problem,
 )
+from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.test_model.states import LEVEL_ERRORS
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.least_squares import inverse_of
-from snrmjax.numerics.result import Variable
 
 _LISTED = 8  # sources on one screen
 
@@ -44,13 +41,22 @@ class Contributions(AbstractTable[Contribution]):
     """Shares of the variance of both bands by source of error, the largest first."""
 
     coordinates = ("source",)
+    columns: ClassVar = {
+        "source": (lambda row: row.source, "", "source of error"),
+        "kind": (lambda row: row.kind, "", "kind of source"),
+        "frequency_share": (
+            lambda row: row.frequency_share,
+            *("1", "share of the natural frequency's variance"),
+        ),
+        "damping_share": (lambda row: row.damping_share, "1", "share of the variance of 2ζω"),
+    }
 
     def summary(self) -> tuple[str, ...]:
         """See `AbstractResult`."""
         listed = [
-            f"{one.source}: {100 * one.frequency_share:.1f} % of the variance of the natural "
-            f"frequency, {100 * one.damping_share:.1f} % of the damping's"
-            for one in self.rows[:_LISTED]
+            f"{row.source}: {100 * row.frequency_share:.1f} % of the variance of the natural "
+            f"frequency, {100 * row.damping_share:.1f} % of the damping's"
+            for row in self.rows[:_LISTED]
         ]
         more = len(self.rows) - len(listed)
         return (
@@ -79,41 +85,15 @@ class Contributions(AbstractTable[Contribution]):
         together.sort(key=lambda row: -row.frequency_share - row.damping_share)
         return Contributions(tuple(together))
 
-    def variables(self) -> dict[str, Variable]:
-        """See `AbstractResult`."""
-
-        def share(name: str, meaning: str) -> Variable:
-            return self.column([getattr(one, name) for one in self.rows], "1", meaning)
-
-        return {
-            "source": self.column([one.source for one in self.rows], "", "source of error"),
-            "kind": self.column([one.kind for one in self.rows], "", "kind of source"),
-            "frequency_share": share(
-                "frequency_share", "share of the natural frequency's variance"
-            ),
-            "damping_share": share("damping_share", "share of the variance of 2ζω"),
-        }
-
-
-@compiled
-def _slopes_of_prior(curve: AbstractCurve) -> Float[Array, "row parameter"]:
-    def of(parameters: Array) -> Array:
-        return eqx.tree_at(lambda f: f.parameters, curve, parameters).prior_residuals()
-
-    return jax.jacfwd(of)(curve.parameters)
-
 
 def _bend_slopes(fit: JointFit) -> Float[np.ndarray, "row unknown"]:
     """Derivatives, by the unknowns, of what is expected near zero of both curves."""
-
-    begin, blocks = 0, []
-    for curve in (fit.unknowns.squared_frequency, fit.unknowns.modal_damping):
-        # One form of all families: one program. Its further rows and columns are zero.
-        slopes = np.asarray(_slopes_of_prior(packed(curve)))[:, : curve.parameters.shape[0]]
-        end = begin + slopes.shape[1]
-        blocks.append(np.pad(slopes, ((0, 0), (begin, len(fit.covariance) - end))))
-        begin = end
-    return np.concatenate(blocks)
+    curves = fit.unknowns.squared_frequency, fit.unknowns.modal_damping
+    first, second = (np.asarray(curve.terms().prior) for curve in curves)
+    slopes = np.zeros((len(first) + len(second), len(fit.covariance)))
+    n = first.shape[1]
+    slopes[: len(first), :n], slopes[len(first) :, n : n + second.shape[1]] = first, second
+    return slopes
 
 
 def contributions(fit: JointFit, *, n_amplitudes: int = 25) -> Contributions:
@@ -127,9 +107,9 @@ def contributions(fit: JointFit, *, n_amplitudes: int = 25) -> Contributions:
     largest first; they sum to one but for rounding.
     """
     program, problem = fit.packed(), padded_problem(fit.problem)
-    found = _first_order(program.vector, program.unravel, problem)
+    derivatives = _first_order(program.vector, program.unravel, problem)
     p, n, n_levels = len(program.own), len(fit.data.level), fit.data.n_levels
-    jacobian, by_error = np.asarray(found[0])[:, program.own], np.asarray(found[1])[:n]
+    jacobian, by_error = np.asarray(derivatives[0])[:, program.own], np.asarray(derivatives[1])[:n]
     inverse = inverse_of(jacobian)
     points = jacobian[: 2 * len(problem.data.level)].reshape(-1, 2, p)[:n]
     by_state = np.einsum("pq,siq,sie->pse", inverse, points, by_error) * np.asarray(fit.data.std)
@@ -164,8 +144,7 @@ def contributions(fit: JointFit, *, n_amplitudes: int = 25) -> Contributions:
     shares = np.mean(parts / np.sum(parts, axis=0), axis=1).tolist()
     listed = [
         Contribution(source, share[0], share[1], kind)
-        for (source, kind, columns), share in zip(rows, shares, strict=True)
-        if columns.shape[1]
+        for (source, kind, _), share in zip(rows, shares, strict=True)
     ]
     ranked = sorted(listed, key=lambda row: -row.frequency_share - row.damping_share)
     return Contributions(tuple(ranked))

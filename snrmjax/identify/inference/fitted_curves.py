@@ -14,7 +14,6 @@ from snrmjax.identify.pointwise.points_result import AmplitudeArgument
 
 _SCAN = 256  # displacements of the backbone, on which a velocity is looked for
 _ITERATIONS = 12
-_STEP = 1e-5  # relative, of central differences by the amplitude
 _KNOTS = 120  # of curves of families by name, for what takes a `Backbone`
 _DOUBLINGS = 6  # of the displacement, to reach a velocity
 
@@ -36,16 +35,16 @@ def fitted_values(
     if (velocity is None) == (displacement is None):
         raise ValueError("give either `velocity` or `displacement`.")
     if velocity is not None:
-        found = values_at_velocity(fit, np.asarray(velocity, np.float64))
+        curves = values_at_velocity(fit, np.asarray(velocity, np.float64))
     else:
-        found = values_at_displacement(fit, np.asarray(displacement, np.float64))
-    covariance = np.einsum("ocp,pq,odq->ocd", found.slopes, fit.covariance, found.slopes)
-    squared, damping = found.values.T
+        curves = values_at_displacement(fit, np.asarray(displacement, np.float64))
+    covariance = np.einsum("ocp,pq,odq->ocd", curves.slopes, fit.covariance, curves.slopes)
+    squared, damping = curves.values.T
     if of_a_new_level:
         stiffness, dissipation = np.asarray(fit.prior.level)[2:]
         covariance[:, 0, 0] += (squared * stiffness) ** 2
         covariance[:, 1, 1] += (damping * dissipation) ** 2
-    return banded_values(found.velocity, squared, damping, covariance)
+    return banded_values(curves.velocity, squared, damping, covariance)
 
 
 def values_to_the_largest(fit: JointFit, n_points: int) -> BackboneValues:
@@ -70,8 +69,8 @@ def as_backbone(
     velocity is then taken where it lies on the backbone. Against velocity the knots are where the
     backbone has them.
     """
-    own = argument == "displacement" and _are_smooth(fit)
-    squared, damping, covariance = _own_curves(fit) if own else _redrawn(fit, argument, reach)
+    are_own = argument == "displacement" and _are_smooth(fit)
+    squared, damping, covariance = _own_curves(fit) if are_own else _redrawn(fit, argument, reach)
     motion = fit.motion()
     measured = np.abs(motion.velocity) if argument == "velocity" else motion.displacement
     return Backbone(
@@ -89,7 +88,9 @@ def as_backbone(
 def _are_smooth(fit: JointFit) -> bool:
     """Whether both curves are smooth ones of the displacement, through the same knots."""
     pair = fit.unknowns.squared_frequency, fit.unknowns.modal_damping
-    return all(isinstance(one, SmoothingSpline) and one.argument == "displacement" for one in pair)
+    return all(
+        isinstance(curve, SmoothingSpline) and curve.argument == "displacement" for curve in pair
+    )
 
 
 def _own_curves(fit: JointFit) -> tuple[AbstractFamily, AbstractFamily, np.ndarray]:
@@ -110,17 +111,17 @@ def _redrawn(
         positive = values_at_displacement(fit, displacement).values[:, 0] > 0
     # A polynomial may fall below zero beyond the data: there is no motion there.
     displacement = displacement[: np.append(positive, False).argmin()]
-    found = values_at_displacement(fit, displacement)
+    curves = values_at_displacement(fit, displacement)
     if argument == "velocity":
-        found = values_at_velocity(fit, found.velocity)
-    at, values = getattr(found, argument), found.values
+        curves = values_at_velocity(fit, curves.velocity)
+    at, values = getattr(curves, argument), curves.values
     # Dry friction has no finite damping at rest: there the next knot's value stands.
     values[0] = np.where(np.isfinite(values[0]), values[0], values[1])
     pair = (
         Spline.through((at / at[-1]) ** 2, values[:, k], jax.device_put(at[-1]), argument)
         for k in range(2)
     )
-    rows = np.concatenate([found.slopes[:, 0], found.slopes[:, 1]])
+    rows = np.concatenate([curves.slopes[:, 0], curves.slopes[:, 1]])
     return *pair, rows @ fit.covariance @ rows.T
 
 
@@ -138,15 +139,15 @@ def values_at_velocity(fit: JointFit, velocity: Float[np.ndarray, " point"]) -> 
 
     Raises `ValueError` where the backbone has a velocity at several displacements, or at none.
     """
-    found = _near(fit, float(np.max(velocity)))
-    if found.turns_back_at is not None:
+    reached = _near(fit, float(np.max(velocity)))
+    if reached.turns_back_at is not None:
         raise ValueError(
-            f"the backbone turns back at {found.turns_back_at:.4g} m/s: there velocities belong to "
-            "several displacements; ask for values at displacements."
+            f"the backbone turns back at {reached.turns_back_at:.4g} m/s: there velocities belong "
+            "to several displacements; ask for values at displacements."
         )
-    if np.max(velocity) > found.speed[-1]:
+    if np.max(velocity) > reached.speed[-1]:
         raise ValueError(f"the backbone does not reach {np.max(velocity):.4g} m/s.")
-    near = np.interp(velocity, found.speed, found.displacement)
+    near = np.interp(velocity, reached.speed, reached.displacement)
     return _on_backbone(fit, velocity, near)
 
 
@@ -167,20 +168,20 @@ def _on_backbone(
     unknowns = fit.unknowns
     curves = unknowns.squared_frequency, unknowns.modal_damping
     n = curves[0].parameters.shape[0]
-    of_velocity = [one.argument == "velocity" for one in curves]
+    of_velocity = [curve.argument == "velocity" for curve in curves]
     given_velocity = near is not None
     at = np.asarray(at, dtype=float)
     if of_velocity[0] == given_velocity:
-        squared, by_own, _ = _linearised(curves[0], at)
+        squared, by_own, _ = curves[0].linearised(at)
         root = np.sqrt(squared)
         other = at / root if given_velocity else at * root
         # x = v/√s or v = x√s.
         moves = (-0.5 if given_velocity else 0.5) * (other / squared)[:, None] * by_own
     else:
-        other = at * np.sqrt(_linearised(curves[0], 0 * at)[0]) if near is None else near
+        other = at * np.sqrt(curves[0].linearised(0 * at)[0]) if near is None else near
         for _ in range(_ITERATIONS + 1):
             # v − x√s(x) for x, or x√s(v) − v for v.
-            squared, by_own, steep = _linearised(curves[0], other)
+            squared, by_own, steep = curves[0].linearised(other)
             root = np.sqrt(squared)
             gap = other * root - at if given_velocity else at * root - other
             arm = (other if given_velocity else at) / (2 * root)
@@ -189,29 +190,13 @@ def _on_backbone(
             other = other - gap / slope
         by_own = by_own + steep[:, None] * moves
     displacement, velocity = (other, at) if given_velocity else (at, other)
-    damping, by_damping, steep = _linearised(
-        curves[1], velocity if of_velocity[1] else displacement
-    )
+    damping, by_damping, steep = curves[1].linearised(velocity if of_velocity[1] else displacement)
     # The unknowns after those of the curves move nothing here.
     slopes = np.zeros((len(at), 2, len(fit.covariance)))
     slopes[:, 0, :n], slopes[:, 1, n : n + by_damping.shape[1]] = by_own, by_damping
     if of_velocity[1] != given_velocity:
         slopes[:, 1, :n] = steep[:, None] * moves
     return OnBackbone(np.stack([squared, damping], axis=1), slopes, displacement, velocity)
-
-
-def _linearised(
-    curve: AbstractFamily, amplitude: Float[np.ndarray, " point"]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Values, derivatives by the parameters, and by the amplitude by central differences."""
-    values, slopes = curve.values_and_slopes(amplitude)
-    step = _STEP * np.maximum(amplitude, 1e-3 * float(curve.scale))
-    (above, _), (below, _) = (
-        curve.values_and_slopes(np.maximum(amplitude + sign * step, 0.0)) for sign in (1, -1)
-    )
-    width = amplitude + step - np.maximum(amplitude - step, 0.0)
-    with np.errstate(invalid="ignore"):
-        return values, slopes, (above - below) / width
 
 
 class _Reached(NamedTuple):

@@ -28,9 +28,9 @@ from snrmjax.identify.prediction.resonance_distribution import (
     other_modes,
     resonance_distribution,
 )
-from snrmjax.numerics.result import Variable
-
-_HERTZ = 2 * np.pi  # rad/s
+from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.result import quantity
+from snrmjax.numerics.units import HERTZ
 
 
 class FittedResponse(PredictedResponse):
@@ -40,8 +40,9 @@ class FittedResponse(PredictedResponse):
     place where the drawn curve has them, without a band.
     """
 
-    frequency_std: Float[np.ndarray, " point"]  # rad/s, at fixed amplitude
-    velocity_std: Float[np.ndarray, " point"]  # of the magnitude at fixed frequency; large at folds
+    frequency_std: Float[np.ndarray, " point"] = quantity("point", "Hz", "1σ at fixed amplitude")
+    # Of the magnitude; large at folds.
+    velocity_std: Float[np.ndarray, " point"] = quantity("point", "m/s", "1σ at fixed frequency")
     resonances: tuple[FittedPoint, ...]
     folds: tuple[FittedPoint, ...]
     not_located: tuple[FittedPoint, ...]
@@ -49,36 +50,28 @@ class FittedResponse(PredictedResponse):
 
     def summary(self) -> tuple[str, ...]:
         """See `AbstractResult`."""
-        hertz, size = self.frequency / _HERTZ, np.abs(self.velocity)
+        hertz, size = self.frequency / HERTZ, np.abs(self.velocity)
         return (
             f"FittedResponse to {self.force:.4g} N: {len(hertz)} points from {hertz.min():.6g} to "
             f"{hertz.max():.6g} Hz, up to {size.max():.4g} m/s",
             *(
-                f"{one.kind} at {one.frequency / _HERTZ:.6g} ± {one.frequency_std / _HERTZ:.2g} Hz"
-                f", {one.velocity:.4g} ± {one.velocity_std:.2g} m/s"
-                for one in (*self.resonances, *self.folds)
+                f"{point.kind} at {point.frequency / HERTZ:.6g} ± "
+                f"{point.frequency_std / HERTZ:.2g} Hz, {point.velocity:.4g} ± "
+                f"{point.velocity_std:.2g} m/s"
+                for point in (*self.resonances, *self.folds)
             ),
             f"{int(np.sum(~self.stable))} points unstable, {int(np.sum(self.continued))} beyond "
             f"the measured amplitudes, {len(self.not_located)} resonances or folds not located",
             *((f"note: {self.note}",) if self.note else ()),
         )
 
-    def variables(self) -> dict[str, Variable]:
-        """See `AbstractResult`."""
-        per, std = ("point",), self.frequency_std / _HERTZ
-        return {
-            **super().variables(),
-            "frequency_std_hz": Variable(per, std, "Hz", "1σ at fixed amplitude"),
-            "velocity_std_m_s": Variable(per, self.velocity_std, "m/s", "1σ at fixed frequency"),
-        }
-
     def attributes(self) -> dict[str, str | float | int]:
         """See `AbstractResult`."""
-        own: dict[str, str | float | int] = {
+        more: dict[str, str | float | int] = {
             "sensor": self.sensor,
             "n_not_located": len(self.not_located),
         }
-        return super().attributes() | own
+        return super().attributes() | more
 
 
 def fitted_response(
@@ -121,8 +114,8 @@ def fitted_response(
         amplitude, frequency, velocity, frequency_std, velocity_std = band
         places = [*(tips if number == 0 else ()), *turns(curve.frequency, curve.amplitude)]
         points = [located(fit, force, place, level) for place in places]
-        good = [one for one in points if one.located]
-        missing = tuple(one for one in points if not one.located)
+        good = [point for point in points if point.located]
+        missing = tuple(point for point in points if not point.located)
         answer.append(
             FittedResponse(
                 force=force,
@@ -133,11 +126,11 @@ def fitted_response(
                 branch=curve.branch,
                 continued=curve.continued,
                 isolated=curve.isolated,
-                note=" ".join(filter(None, [curve.note, _note_on(missing, force)])),
+                notes=(*curve.notes, *_notes_on(missing, force)),
                 frequency_std=frequency_std,
                 velocity_std=velocity_std,
-                resonances=tuple(one for one in good if one.kind == "resonance"),
-                folds=tuple(one for one in good if one.kind == "fold"),
+                resonances=tuple(point for point in good if point.kind == "resonance"),
+                folds=tuple(point for point in good if point.kind == "fold"),
                 not_located=missing,
                 sensor=fit.modes.sensors[fit.data.sensor],
             )
@@ -145,15 +138,9 @@ def fitted_response(
     return answer
 
 
-def _note_on(missing: tuple[FittedPoint, ...], force: float) -> str:
-    """What was not located under a force."""
-    if not missing:
-        return ""
-    listed = ", ".join(f"{one.kind} near {one.frequency / _HERTZ:.5g} Hz" for one in missing)
-    return (
-        f"{len(missing)} resonances or folds under {force:g} N could not be located ({listed}) and "
-        "have no band."
-    )
+def _notes_on(missing: tuple[FittedPoint, ...], force: float) -> tuple[Fact, ...]:
+    points = tuple((point.kind, float(point.frequency) / HERTZ) for point in missing)
+    return (Fact("points_not_located", points=points, force=force),) if points else ()
 
 
 def predicted_resonance(

@@ -117,8 +117,8 @@ def banded_curve(
     frequency at fixed amplitude and of the velocity's magnitude at fixed frequency.
     """
     program, motion = fit.packed(), ForcedMotion.of(fit, force, new)
-    own, level = program.padded_covariance(fit.covariance), np.diag(new.std**2)
-    covariance = jnp.asarray(block_diag(own, level))
+    of_fit, level = program.padded_covariance(fit.covariance), np.diag(new.std**2)
+    covariance = jnp.asarray(block_diag(of_fit, level))
     count, vector = np.array(_ONTO_THE_CURVE), motion.with_level(program.vector)
     # The points come from curves drawn anew through knots: steps put them on the fit's own.
     return by_blocks(

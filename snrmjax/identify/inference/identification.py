@@ -1,6 +1,7 @@
 """The whole inverse method in one call: steady states in, backbone and damping out."""
 
-from typing import ClassVar, NamedTuple
+import dataclasses
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -28,27 +29,19 @@ from snrmjax.measure.states import SteadyStates
 from snrmjax.model.modes import LinearModes
 from snrmjax.model.structures import Structure, modes_of
 from snrmjax.numerics.blocks import on_one_core
+from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.units import HERTZ
 
-_HERTZ = 2 * np.pi
 _FEWEST = 2  # points, of which a curve can be told
-
-
-class Anchor(NamedTuple):
-    """How far curves had to be bent to meet the linear mode at zero amplitude."""
-
-    frequency_gap: float  # rad/s, free curve at zero minus linear frequency
-    frequency_gap_std: float  # rad/s
-    damping_gap: float  # free damping ratio at zero minus the linear one
-    damping_gap_std: float
-    largest_frequency_shift: float  # rad/s, anchored minus free curve among the measured points
-    largest_damping_shift: float
+_SHAPE_MISSED = 0.1  # share of a motion that is not the mode's shape and worth a note
+_EXPLAINED, _WORTH = 0.3, 0.1  # by the phase: share of the damping's variance, and its change
 
 
 class Identification(AbstractResult):
     """Points, curves and everything that a reader of them should know.
 
-    The curves are those of `fit`, the joint fit of all states, unless they were anchored.
+    The curves are those of `fit`, the joint fit of all states.
     """
 
     coordinates: ClassVar[tuple[str, ...]] = ("state", "level", "backbone_amplitude_m_s")
@@ -56,15 +49,14 @@ class Identification(AbstractResult):
     points: BackbonePoints
     backbone: Backbone
     fit: JointFit
-    anchor: Anchor | None
-    notes: tuple[str, ...]
+    notes: tuple[Fact | str, ...] = eqx.field(static=True)
 
     @property
     def level_frequency_std(self) -> float:
         """1σ of the natural frequency (rad/s) that the states of a level share."""
         j = self.fit.modes.mode_of_interest
-        own = float(self.fit.modes.natural_frequency[j])
-        return 0.5 * float(self.fit.noise.level_std[2]) * own
+        natural = float(self.fit.modes.natural_frequency[j])
+        return 0.5 * float(self.fit.noise.level_std[2]) * natural
 
     @property
     def level_damping_std(self) -> float:
@@ -73,38 +65,46 @@ class Identification(AbstractResult):
         return float(self.fit.noise.level_std[3]) * float(self.fit.modes.damping_ratio[j])
 
     def summary(self) -> tuple[str, ...]:
-        """See `AbstractResult`."""
-        states, *_ = self.points.summary()
-        _, *curves = self.backbone.summary()
-        scale, unit = self.fit.noise.scale, "times the stated noise"
-        if not self.fit.noise.stated:
-            scale, unit = 100 * scale, "% of the measured phasor (1σ)"
+        """How many points, ranges of the curves, what states and levels scatter by, notes."""
+        points, ends = self.points, self.backbone.sampled()
+        n_levels, noise = len(np.unique(np.asarray(points.level))), self.fit.noise
+        scale = f"{noise.scale:.3g} times the stated noise"
+        if not noise.stated:
+            scale = f"{100 * noise.scale:.3g} % of the measured phasor (1σ)"
+        hertz, ratio = np.asarray(ends.natural_frequency) / HERTZ, np.asarray(ends.damping_ratio)
+        speed = np.asarray(ends.velocity)
+        status, counts = np.unique(np.asarray(points.status), return_counts=True)
+        outcomes = (PointStatus(int(kind)).message for kind in status)
         return (
-            states.replace("BackbonePoints", "Identification", 1),
-            *curves,
-            f"scatter of states about the curves: {scale:.3g} {unit}",
-            f"level to level: {self.level_frequency_std / _HERTZ:.2g} Hz and "
+            f"Identification: {len(points.status)} steady states of {n_levels} levels at "
+            f"{points.sensor!r}",
+            *(f"{n} {outcome}" for n, outcome in zip(counts, outcomes, strict=True)),
+            f"natural frequency {np.nanmin(hertz):.6g} to {np.nanmax(hertz):.6g} Hz",
+            f"damping ratio {100 * np.nanmin(ratio):.4g} to {100 * np.nanmax(ratio):.4g} %",
+            f"velocity {np.nanmin(speed):.4g} to {np.nanmax(speed):.4g} m/s",
+            f"scatter of states about the curves: {scale}",
+            f"level to level: {self.level_frequency_std / HERTZ:.2g} Hz and "
             f"{100 * self.level_damping_std:.2g} % of critical damping (1σ)",
             *(f"note: {note}" for note in self.notes),
         )
 
     def variables(self) -> dict[str, Variable]:
         """See `AbstractResult`; those of the points, and of the curves under `backbone_…`."""
-        own = dict(self.points.variables())
+        variables = dict(self.points.variables())
         for name, variable in self.backbone.variables().items():
             at = "backbone_amplitude_m_s"
             key = at if name == "velocity_m_s" else f"backbone_{name}"
-            own[key] = variable._replace(dimensions=(at,))
-        return own
+            variables[key] = variable._replace(dimensions=(at,))
+        return variables
 
     def attributes(self) -> dict[str, str | float | int]:
         """See `AbstractResult`."""
         return {
             **self.backbone.attributes(),
             "noise_stated": int(self.fit.noise.stated),
-            "level_frequency_std_hz": self.level_frequency_std / _HERTZ,
+            "level_frequency_std_hz": self.level_frequency_std / HERTZ,
             "level_damping_ratio_std": self.level_damping_std,
-            "notes": "\n".join(self.notes),
+            "notes": "\n".join(map(str, self.notes)),
         }
 
 
@@ -117,7 +117,6 @@ def identify_backbone(
     amplitude: AmplitudeArgument = "displacement",
     measure: AmplitudeMeasure = "fundamental",
     n_knots: int | None = None,
-    anchor: bool = False,
 ) -> Identification:
     """Backbone and damping of the mode of interest from near-resonant steady states.
 
@@ -126,11 +125,9 @@ def identify_backbone(
     them: the errors of levels that it states then enter the bands. Where no noise is stated, the
     standard deviations of the points come from the scatter about the curves.
 
-    Arguments: `amplitude` and `measure` as in `identify_points`; `n_knots` at most of each curve;
-    `anchor` makes both curves start at the linear mode at zero amplitude and reports how far this
-    moves them.
-    Returns an `Identification` whose `notes` say in words what the reader of the file did not use,
-    what was left out, what the noise turned out to be and how far an anchor moved the curves.
+    Arguments: `amplitude` and `measure` as in `identify_points`; `n_knots` at most of each curve.
+    Returns an `Identification` whose `notes` say what the reader of the file did not use, what was
+    left out and what the noise turned out to be.
     Raises `ValueError` where fewer than two states have a point, and what `fit_jointly` raises.
     Not differentiable, since curves are chosen: differentiate `identify_points`.
     Reference: Kwarta & Allen, section 2.2.
@@ -152,8 +149,8 @@ def identify_backbone(
         )
     family = "auto" if n_knots is None else f"smoothing_spline:{n_knots}"
     fit = fit_jointly(states, modes, backbone=family, damping=family)
-    found = identification_of_fit(data, fit, amplitude=amplitude, measure=measure, anchor=anchor)
-    return eqx.tree_at(lambda f: f.notes, found, (*data.notes, *found.notes))
+    identified = identification_of_fit(data, fit, amplitude=amplitude, measure=measure)
+    return dataclasses.replace(identified, notes=(*data.notes, *identified.notes))
 
 
 def identification_of_fit(
@@ -162,7 +159,6 @@ def identification_of_fit(
     *,
     amplitude: AmplitudeArgument = "displacement",
     measure: AmplitudeMeasure = "fundamental",
-    anchor: bool = False,
 ) -> Identification:
     """Each steady state's own point beside the curves of a joint fit.
 
@@ -175,88 +171,28 @@ def identification_of_fit(
     Returns an `Identification` whose `notes` are those of the fit and of the points.
     """
     points = identify_points(data, fit.modes_found, amplitude=amplitude, measure=measure)
-    curves, report = as_backbone(fit, argument=amplitude), None
-    if anchor:
-        curves, report = _anchored(curves, points, fit.modes)
-    found = Identification(points, curves, fit, report, ())
+    curves = as_backbone(fit, argument=amplitude)
+    identified = Identification(points, curves, fit, ())
     if not fit.noise.stated:
         gain, phase = map(float, fit.noise.level_std[:2])
         j = fit.modes.mode_of_interest
-        own = float(fit.modes.natural_frequency[j])
-        wandering = 0.5 * own * float(np.max(np.asarray(fit.data.std)[:, 3]))
+        natural = float(fit.modes.natural_frequency[j])
+        wandering = 0.5 * natural * float(np.max(np.asarray(fit.data.std)[:, 3]))
         points = errors_from_scatter(
             points,
             fit.noise.scale,
             level_gain=gain,
             level_phase=phase,
-            frequency_std=float(np.hypot(found.level_frequency_std, wandering)),
-            damping_std=found.level_damping_std,
+            frequency_std=float(np.hypot(identified.level_frequency_std, wandering)),
+            damping_std=identified.level_damping_std,
             modal_mass_std=fit.modes_found.own_modal_mass_std,
         )
-    freed = "instrument_phase" in fit.free
     notes = (
         *fit.notes,
-        *notes_on_points(points, fit.modes, "have no point of their own (the curves use them)"),
-        *notes_on_phases(points, curves, _PHASE_FREED if freed else _FREE_PHASE),
-        *_notes_on_anchor(report),
+        *notes_on_points(points, fit.modes),
+        *notes_on_phases(points, curves, phase_was_free="instrument_phase" in fit.free),
     )
-    return Identification(points, curves, fit, report, notes)
-
-
-def _anchored(
-    free: Backbone, points: BackbonePoints, modes: LinearModes
-) -> tuple[Backbone, Anchor]:
-    """Both curves given that they start at the linear mode, and how far this moves them."""
-    j = modes.mode_of_interest
-    omega, zeta = float(modes.natural_frequency[j]), float(modes.damping_ratio[j])
-    covariance = np.asarray(free.covariance)
-    n = free.squared_frequency.parameters.shape[0]
-    places = [0, n]  # the first knots are at rest
-    known = np.array([omega**2, 2 * zeta * omega])
-    vector = np.concatenate(
-        [np.asarray(c.parameters) for c in (free.squared_frequency, free.modal_damping)]
-    )
-    arm = np.linalg.solve(covariance[np.ix_(places, places)], covariance[places]).T
-    gap = vector[places] - known
-    moved, left = vector - arm @ gap, covariance - arm @ covariance[places]
-    pinned = eqx.tree_at(
-        lambda b: (
-            *(b.squared_frequency.parameters, b.modal_damping.parameters),
-            *(b.covariance, b.smallest),
-        ),
-        free,
-        jax.device_put((moved[:n], moved[n:], left, np.zeros(()))),
-    )
-    use = np.asarray(points.usable) & np.isfinite(np.asarray(points.amplitude))
-    at = np.asarray(points.amplitude)[use]
-    before, after = free.values(at), pinned.values(at)
-
-    def largest(name: str) -> float:
-        difference = np.asarray(getattr(after, name)) - np.asarray(getattr(before, name))
-        return float(difference[np.argmax(np.abs(difference))])
-
-    std = np.sqrt(np.diag(covariance)[places])
-    return pinned, Anchor(
-        frequency_gap=float(np.sqrt(max(vector[0], 0.0))) - omega,
-        frequency_gap_std=float(std[0]) / (2 * omega),
-        damping_gap=float(vector[n]) / (2 * omega) - zeta,
-        damping_gap_std=float(std[1]) / (2 * omega),
-        largest_frequency_shift=largest("natural_frequency"),
-        largest_damping_shift=largest("damping_ratio"),
-    )
-
-
-def _notes_on_anchor(anchor: Anchor | None) -> tuple[str, ...]:
-    if anchor is None:
-        return ()
-    hz = 1 / _HERTZ
-    return (
-        f"anchored at the linear mode: the free curves miss it at zero amplitude by "
-        f"{anchor.frequency_gap * hz:+.3g} ± {anchor.frequency_gap_std * hz:.2g} Hz and "
-        f"{100 * anchor.damping_gap:+.3g} ± {100 * anchor.damping_gap_std:.2g} % damping; the "
-        f"measured points were moved by up to {anchor.largest_frequency_shift * hz:+.2g} Hz "
-        f"and {100 * anchor.largest_damping_shift:+.2g} %.",
-    )
+    return Identification(points, curves, fit, notes)
 
 
 def errors_from_scatter(
@@ -281,10 +217,10 @@ def errors_from_scatter(
     scale = noise * off_resonance_error_factor(np.asarray(points.mode_velocity))
     shared = np.array([0.0, level_gain, level_phase])
     spread = np.hypot(scale[:, None, None] * np.array([0.0, 1.0, 1.0]), shared)
-    own = np.sum((sensitivity[:, :2] * spread) ** 2, axis=2)
+    variances = np.sum((sensitivity[:, :2] * spread) ** 2, axis=2)
     natural, damping = np.asarray(points.natural_frequency), np.asarray(points.damping_ratio)
-    natural_std = np.hypot(np.sqrt(own[:, 0]) / (2 * natural), frequency_std)
-    of_damping = np.hypot(np.sqrt(own[:, 1]) / (2 * natural), damping_std)
+    natural_std = np.hypot(np.sqrt(variances[:, 0]) / (2 * natural), frequency_std)
+    of_damping = np.hypot(np.sqrt(variances[:, 1]) / (2 * natural), damping_std)
     of_damping = np.hypot(of_damping, damping * natural_std / natural)
     if modal_mass_std is not None:
         of_mass = moved_by_modal_mass(natural, damping, np.asarray(points.frequency))
@@ -297,50 +233,34 @@ def errors_from_scatter(
     )
 
 
-def notes_on_points(points: BackbonePoints, modes: LinearModes, consequence: str) -> list[str]:
-    """Sentences on states without a point (`consequence` says what follows), roots and sensors."""
-    notes = []
-    status = np.asarray(points.status)
+def notes_on_points(points: BackbonePoints, modes: LinearModes) -> list[Fact]:
+    """Which states have no point, or two, and how far sensors are from the mode's shape."""
+    status, notes = np.asarray(points.status), []
     for kind in PointStatus:
         count = int(np.sum(status == kind))
         if kind != PointStatus.OK and count:
-            notes.append(f"{count} of {len(status)} steady states {consequence}: {kind.message}.")
+            reason = {"of": len(status), "reason": kind.message}
+            notes.append(Fact("states_without_point", n_states=count, **reason))
     other = int(np.sum(np.isfinite(np.asarray(points.alternative_natural_frequency))))
     if other:
-        notes.append(
-            f"{other} steady states have a second solution that amplitude and phase alone would "
-            "also allow."
-        )
-    if np.asarray(points.filter_residual).max(initial=0.0) > 0.1 and len(modes.sensors) > 1:
-        notes.append(
-            "the sensors do not move as the mode shape says (residual up to "
-            f"{100 * np.nanmax(np.asarray(points.filter_residual)):.0f} %): check the shape, or "
-            "the mode's shape changes with amplitude."
-        )
+        notes.append(Fact("second_solutions", n_states=other))
+    residual = float(np.asarray(points.filter_residual).max(initial=0.0))
+    if residual > _SHAPE_MISSED and len(modes.sensors) > 1:
+        residual = float(np.nanmax(np.asarray(points.filter_residual)))
+        notes.append(Fact("shape_not_followed", residual=residual))
     return notes
 
 
-_FREE_PHASE = (
-    "let a joint fit estimate it (`--free instrument_phase`; in Python "
-    '`fit_jointly(…, free=["instrument_phase"])`)'
-)
-_PHASE_FREED = (
-    "since this fit has already estimated it, check the force calibration and trust points near "
-    "resonance"
-)
-
-
-def notes_on_phases(points: BackbonePoints, curves: Backbone, advice: str) -> list[str]:
-    """A sentence when damping changes with the phase inside the levels, which it should not.
-
-    Arguments: `advice` what to do about it.
-    """
+def notes_on_phases(
+    points: BackbonePoints, curves: Backbone, *, phase_was_free: bool
+) -> list[Fact]:
+    """That damping changes with the phase inside the levels, which it should not."""
     points = jax.tree.map(np.asarray, points)
     use = points.usable
     level = points.level[use]
     sign = np.sign(float(curves.modal_constant))  # negative: the mode moves against force
     sine = sign * np.sin(np.angle(np.asarray(points.mode_velocity)))[use]
-    curve, _ = curves.modal_damping.values_and_slopes(np.asarray(points.amplitude)[use])
+    curve = curves.modal_damping.linearised(np.asarray(points.amplitude)[use]).value
     excess = np.asarray(points.modal_damping)[use] / curve - 1
     _, member = np.unique(level, return_inverse=True)
     count = np.bincount(member)
@@ -351,14 +271,7 @@ def notes_on_phases(points: BackbonePoints, curves: Backbone, advice: str) -> li
         return []
     slope = float(x @ y / (x @ x))
     explained = slope**2 * float(x @ x) / float(y @ y)
-    across = slope * 2 * np.sin(np.pi / 4)
-    if explained < 0.3 or abs(across) < 0.1:
+    across = slope * 2 * np.sin(np.pi / 4)  # from 45° on one side to 45° on the other
+    if explained < _EXPLAINED or abs(across) < _WORTH:
         return []
-    sides = ["45° below resonance (velocity leads)", "45° above it (velocity lags)"]
-    if across < 0:
-        sides = ["45° above resonance (velocity lags)", "45° below it (velocity leads)"]
-    return [
-        f"damping comes out {100 * abs(across):.0f} % higher from points {sides[0]} than from "
-        f"points {sides[1]}, which a damping that depends on amplitude alone does not do; an error "
-        f"of the instrument's phase does: {advice}."
-    ]
+    return [Fact("damping_changes_with_phase", change=across, phase_was_free=phase_was_free)]

@@ -5,17 +5,18 @@ from typing import Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from snrmjax.identify.inference.forced_motion import ForcedMotion
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.pointwise.prediction_result import Resonance
 from snrmjax.identify.prediction.new_level import ON_THE_CURVES, NewLevel
 from snrmjax.numerics.compiled import compiled
-from snrmjax.numerics.result import Variable
+from snrmjax.numerics.result import quantity, setting
 
-_HERTZ = 2 * np.pi  # rad/s
 _ITERATIONS = 12
+_SETTLED = 1e-9  # relative step, below which a point is a root
+_FARTHEST = 0.2  # relative, from where the drawn curve has it
 
 Kind = Literal["resonance", "fold"]
 
@@ -26,34 +27,13 @@ class FittedPoint(Resonance):
     One that was not located has the place that the drawn curve has, and NaN for 1σ.
     """
 
-    frequency_std: float
-    velocity_std: float
-    kind: Kind
+    frequency_std: float = quantity("", "Hz", "1σ of the frequency")
+    velocity_std: float = quantity("", "m/s", "1σ of the velocity")
+    kind: Kind = setting()
     located: bool  # False: no root of Newton's method near where the drawn curve has it
 
-    def summary(self) -> tuple[str, ...]:
-        """See `AbstractResult`."""
-        size, std = self.frequency / _HERTZ, self.frequency_std / _HERTZ
-        status = "located" if self.located else "not located"
-        if self.continued:
-            status += ", beyond the measured amplitudes"
-        return (
-            f"FittedPoint: {self.kind} under {self.force:.4g} N",
-            f"{size:.6g} ± {std:.2g} Hz, {self.velocity:.4g} ± {self.velocity_std:.2g} m/s",
-            f"status: {status}",
-        )
-
-    def variables(self) -> dict[str, Variable]:
-        """See `AbstractResult`."""
-        std = self.frequency_std / _HERTZ
-        return {
-            **super().variables(),
-            "frequency_std_hz": Variable((), std, "Hz", "1σ of the frequency"),
-            "velocity_std_m_s": Variable((), self.velocity_std, "m/s", "1σ of the velocity"),
-        }
-
     def attributes(self) -> dict[str, str | float | int]:
-        """See `AbstractResult`."""
+        """What it is, and whether it was located."""
         return {"kind": self.kind, "status": "located" if self.located else "not_located"}
 
 
@@ -65,7 +45,9 @@ class Place(NamedTuple):
     frequency: float  # rad/s
 
 
-class _Solved(NamedTuple):
+class SolvedPoint(NamedTuple):
+    """A root of the equations of a resonance or fold, and its derivatives."""
+
     values: np.ndarray  # frequency, velocity, displacement
     slopes: np.ndarray  # of them by the fit's unknowns
     by_level: np.ndarray  # and by the level's errors
@@ -82,14 +64,14 @@ def located(
 
     At a phase resonance the mode moves in phase with the force: 2ζ̃ω̃ = |A|F/v.
     """
-    found = _solved(fit, force, place, new)
+    solved = solved_point(fit, force, place, new)
     (_, x, omega), nan = place, float("nan")
     values, std, ratio = np.array([omega, omega * x, x]), np.full(3, nan), nan
-    if found is not None:
-        values = found.values
-        std = np.sqrt(found.variance(fit) + found.by_level**2 @ new.std**2)
+    if solved is not None:
+        values = solved.values
+        std = np.sqrt(solved.variance(fit) + solved.by_level**2 @ new.std**2)
     omega, speed, x = map(float, values)
-    if found is not None and place.kind == "resonance":
+    if solved is not None and place.kind == "resonance":
         load = abs(float(fit.problem.constant_of(fit.unknowns))) * force
         ratio = load / (2 * omega**2 * x)
     return FittedPoint(
@@ -102,7 +84,7 @@ def located(
         frequency_std=float(std[0]),
         velocity_std=float(std[1]),
         kind=place.kind,
-        located=found is not None,
+        located=solved is not None,
     )
 
 
@@ -113,22 +95,9 @@ def turns(frequency: np.ndarray, amplitude: np.ndarray) -> list[Place]:
     return [Place("fold", float(amplitude[k]), float(frequency[k])) for k in at]
 
 
-def point_slopes(
-    fit: JointFit, force: float, kind: Kind, point: FittedPoint
-) -> Float[np.ndarray, "output unknown"]:
-    """Derivatives of a resonance's or fold's frequency and velocity by the free unknowns.
-
-    Raises `ValueError` when there is no such point there.
-    """
-    found = _solved(fit, force, Place(kind, point.velocity / point.frequency, point.frequency))
-    if found is None:
-        raise ValueError(f"there is no {kind} near {point.frequency / _HERTZ:.4g} Hz.")
-    return found.slopes[:2]
-
-
-def _solved(
+def solved_point(
     fit: JointFit, force: float, place: Place, new: NewLevel = ON_THE_CURVES
-) -> _Solved | None:
+) -> SolvedPoint | None:
     """Frequency, velocity and displacement of a point, and their slopes by the unknowns."""
     program, motion = fit.packed(), ForcedMotion.of(fit, force, new)
     unit = jnp.array([place.amplitude, place.frequency])
@@ -136,7 +105,7 @@ def _solved(
     values, slopes, good = map(np.asarray, _point_with_slopes(motion, vector, unit, is_fold))
     if not good:
         return None
-    return _Solved(values, slopes[:, program.own], slopes[:, len(program.vector) :])
+    return SolvedPoint(values, slopes[:, program.own], slopes[:, len(program.vector) :])
 
 
 @compiled
@@ -162,10 +131,11 @@ def _point_with_slopes(
         return point - jnp.linalg.solve(jacobian, equations(point, vector))
 
     point = jax.lax.fori_loop(0, _ITERATIONS, step, jnp.ones(2))
-    left = jnp.max(jnp.abs(equations(point, vector)))
-    good = (left < 1e-9) & jnp.all(jnp.abs(point - 1.0) < 0.2)
-    by_vector = jax.jacfwd(equations, argnums=1)(point, vector)
-    along = -jnp.linalg.solve(jax.jacfwd(equations)(point, vector), by_vector)
+    # What a further step would move: what the equations leave grows with lightly damped slopes.
+    jacobian, by_vector = jax.jacfwd(equations, argnums=(0, 1))(point, vector)
+    left = jnp.linalg.solve(jacobian, equations(point, vector))
+    good = jnp.all(jnp.abs(left) < _SETTLED) & jnp.all(jnp.abs(point - 1.0) < _FARTHEST)
+    along = -jnp.linalg.solve(jacobian, by_vector)
 
     def outputs(point: Array, vector: Array) -> Array:
         x, omega = point * unit

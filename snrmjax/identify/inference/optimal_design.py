@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -12,7 +12,6 @@ from jaxtyping import Array, Complex, Float
 
 from snrmjax.identify.inference.fitted_curves import values_at_displacement
 from snrmjax.identify.inference.fitted_response import FittedResponse, fitted_response
-from snrmjax.identify.inference.located_points import Kind, point_slopes
 from snrmjax.identify.inference.table_result import AbstractTable
 from snrmjax.identify.joint.force_balance import (
     BalanceData,
@@ -22,21 +21,19 @@ from snrmjax.identify.joint.force_balance import (
     no_errors,
     weighting_at,
 )
-from snrmjax.identify.joint.free_unknowns import Unravel, padded_levels
+from snrmjax.identify.joint.free_unknowns import Unravel, padded_levels, whitened
 from snrmjax.identify.joint.joint_fit import JointFit
-from snrmjax.identify.joint.residuals import whitened
 from snrmjax.identify.test_model.states import LEVEL_ERRORS
 from snrmjax.numerics.blocks import padded
 from snrmjax.numerics.compiled import compiled
-from snrmjax.numerics.result import Variable
+from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.result import Variable, setting
 from snrmjax.numerics.status import Status
+from snrmjax.numerics.units import HERTZ
 
-Target = Literal["curves", "frequency", "damping", "resonance", "fold"]
+Target = Literal["curves", "frequency", "damping"]
 
-_NOT_CONVERGED = (
-    "the fit that this advice rests on has not converged: another fit may advise other states"
-)
-_HERTZ = 2 * np.pi  # rad/s
+_CURVES = ("natural frequency", "damping")
 _SHOWN = 12  # advised states on one screen
 _PER_FORCE = 96  # candidate states of one force
 _TARGETS = 25  # amplitudes at which the band of a curve counts
@@ -65,7 +62,7 @@ class NextMeasurement(NamedTuple):
     velocity: float  # m/s, expected
     phase: float  # rad, expected of the velocity relative to the force
     expected_band_ratio: float  # mean band after this and the ones before it, over today's
-    reason: str
+    reason: Fact
     drive: float | None = None  # V, where only the drive is known
 
     @property
@@ -80,13 +77,26 @@ class NextMeasurements(AbstractTable[NextMeasurement]):
     """Advised steady states, the best first; a sequence of `NextMeasurement`."""
 
     coordinates = ("rank",)
+    columns: ClassVar = {
+        "rank": (lambda row: row.rank, "1", "rank, the best first"),
+        "force_n": (lambda row: row.force, "N", "force"),
+        "drive_v": (lambda row: row.drive, "V", "drive voltage"),
+        "frequency_hz": (lambda row: row.frequency / HERTZ, "Hz", "frequency"),
+        "velocity_m_s": (lambda row: row.velocity, "m/s", "expected velocity"),
+        "phase_deg": (lambda row: np.degrees(row.phase), "deg", "phase"),
+        "expected_band_ratio": (
+            lambda row: row.expected_band_ratio,
+            *("1", "mean band after it, over today's"),
+        ),
+        "reason": (lambda row: str(row.reason), "", "why this state"),
+    }
 
     responses: tuple[FittedResponse, ...]  # the main curves under the advised forces
-    sensor: str = eqx.field(static=True)
-    target: str = eqx.field(static=True)
-    status: AdviceStatus = eqx.field(static=True)
+    sensor: str = setting()
+    target: str = setting()
+    status: AdviceStatus = setting()
     drive_known_only: bool = eqx.field(static=True)
-    notes: tuple[str, ...] = eqx.field(static=True, default=())
+    notes: tuple[Fact, ...] = setting(default=())
 
     @property
     def message(self) -> str:
@@ -96,10 +106,10 @@ class NextMeasurements(AbstractTable[NextMeasurement]):
     def summary(self) -> tuple[str, ...]:
         """See `AbstractResult`."""
         lines = [f"NextMeasurements: {len(self)} states that narrow the band of {self.target} most"]
-        for one in self.rows[:_SHOWN]:
-            load = f"force {one.force:.4g} N" if one.drive is None else f"drive {one.drive:.4g} V"
-            place = f"{load}, {one.frequency / _HERTZ:.6g} Hz (expected {one.expected})"
-            lines.append(f"{one.rank}: {place}: {one.reason}")
+        for row in self.rows[:_SHOWN]:
+            load = f"force {row.force:.4g} N" if row.drive is None else f"drive {row.drive:.4g} V"
+            place = f"{load}, {row.frequency / HERTZ:.6g} Hz (expected {row.expected})"
+            lines.append(f"{row.rank}: {place}: {row.reason}")
         if len(self) > _SHOWN:
             lines.append(f"and {len(self) - _SHOWN} more")
         if self.status != AdviceStatus.COMPLETE:
@@ -107,33 +117,15 @@ class NextMeasurements(AbstractTable[NextMeasurement]):
         return (*lines, *(f"note: {note}" for note in self.notes))
 
     def variables(self) -> dict[str, Variable]:
-        """See `AbstractResult`."""
-
-        rows = self.rows
-        load = {"force_n": self.column([one.force for one in rows], "N", "force")}
-        if self.drive_known_only:
-            load = {"drive_v": self.column([one.drive for one in rows], "V", "drive voltage")}
-        ratio = [one.expected_band_ratio for one in rows]
+        """Those of the rows, the force as a test states it."""
+        left_out = "force_n" if self.drive_known_only else "drive_v"
         return {
-            "rank": self.column([one.rank for one in rows], "1", "rank, the best first"),
-            **load,
-            "frequency_hz": self.column(
-                [one.frequency / _HERTZ for one in rows], "Hz", "frequency"
-            ),
-            "velocity_m_s": self.column([one.velocity for one in rows], "m/s", "expected velocity"),
-            "phase_deg": self.column(np.degrees([o.phase for o in rows]).tolist(), "deg", "phase"),
-            "expected_band_ratio": self.column(ratio, "1", "mean band after it, over today's"),
-            "reason": self.column([one.reason for one in rows], "", "why this state"),
+            name: variable for name, variable in super().variables().items() if name != left_out
         }
 
     def attributes(self) -> dict[str, str | float | int]:
         """See `AbstractResult`."""
-        return {
-            "target": self.target,
-            "sensor": self.sensor,
-            "status": self.message,
-            "notes": "\n".join(self.notes),
-        }
+        return {**super().attributes(), "status": self.status.message}
 
 
 def next_measurements(
@@ -141,7 +133,6 @@ def next_measurements(
     count: int,
     *,
     target: Target = "curves",
-    target_force: float | None = None,
     forces: Sequence[float] | Float[np.ndarray, " force"] | None = None,
     from_frequency: float = 0.0,
     to_frequency: float = np.inf,
@@ -155,12 +146,11 @@ def next_measurements(
     are those of the families taken, without what the choice among families leaves open.
 
     Arguments: `target` is the band to narrow: of both curves (relative), of natural frequency or
-    damping alone, or of the frequency of the resonance or upper fold under `target_force`.
+    damping alone.
     `forces`, by default twelve from the smallest to the largest measured. Both are in N, or in V
     where the fitted data know the drive only. Frequencies in rad/s.
     Returns at most `count` states: fewer, or none, when a test can reach no more; `status` says so,
     and `notes` say that the fit has not converged.
-    Raises `ValueError` when the target needs a force and has none, or does not exist there.
     Reference: the one-step rule of sequential design, Fedorov, Theory of Optimal Experiments
     (1972), for a mean of standard deviations.
     """
@@ -169,12 +159,10 @@ def next_measurements(
     if forces is not None:
         given = np.asarray(forces, dtype=np.float64)
         wanted = fit.force_of_drive(given) if fit.drive_known_only else given
-    if target_force is not None and fit.drive_known_only:
-        target_force = float(fit.force_of_drive(np.asarray(target_force)))
     states = _candidates(fit, [float(f) for f in wanted], (from_frequency, to_frequency))
-    slopes, scale = _target(fit, target, target_force)
+    slopes, scale = _target(fit, target)
     advice = [] if states is None else _ranked(fit, states, slopes / scale[:, None], target, count)
-    loads = {one.force for one in advice}
+    loads = {row.force for row in advice}
     status = AdviceStatus.COMPLETE if len(advice) == count else AdviceStatus.FEWER_STATES
     return NextMeasurements(
         rows=tuple(advice),
@@ -183,7 +171,7 @@ def next_measurements(
         target=target,
         status=status if states is not None else AdviceStatus.NO_STATE,
         drive_known_only=fit.drive_known_only,
-        notes=() if fit.converged else (_NOT_CONVERGED,),
+        notes=() if fit.converged else (Fact("advice_of_unconverged_fit"),),
     )
 
 
@@ -238,11 +226,11 @@ class _States(NamedTuple):
 
 
 def _candidates(fit: JointFit, forces: list[float], ends: tuple[float, float]) -> _States | None:
-    rows, every = [], []
+    rows, drawn = [], []
     for number, force in enumerate(forces):
         curves = fitted_response(fit, force, from_frequency=ends[0], to_frequency=ends[1])
         for curve in curves[:1]:
-            every.append(curve)
+            drawn.append(curve)
             keep = _measurable(curve)
             at = np.flatnonzero(keep)
             if at.size > _PER_FORCE:
@@ -256,7 +244,7 @@ def _candidates(fit: JointFit, forces: list[float], ends: tuple[float, float]) -
     if not rows or not sum(len(row[0]) for row in rows):
         return None
     level, load, frequency, velocity = (np.concatenate(c) for c in zip(*rows, strict=True))
-    return _States(level, load, frequency, velocity, tuple(every))
+    return _States(level, load, frequency, velocity, tuple(drawn))
 
 
 def _measurable(curve: FittedResponse) -> np.ndarray:
@@ -267,25 +255,15 @@ def _measurable(curve: FittedResponse) -> np.ndarray:
 
 
 def _target(
-    fit: JointFit, target: Target, force: float | None
+    fit: JointFit, target: Target
 ) -> tuple[Float[np.ndarray, "output unknown"], Float[np.ndarray, " output"]]:
     """Slopes of what shall become better known, and the values that its bands are relative to."""
-    if target in ("curves", "frequency", "damping"):
-        measured = np.asarray(fit.motion().displacement)
-        at = np.linspace(measured.min(), measured.max(), _TARGETS)
-        values, slopes, *_ = values_at_displacement(fit, at)
-        parts = {"frequency": [0], "damping": [1]}.get(target, [0, 1])
-        each = [slopes[:, k] / (2.0 if k == 0 else 1.0) for k in parts]
-        return np.concatenate(each), np.concatenate([values[:, k] for k in parts])
-    if force is None:
-        raise ValueError(f"the target {target!r} needs `target_force`.")
-    curves = fitted_response(fit, force)
-    points = [p for c in curves for p in (c.resonances if target == "resonance" else c.folds)]
-    if not points:
-        raise ValueError(f"the fitted response to {force:g} N has no {target}.")
-    best = max(points, key=lambda point: point.velocity)
-    kind: Kind = "resonance" if target == "resonance" else "fold"
-    return point_slopes(fit, force, kind, best)[:1], np.array([best.frequency])
+    measured = np.asarray(fit.motion().displacement)
+    at = np.linspace(measured.min(), measured.max(), _TARGETS)
+    values, slopes, *_ = values_at_displacement(fit, at)
+    parts = {"frequency": [0], "damping": [1]}.get(target, [0, 1])
+    each = [slopes[:, k] / (2.0 if k == 0 else 1.0) for k in parts]
+    return np.concatenate(each), np.concatenate([values[:, k] for k in parts])
 
 
 def _information(fit: JointFit, states: _States) -> Float[np.ndarray, "state part unknown"]:
@@ -310,8 +288,8 @@ def _information(fit: JointFit, states: _States) -> Float[np.ndarray, "state par
     padded_states = jax.tree.map(lambda rows: filled(rows, n_padded, None), data)
     levels = dataclasses.replace(padded_states, n_levels=padded_levels(n_levels))
     problem = BalanceProblem(levels, fit.modes, fit.prior)
-    found = _slopes(program.vector, program.unravel, problem)
-    by_vector, by_level = (np.asarray(part)[:n] for part in found)
+    by_unknowns = _slopes(program.vector, program.unravel, problem)
+    by_vector, by_level = (np.asarray(part)[:n] for part in by_unknowns)
     rows = np.zeros((n, 2, fit.covariance.shape[0] + n_levels * len(LEVEL_ERRORS)))
     rows[:, :, : fit.covariance.shape[0]] = by_vector[:, :, program.own]
     for k in range(len(LEVEL_ERRORS)):
@@ -349,9 +327,9 @@ def _best(
 ) -> tuple[int, np.ndarray]:
     """The candidate that leaves the smallest mean band, and the variances that it leaves."""
     index = np.flatnonzero(wanted)
-    own = rows[index]
-    through = own @ covariance  # (state, part, unknown)
-    inner = np.eye(2) + through @ own.transpose(0, 2, 1)
+    candidates = rows[index]
+    through = candidates @ covariance  # (state, part, unknown)
+    inner = np.eye(2) + through @ candidates.transpose(0, 2, 1)
     arms = through @ slopes.T  # (state, part, output)
     gain = np.einsum("sio,sio->so", arms, np.linalg.solve(inner, arms))
     variance = np.einsum("op,pq,oq->o", slopes, covariance, slopes)
@@ -360,18 +338,12 @@ def _best(
     return int(index[best]), left[best]
 
 
-def _reason(target: Target, before: np.ndarray, after: np.ndarray) -> str:
-    """Why this state, in words."""
+def _reason(target: Target, before: np.ndarray, after: np.ndarray) -> Fact:
+    """Which band becomes narrower, and by what share."""
     narrowed = 1 - np.sqrt(after / before)
     if target == "curves":
-        half = len(before) // 2
-        names = ("natural frequency", "damping")
-        shares = [float(np.mean(narrowed[:half])), float(np.mean(narrowed[half:]))]
-        which = names[int(np.argmax(shares))]
-        gain = max(shares)
-    else:
-        which = {"frequency": "natural frequency", "damping": "damping"}.get(
-            target, f"{target} frequency"
-        )
-        gain = float(np.mean(narrowed))
-    return f"the {which} band becomes {100 * gain:.2g} % narrower"
+        shares = dict(zip(_CURVES, np.mean(narrowed.reshape(2, -1), axis=1).tolist(), strict=True))
+        curve = max(shares, key=lambda name: shares[name])
+        return Fact("band_narrower", curve=curve, share=shares[curve])
+    curve = _CURVES[target == "damping"]
+    return Fact("band_narrower", curve=curve, share=float(np.mean(narrowed)))

@@ -1,7 +1,7 @@
 """Results that are tables of rows: sequences that also become a labelled data set."""
 
-from collections.abc import Iterator, Sequence
-from typing import Any, Generic, TypeVar, overload
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, ClassVar, Generic, TypeVar, overload
 
 import numpy as np
 
@@ -13,6 +13,8 @@ Row = TypeVar("Row")
 class AbstractTable(AbstractResult, Generic[Row]):
     """A result that is a sequence of rows, each a `NamedTuple`."""
 
+    # Of a row, unit and meaning.
+    columns: ClassVar[Mapping[str, tuple[Callable[[Any], Any], str, str]]]
     rows: tuple[Row, ...]
 
     def __len__(self) -> int:
@@ -31,6 +33,9 @@ class AbstractTable(AbstractResult, Generic[Row]):
         """The rows in their order."""
         return iter(self.rows)
 
-    def column(self, values: Sequence[Any] | np.ndarray, unit: str, meaning: str) -> Variable:
-        """A quantity of every row."""
-        return Variable(("row",), np.asarray(values), unit, meaning)
+    def variables(self) -> dict[str, Variable]:
+        """One of every entry of `columns`."""
+        return {
+            name: Variable(("row",), np.array([of(row) for row in self.rows]), unit, meaning)
+            for name, (of, unit, meaning) in self.columns.items()
+        }

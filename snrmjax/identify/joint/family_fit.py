@@ -12,10 +12,14 @@ from jaxtyping import Array, Float
 
 from snrmjax.identify.checks.residual_autocorrelation import share_told_by
 from snrmjax.identify.joint.force_balance import BalanceProblem, Unknowns, nearest_errors
-from snrmjax.identify.joint.free_unknowns import Unravel, packed_unknowns, padded_problem
+from snrmjax.identify.joint.free_unknowns import (
+    Unravel,
+    corrected_residuals,
+    packed_unknowns,
+    padded_problem,
+)
 from snrmjax.identify.joint.notes import NoiseEstimate
 from snrmjax.identify.joint.posterior_view import LEAST_LEFT
-from snrmjax.identify.joint.residuals import corrected_residuals
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.least_squares import degrees_spent, root_of_inverse
 from snrmjax.numerics.status import Status
@@ -91,21 +95,21 @@ def fit_families(
         problem = problem.with_data(correction=answer.correction[:n])
         residuals = np.asarray(answer.residuals)[:n] / np.sqrt(share)
         level, frequency = (np.asarray(a) for a in (problem.data.level, problem.data.frequency))
-        told = share_told_by(residuals, level, frequency)
-        rows = told * residuals.size
+        independent = share_told_by(residuals, level, frequency)
+        rows = independent * residuals.size
         left = max(rows - degrees_spent(jacobian, answer.residuals.size), LEAST_LEFT * rows)
-        found = size * float(np.sqrt(told * np.sum(residuals**2) / left))
-        std = found / float(np.sqrt(2 * left))
-        noise = dataclasses.replace(noise, scale=found, scale_std=std)
-        wanted = 1.0 if believed and not noise.exceeded else max(found, 1e-12)
-        change = np.hypot(np.log(wanted / size), np.log(told / share))
-        size, share = (size, share) if change < _SETTLED else (wanted, told)
+        scale = size * float(np.sqrt(independent * np.sum(residuals**2) / left))
+        std = scale / float(np.sqrt(2 * left))
+        noise = dataclasses.replace(noise, scale=scale, scale_std=std)
+        wanted = 1.0 if believed and not noise.exceeded else max(scale, 1e-12)
+        change = np.hypot(np.log(wanted / size), np.log(independent / share))
+        size, share = (size, share) if change < _SETTLED else (wanted, independent)
         if change < _SETTLED:
             status = FitStatus.CONVERGED if bool(good) else FitStatus.STEP_LIMIT
             break
     root = root_of_inverse(jacobian)
-    own = Unravel(start, free)(np.asarray(program.vector)[program.own])
-    return FamilyFit(own, root @ root.T, problem, noise, residuals, status)
+    unknowns = Unravel(start, free)(np.asarray(program.vector)[program.own])
+    return FamilyFit(unknowns, root @ root.T, problem, noise, residuals, status)
 
 
 class _Answer(NamedTuple):
@@ -136,10 +140,10 @@ def _solved(
     Every unknown counts in its own `unit`, so that the solver's damping treats all alike; states
     are corrected for their most likely errors at every step.
     """
-    found: optx.Solution = optx.least_squares(
+    solution: optx.Solution = optx.least_squares(
         lambda y, _: corrected_residuals(y * unit, unravel, problem),
         *(_ROUND, vector / unit),
         max_steps=MOST_STEPS,
         throw=False,
     )
-    return found.value * unit, jnp.asarray(found.result == optx.RESULTS.successful)
+    return solution.value * unit, jnp.asarray(solution.result == optx.RESULTS.successful)

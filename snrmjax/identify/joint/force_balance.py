@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
-from snrmjax.identify.curves.family_base import AbstractCurve, AbstractFamily
+from snrmjax.identify.curves.family_base import AbstractFamily, PackedCurve
 from snrmjax.identify.pointwise.backbone_points import modal_filter, off_resonance_error_factor
 from snrmjax.identify.pointwise.snrm import reference_sensor
 from snrmjax.identify.test_model.priors import FORCE_TO_VELOCITY
@@ -118,13 +118,13 @@ def stated_level_std(model: Structure | LinearModes) -> Float[np.ndarray, " erro
         return np.zeros(len(LEVEL_ERRORS))
     gain, phase, frequency, damping = model.level_stds
     j = model.modes.mode_of_interest
-    own, ratio = float(model.modes.natural_frequency[j]), float(model.modes.damping_ratio[j])
+    natural, ratio = float(model.modes.natural_frequency[j]), float(model.modes.damping_ratio[j])
     if damping > 0 and ratio <= 0:
         raise ValueError(
             "`level_damping_std` is stated, but the linear damping ratio that it is relative to "
             "is 0: state a damping ratio."
         )
-    return np.array([gain, phase, 2 * frequency / own, damping / ratio if damping > 0 else 0.0])
+    return np.array([gain, phase, 2 * frequency / natural, damping / ratio if damping > 0 else 0.0])
 
 
 def stated_prior(
@@ -213,7 +213,7 @@ class Motion(eqx.Module):
     displacement: Float[Array, " state"]  # m
     force: Float[Array, " state"]  # N
 
-    def amplitude(self, curve: AbstractCurve) -> Float[Array, " state"]:
+    def amplitude(self, curve: AbstractFamily | PackedCurve) -> Float[Array, " state"]:
         """The amplitude that a curve is a function of."""
         return curve.amplitude(self.displacement, jnp.abs(self.velocity))
 
@@ -244,8 +244,8 @@ def recorded_motion(unknowns: Unknowns, problem: BalanceProblem) -> Motion:
     force = force + float(unknowns.force_offset) * np.min(np.asarray(data.force))
     turned = of_force - level[:, 0] - 1j * (level[:, 1] + float(unknowns.instrument_phase))
     linear = with_deviations(problem.modes, unknowns.linear, prior.linear)
-    own = np.asarray(data.velocity) * np.exp(turned) - velocity_of_others(linear, data, force)
-    return Motion(own, np.abs(own) / np.asarray(data.frequency), force)
+    of_mode = np.asarray(data.velocity) * np.exp(turned) - velocity_of_others(linear, data, force)
+    return Motion(of_mode, np.abs(of_mode) / np.asarray(data.frequency), force)
 
 
 @compiled
@@ -267,8 +267,8 @@ def motion_of(
     velocity = data.velocity * jnp.exp(error[:, 1] - level[:, 0] + of_force + 1j * phase)
     linear = with_deviations(problem.modes, unknowns.linear, prior.linear)
     residual = residual_velocity(linear, jnp.asarray(data.frequency), force)
-    own = velocity - jnp.sum(data.share * residual, axis=1)
-    return Motion(own, jnp.abs(own) / data.frequency, force)
+    of_mode = velocity - jnp.sum(data.share * residual, axis=1)
+    return Motion(of_mode, jnp.abs(of_mode) / data.frequency, force)
 
 
 @compiled
@@ -357,8 +357,8 @@ def nearest_errors(
         whitened = jnp.einsum(
             "sij,sj->si", own.whiten, force_balance(unknowns, problem, errors) + own.offset
         )
-        found = -jnp.einsum("sje,sij,si->se", slopes, own.whiten, whitened) * problem.data.std**2
-        return jnp.clip(found, -_FARTHEST, _FARTHEST), errors, own
+        nearest = -jnp.einsum("sje,sij,si->se", slopes, own.whiten, whitened) * problem.data.std**2
+        return jnp.clip(nearest, -_FARTHEST, _FARTHEST), errors, own
 
     start = problem.data.correction
     n = len(start)

@@ -1,4 +1,4 @@
-"""The unknowns that a fit may change as one vector, in the order that their names have."""
+"""The unknowns that a fit may change as one vector, and what it makes small by them."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -11,12 +11,15 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
-from snrmjax.identify.curves.packed_curve import packed
+from snrmjax.identify.curves.family_base import packed
 from snrmjax.identify.joint.force_balance import (
     BalanceData,
     BalanceProblem,
     Unknowns,
+    Weighting,
     filled,
+    force_balance,
+    nearest_errors,
     with_room,
 )
 from snrmjax.identify.test_model.states import LEVEL_ERRORS
@@ -49,9 +52,9 @@ class Unravel(eqx.Module):
             return eqx.combine(ravel_pytree(moving)[1](vector), fixed)
         leaves, structure = jax.tree.flatten(moving)
         ends = np.cumsum([leaf.size for leaf in leaves])
-        own = np.split(np.asarray(vector), ends[:-1])
+        pieces = np.split(np.asarray(vector), ends[:-1])
         parts = [
-            jnp.asarray(part.reshape(leaf.shape)) for part, leaf in zip(own, leaves, strict=True)
+            jnp.asarray(part.reshape(leaf.shape)) for part, leaf in zip(pieces, leaves, strict=True)
         ]
         return eqx.combine(jax.tree.unflatten(structure, parts), fixed)
 
@@ -93,8 +96,8 @@ def packed_unknowns(
     linear = len(vector) - len(unknowns.linear)
     spare = (len(whole.level) - present) * len(LEVEL_ERRORS)
     rest = (*range(size + other, linear - spare), *range(linear, len(vector)))
-    own = [*range(n), *range(size, size + m), *rest]
-    return PackedUnknowns(vector, Unravel(whole, free), np.array(own))
+    places = [*range(n), *range(size, size + m), *rest]
+    return PackedUnknowns(vector, Unravel(whole, free), np.array(places))
 
 
 def padded_data(data: BalanceData) -> BalanceData:
@@ -159,3 +162,41 @@ def named_unknowns(
         *((f"linear_{k}", "std") for k in range(unknowns.linear.shape[0] - 1)),
         ("modal_mass", "std"),
     )
+
+
+def whitened(
+    unknowns: Unknowns,
+    problem: BalanceProblem,
+    weighting: Weighting,
+) -> Float[Array, "state part"]:
+    """Residuals of the states, of unit variance where the noise is as stated."""
+    balance = force_balance(unknowns, problem, problem.data.correction) + weighting.offset
+    return jnp.sqrt(problem.data.weight)[:, None] * jnp.einsum(
+        "sij,sj->si", weighting.whiten, balance
+    )
+
+
+def all_residuals(
+    vector: Array,
+    unravel: Unravel,
+    problem: BalanceProblem,
+    weighting: Weighting,
+) -> Float[Array, " residual"]:
+    """Whitened residuals of the states, then the priors of levels, linear parameters and curves."""
+    unknowns = unravel(vector)
+    points = whitened(unknowns, problem, weighting).reshape(-1)
+    curves = (unknowns.squared_frequency, unknowns.modal_damping)
+    priors = [unknowns.level.reshape(-1), unknowns.linear, *(c.prior_residuals() for c in curves)]
+    return jnp.concatenate([points, *priors])
+
+
+def corrected_residuals(
+    vector: Array, unravel: Unravel, problem: BalanceProblem
+) -> Float[Array, " residual"]:
+    """`all_residuals`, the states corrected for their most likely errors.
+
+    The residuals are then those errors in units of their 1σ, whose slopes need no derivative of
+    the errors themselves.
+    """
+    errors, weighting = nearest_errors(unravel(jax.lax.stop_gradient(vector)), problem)
+    return all_residuals(vector, unravel, problem.with_data(correction=errors), weighting)

@@ -56,9 +56,10 @@ from snrmjax.measure.states import SteadyStates
 from snrmjax.model.modes import LinearModes
 from snrmjax.model.structures import Structure, modes_of
 from snrmjax.numerics.blocks import on_one_core
+from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.units import HERTZ
 
-_HERTZ = 2 * np.pi  # rad/s
 _MOVED = 2.0  # standard deviations of a level's error, from which on the fit says so
 
 
@@ -80,7 +81,7 @@ class JointFit(AbstractResult):
     residuals: Float[np.ndarray, "state part"]  # whitened, of unit variance if all is right
     drive_known_only: bool = eqx.field(static=True)
     free: tuple[str, ...] = eqx.field(static=True)
-    notes: tuple[str, ...] = eqx.field(static=True)
+    notes: tuple[Fact, ...] = eqx.field(static=True)
     status: FitStatus = eqx.field(static=True)
     level_numbers: tuple[int, ...] = eqx.field(static=True)  # of the file; `data` counts from 0
 
@@ -123,13 +124,13 @@ class JointFit(AbstractResult):
         """
         share = self.problem.constant_of(self.unknowns) / self.problem.modal_constant
         j, modes = self.modes.mode_of_interest, self.modes
-        found = eqx.tree_at(
+        scaled = eqx.tree_at(
             lambda m: m.participation, modes, modes.participation.at[j].multiply(share)
         )
         if modes.modal_mass_std is None:
-            return found
+            return scaled
         left = self.prior.linear[-1] * jnp.sqrt(jnp.asarray(self.covariance)[-1, -1])
-        return eqx.tree_at(lambda m: m.modal_mass_std, found, modes.modal_mass_std.at[j].set(left))
+        return eqx.tree_at(lambda m: m.modal_mass_std, scaled, modes.modal_mass_std.at[j].set(left))
 
     def motion(self) -> Motion:
         """The nonlinear mode's motion in the states as the fit sees it."""
@@ -165,8 +166,8 @@ class JointFit(AbstractResult):
 
     def labels(self) -> tuple[str, ...]:
         """`names` with the levels' own numbers, for readers."""
-        own = named_unknowns(self.unknowns, self.data, self.free, self.level_numbers)
-        return tuple(name for name, _ in own)
+        named = named_unknowns(self.unknowns, self.data, self.free, self.level_numbers)
+        return tuple(name for name, _ in named)
 
     def units(self) -> tuple[str, ...]:
         """Units of the free unknowns; a curve's terms count at the largest amplitude."""
@@ -187,7 +188,7 @@ class JointFit(AbstractResult):
             f"JointFit: natural frequency: {squared.words}; damping: {damping.words}",
             f"{len(self.data.level)} steady states of {self.data.n_levels} levels at "
             f"{self.modes.sensors[self.data.sensor]!r}, {size.min():.3g} to {size.max():.3g} m/s",
-            f"natural frequency {omega.min() / _HERTZ:.6g} to {omega.max() / _HERTZ:.6g} Hz, "
+            f"natural frequency {omega.min() / HERTZ:.6g} to {omega.max() / HERTZ:.6g} Hz, "
             f"damping ratio {100 * ratio.min():.3g} to {100 * ratio.max():.3g} %",
             f"residuals: {noise}",
             f"status: {self.status.message}",
@@ -206,7 +207,7 @@ class JointFit(AbstractResult):
             "std": Variable(per, std, "", "1σ, in `unit`"),
             "unit": Variable(per, np.array(self.units()), "", "unit of the parameter"),
             "level": Variable(state, numbers[np.asarray(data.level)], "1", "level"),
-            "frequency_hz": Variable(state, np.asarray(data.frequency) / _HERTZ, "Hz", "frequency"),
+            "frequency_hz": Variable(state, np.asarray(data.frequency) / HERTZ, "Hz", "frequency"),
             "drive_v" if force == "V" else "force_n": Variable(state, measured, force, "force"),
             "velocity_m_s": Variable(
                 state, np.abs(np.asarray(self.motion().velocity)), "m/s", "velocity of the mode"
@@ -221,7 +222,7 @@ class JointFit(AbstractResult):
             "damping": self.unknowns.modal_damping.label,
             "noise_scale": self.noise.scale,
             "status": self.status.message,
-            "notes": "\n".join(self.notes),
+            "notes": "\n".join(map(str, self.notes)),
         }
 
 
@@ -282,7 +283,9 @@ def fit_jointly(
         raise ValueError(f"a joint fit needs at least 3 steady states, but only {n} are usable.")
     driven = not np.any(np.isfinite(np.asarray(data.force)))
     released = tuple(name for name in FREE if name in free or (driven and name == "force_gain"))
-    knots = {one.size for one in choices if one.kind == SmoothingSpline.kind and one.size}
+    knots = {
+        choice.size for choice in choices if choice.kind == SmoothingSpline.kind and choice.size
+    }
     if len(knots) > 1:
         raise ValueError(
             f"smooth curves have their knots in common: give both one size, not {min(knots)} "
@@ -290,12 +293,12 @@ def fit_jointly(
         )
     problem = BalanceProblem(measured, modes, stated_prior(modes, level_std, released))
     view = view_of(problem, released, stated, robust=robust, knots=max(knots, default=None))
-    found, unknowns = view.posterior, viewed_unknowns(view, choices)
+    posterior, unknowns = view.posterior, viewed_unknowns(view, choices)
     best = FamilyFit(
-        *(unknowns, viewed_covariance(view), view.problem, view.noise, found.residuals),
-        FitStatus.CONVERGED if found.settled else FitStatus.NOT_SETTLED,
+        *(unknowns, viewed_covariance(view), view.problem, view.noise, posterior.residuals),
+        FitStatus.CONVERGED if posterior.settled else FitStatus.NOT_SETTLED,
     )
-    if not all(one.kind in SMOOTH and one.argument != "velocity" for one in choices):
+    if not all(choice.kind in SMOOTH and choice.argument != "velocity" for choice in choices):
         wander = np.full(n, view.wandering / (1.0 if view.believed else view.noise.scale))
         errors = np.column_stack([np.asarray(measured.std)[:, :3], wander])
         best = fit_families(
@@ -305,13 +308,15 @@ def fit_jointly(
     autocorrelation = residual_autocorrelation(best.residuals, along_resonance(level, frequency))
     # What levels differ by is said where the data ask for it or the fit made use of it, and stays
     # possible elsewhere.
-    differ = np.array(found.differing) | _moved(best)
-    told = np.where(level_std > 0, level_std, np.where(differ, best.noise.level_std, 0.0))
+    differ = np.array(posterior.differing) | _moved(best)
+    level_std_said = np.where(level_std > 0, level_std, np.where(differ, best.noise.level_std, 0.0))
     fit = JointFit(
         unknowns=best.unknowns,
         covariance=best.covariance,
         problem=best.problem,
-        noise=dataclasses.replace(best.noise, level_std=told, autocorrelation=autocorrelation),
+        noise=dataclasses.replace(
+            best.noise, level_std=level_std_said, autocorrelation=autocorrelation
+        ),
         residuals=best.residuals,
         drive_known_only=driven,
         free=released,
@@ -321,7 +326,7 @@ def fit_jointly(
     )
     notes = notes_on_instruments(fit, LEVEL_ERRORS)
     notes += _notes(fit, 0.5 * view.wandering, level_std)
-    return dataclasses.replace(fit, notes=notes)
+    return dataclasses.replace(fit, notes=tuple(notes))
 
 
 def corrected_states(data: SteadyStates, fit: JointFit) -> SteadyStates:
@@ -342,15 +347,15 @@ def corrected_states(data: SteadyStates, fit: JointFit) -> SteadyStates:
     )
 
 
-def _notes(fit: JointFit, wandering: float, stated: Float[np.ndarray, " error"]) -> tuple[str, ...]:
+def _notes(fit: JointFit, wandering: float, stated: Float[np.ndarray, " error"]) -> list[Fact]:
     """All that a reader of a joint fit should know.
 
     Arguments: `wandering` 1σ of the natural frequency from state to state, relative; `stated` 1σ
     of levels' errors.
     """
-    notes: tuple[str, ...] = ()
+    notes = []
     if not fit.converged:
-        notes = (f"the fit has {fit.status.message}; try a simpler family.",)
+        notes.append(Fact("fit_not_converged", reason=fit.status.message))
     level, n_levels = np.asarray(fit.data.level), fit.data.n_levels
     notes += notes_on_noise(fit.noise, wandering, stated, n_levels)
     if np.any((stated == 0) & (fit.noise.level_std > 0)):
@@ -360,13 +365,13 @@ def _notes(fit: JointFit, wandering: float, stated: Float[np.ndarray, " error"])
         notes += notes_on_level_errors(
             shifts, fit.level_numbers, np.array(force), of_force=of_force
         )
-    return (
+    return [
         *notes,
         *notes_on_stated_errors(np.asarray(fit.unknowns.level), stated),
         *notes_on_modal_mass(fit.unknowns, fit.problem, fit.covariance),
         *notes_on_autocorrelation(fit.noise.autocorrelation),
         *notes_on_reach(fit.motion(), level),
-    )
+    ]
 
 
 def _moved(fit: FamilyFit) -> Bool[np.ndarray, " error"]:

@@ -22,7 +22,7 @@ from snrmjax.identify.joint.force_balance import (
 from snrmjax.identify.joint.notes import NoiseEstimate
 from snrmjax.identify.test_model.curve_basis import MOST_KNOTS
 from snrmjax.identify.test_model.hyper import MASS, OFFSET, PHASE
-from snrmjax.identify.test_model.posterior import TestPosterior, few_levels_factor, fit_test
+from snrmjax.identify.test_model.posterior import TestPosterior, fit_test, students_factor
 from snrmjax.identify.test_model.priors import OFF_RESONANCE
 from snrmjax.identify.test_model.states import TestStates
 from snrmjax.identify.test_model.walk import Rounds
@@ -77,56 +77,59 @@ def view_of(
     states = _test_states(problem, free, stated, guess)
     rounds = Rounds(most_knots=MOST_KNOTS if knots is None else knots)
     fit = functools.partial(fit_test, robust=robust, tempered=True)
-    found = fit(states, compare_levels=False, rounds=rounds)
-    mass, std = found.modal_mass
+    posterior = fit(states, compare_levels=False, rounds=rounds)
+    mass, std = posterior.modal_mass
     assumed = "force_gain" not in free and problem.modes.modal_mass_std is None
     if assumed and abs(mass - 1) < _ASKED * std:
         known = dataclasses.replace(problem.prior, linear=problem.prior.linear.at[-1].set(0.0))
         problem = dataclasses.replace(problem, prior=known)
         states = states._replace(mass_std=0.0)
-        found = fit(states, compare_levels=False, rounds=rounds._replace(start=found))
-    wandering = _wandering_stiffness(found)
+        posterior = fit(states, compare_levels=False, rounds=rounds._replace(start=posterior))
+    wandering = _wandering_stiffness(posterior)
     if wandering > 0:
-        own = np.full(len(states.level), wandering / found.hyper.noise)
-        states = states._replace(errors=np.column_stack([states.errors, own]))
-    found = fit(states, over_sizes=True, rounds=rounds._replace(start=found))
+        wander_std = np.full(len(states.level), wandering / posterior.hyper.noise)
+        states = states._replace(errors=np.column_stack([states.errors, wander_std]))
+    posterior = fit(states, over_sizes=True, rounds=rounds._replace(start=posterior))
     if "force_gain" in free:
-        found = _with_common_gain_in_the_force(found)
-    noise = _noise_of(found, stated)
+        posterior = _with_common_gain_in_the_force(posterior)
+    noise = _noise_of(posterior, stated)
     # What a stated noise lets the posterior have may be less than the states show.
-    wider = max(noise.scale / found.hyper.noise, 1.0) if noise.exceeded else 1.0
-    size = wider * found.hyper.noise / np.sqrt(found.share)
+    wider = max(noise.scale / posterior.hyper.noise, 1.0) if noise.exceeded else 1.0
+    size = wider * posterior.hyper.noise / np.sqrt(posterior.share)
     errors = np.zeros((len(states.level), len(STATE_ERRORS)))
     corrections = np.zeros_like(errors)
-    n_inputs = found.corrections.shape[1]
-    errors[:, :n_inputs], corrections[:, :n_inputs] = size * found.states.errors, found.corrections
-    unstated = few_levels_factor(found.states.n_levels) * noise.level_std
+    n_inputs = posterior.corrections.shape[1]
+    errors[:, :n_inputs], corrections[:, :n_inputs] = (
+        size * posterior.states.errors,
+        posterior.corrections,
+    )
+    unstated = students_factor(posterior.states.n_levels - 1) * noise.level_std
     level = np.where(np.asarray(problem.prior.level) > 0, problem.prior.level, unstated)
     problem = dataclasses.replace(
         problem.with_data(
             std=jax.device_put(errors),
-            weight=jax.device_put(found.weight),
+            weight=jax.device_put(posterior.weight),
             correction=jax.device_put(corrections),
         ),
         prior=dataclasses.replace(problem.prior, level=jax.device_put(level)),
     )
-    found = found._replace(covariance=wider**2 * found.covariance)
-    return View(found, problem, guess, free, noise, wandering)
+    posterior = posterior._replace(covariance=wider**2 * posterior.covariance)
+    return View(posterior, problem, guess, free, noise, wandering)
 
 
-def _with_common_gain_in_the_force(found: TestPosterior) -> TestPosterior:
+def _with_common_gain_in_the_force(posterior: TestPosterior) -> TestPosterior:
     """The posterior with all that levels' gains have in common in the free gain of the force.
 
     Both do the same to every state, and the curves stay what they are. How they share it is left
     to priors, of which that of the curves' bends prefers small forces.
     """
-    places, mean = found.places, found.mean.copy()
-    common = float(np.mean(found.level_errors[:, 0]))
+    places, mean = posterior.places, posterior.mean.copy()
+    common = float(np.mean(posterior.level_errors[:, 0]))
     mean[places.levels[:, 0]] -= common
     mean[MASS] = (1 + mean[MASS]) * np.exp(common) - 1
     for scaled in (places.stiffness, places.damping, OFFSET):
         mean[scaled] *= np.exp(common)
-    return found._replace(mean=mean)
+    return posterior._replace(mean=mean)
 
 
 def _test_states(
@@ -166,21 +169,21 @@ def _test_states(
 
 def viewed_unknowns(view: View, choices: tuple[Choice, Choice]) -> Unknowns:
     """Unknowns of a joint fit at the posterior's mean, with curves of the families asked for."""
-    found, prior = view.posterior, view.problem.prior
+    posterior, prior = view.posterior, view.problem.prior
     level, spread = np.asarray(prior.level), np.asarray(prior.linear)
-    mass = found.modal_mass[0]
+    mass = posterior.modal_mass[0]
     gain, is_free = abs(view.gain), "force_gain" in view.free
     linear = np.zeros(len(spread))
-    linear[:-1][spread[:-1] > 0] = found.mean[found.places.others]
+    linear[:-1][spread[:-1] > 0] = posterior.mean[posterior.places.others]
     if spread[-1] > 0:
         linear[-1] = np.log(mass) / spread[-1]
     return Unknowns(
-        squared_frequency=_curve(found, choices[0], 0),
-        modal_damping=_curve(found, choices[1], 1),
+        squared_frequency=_curve(posterior, choices[0], 0),
+        modal_damping=_curve(posterior, choices[1], 1),
         log_force_gain=jax.device_put(np.log(gain / mass) if is_free else 0.0),
-        force_offset=jax.device_put(found.force_offset * (gain / mass if is_free else 1.0)),
-        instrument_phase=jax.device_put(float(np.angle(view.gain)) + found.instrument_phase),
-        level=jax.device_put(found.level_errors * _sign_of_gain(view) / level),
+        force_offset=jax.device_put(posterior.force_offset * (gain / mass if is_free else 1.0)),
+        instrument_phase=jax.device_put(float(np.angle(view.gain)) + posterior.instrument_phase),
+        level=jax.device_put(posterior.level_errors * _sign_of_gain(view) / level),
         linear=jax.device_put(linear),
     )
 
@@ -192,11 +195,11 @@ def _sign_of_gain(view: View) -> Float[np.ndarray, " error"]:
 
 def viewed_covariance(view: View) -> Float[np.ndarray, "unknown unknown"]:
     """Covariance of a fit's free unknowns, with the posterior's own curves: in their order."""
-    found, prior = view.posterior, view.problem.prior
-    places, mass = found.places, found.modal_mass[0]
-    knots = found.basis.largest * np.sqrt(found.basis.knots)
-    curves = found.slopes(knots)
-    n = len(found.mean)
+    posterior, prior = view.posterior, view.problem.prior
+    places, mass = posterior.places, posterior.modal_mass[0]
+    knots = posterior.basis.largest * np.sqrt(posterior.basis.knots)
+    curves = posterior.slopes(knots)
+    n = len(posterior.mean)
 
     def by(**places_and_slopes: float) -> np.ndarray:
         row = np.zeros(n)
@@ -205,7 +208,7 @@ def viewed_covariance(view: View) -> Float[np.ndarray, "unknown unknown"]:
         return row
 
     scale = abs(view.gain) / mass if "force_gain" in view.free else 1.0
-    of_mass = -scale * found.force_offset / mass if "force_gain" in view.free else 0.0
+    of_mass = -scale * posterior.force_offset / mass if "force_gain" in view.free else 0.0
     measurement = {
         "force_gain": by(mass=-1 / mass),
         "force_offset": by(offset=scale, mass=of_mass),
@@ -224,32 +227,32 @@ def viewed_covariance(view: View) -> Float[np.ndarray, "unknown unknown"]:
     rows = [curves[:, 0], curves[:, 1]]
     rows += [row[None] for name, row in measurement.items() if name in view.free]
     slopes = np.concatenate([*rows, levels, linear])
-    covariance = slopes @ found.covariance @ slopes.T
+    covariance = slopes @ posterior.covariance @ slopes.T
     # What is known for certain is as far off, in its own 1σ, as its prior says.
     certain = len(covariance) - len(spread) + np.flatnonzero(spread == 0)
     covariance[certain, certain] = 1.0
     return covariance
 
 
-def _noise_of(found: TestPosterior, stated: bool) -> NoiseEstimate:
+def _noise_of(posterior: TestPosterior, stated: bool) -> NoiseEstimate:
     """The noise as the residuals have it, and 1σ of what levels share as the posterior has them."""
-    rows = found.residuals.size
-    left = max(rows - found.effective_unknowns, LEAST_LEFT * rows)
-    noise = found.hyper.noise * float(np.sqrt(np.sum(found.residuals**2) / left))
-    std = noise / np.sqrt(2 * found.share * left)
-    return NoiseEstimate(noise, std, np.array(found.hyper.level_std), stated)
+    rows = posterior.residuals.size
+    left = max(rows - posterior.effective_unknowns, LEAST_LEFT * rows)
+    noise = posterior.hyper.noise * float(np.sqrt(np.sum(posterior.residuals**2) / left))
+    std = noise / np.sqrt(2 * posterior.share * left)
+    return NoiseEstimate(noise, std, np.array(posterior.hyper.level_std), stated)
 
 
-def _wandering_stiffness(found: TestPosterior) -> float:
+def _wandering_stiffness(posterior: TestPosterior) -> float:
     """1σ of relative stiffness from state to state, zero unless the residuals ask for it.
 
     Errors of force and phase move the balance alike along a response; a natural frequency that
     wanders moves it most where the mode is driven hardest.
     """
-    arm = found.arms_of_stiffness / found.hyper.noise
+    arm = posterior.arms_of_stiffness / posterior.hyper.noise
     length = np.sum(arm**2, axis=1)
-    along = np.sum(arm * found.residuals, axis=1) ** 2
-    size = np.sum(found.residuals**2, axis=1)
+    along = np.sum(arm * posterior.residuals, axis=1) ** 2
+    size = np.sum(posterior.residuals**2, axis=1)
 
     def criterion(point: np.ndarray) -> float:
         noise, extra = np.exp(2 * point)
@@ -263,12 +266,12 @@ def _wandering_stiffness(found: TestPosterior) -> float:
     return float(np.exp(best.x[1])) if best.fun < alone - _CLEARLY else 0.0
 
 
-def _curve(found: TestPosterior, choice: Choice, which: int) -> AbstractFamily:
+def _curve(posterior: TestPosterior, choice: Choice, which: int) -> AbstractFamily:
     """A curve of the family asked for, near what the posterior has."""
     if choice.kind in SMOOTH:
-        return _smooth(found, choice.argument or "displacement", which)
-    x = found.states.amplitude
-    curves = found.curves(x)
+        return _smooth(posterior, choice.argument or "displacement", which)
+    x = posterior.states.amplitude
+    curves = posterior.curves(x)
     values = (curves.squared_frequency, curves.modal_damping)[which]
     std = np.sqrt(curves.covariance[:, which, which])
     family, n = FAMILIES[choice.kind], len(x)
@@ -276,15 +279,15 @@ def _curve(found: TestPosterior, choice: Choice, which: int) -> AbstractFamily:
     tried: list[tuple[float, int, AbstractFamily]] = []
     for size in sizes:
         for argument in (choice.argument,) if choice.argument else ARGUMENTS:
-            at = x if argument == "displacement" else np.abs(found.states.velocity)
-            for one in family.starts(size, argument, at, values, 1 / std):
-                if one.parameters.shape[0] >= n:
+            at = x if argument == "displacement" else np.abs(posterior.states.velocity)
+            for member in family.starts(size, argument, at, values, 1 / std):
+                if member.parameters.shape[0] >= n:
                     raise ValueError(
-                        f"{choice.kind}:{size} has {one.parameters.shape[0]} parameters, but "
+                        f"{choice.kind}:{size} has {member.parameters.shape[0]} parameters, but "
                         f"there are {n} states only: choose a smaller family."
                     )
-                off = np.sqrt(np.mean(((one.values_and_slopes(at)[0] - values) / std) ** 2))
-                tried.append((float(off), one.parameters.shape[0], one))
+                off = np.sqrt(np.mean(((member.linearised(at).value - values) / std) ** 2))
+                tried.append((float(off), member.parameters.shape[0], member))
     # The simplest that lies in the band of the smooth curve, or else the nearest to it.
     inside = [row for row in tried if row[0] < 1.0]
     if inside:
@@ -292,18 +295,18 @@ def _curve(found: TestPosterior, choice: Choice, which: int) -> AbstractFamily:
     return min(tried, key=lambda row: row[0])[2]
 
 
-def _smooth(found: TestPosterior, argument: Argument, which: int) -> SmoothingSpline:
+def _smooth(posterior: TestPosterior, argument: Argument, which: int) -> SmoothingSpline:
     """The posterior's own curve, with bends of the sizes that it found."""
-    basis = found.basis
+    basis = posterior.basis
     displacement = basis.largest * np.sqrt(basis.knots)
-    curves = found.curves(displacement)
+    curves = posterior.curves(displacement)
     values = (curves.squared_frequency, curves.modal_damping)[which]
     knots, scale = basis.knots, basis.largest
     if argument == "velocity":
         speed = displacement * np.sqrt(curves.squared_frequency)
         knots, scale = (speed / speed[-1]) ** 2, float(speed[-1])
-    size = found.units[which] * found.hyper.bends[which] / found.modal_mass[0]
-    std = size * np.exp(basis.directions @ found.hyper.along)
+    size = posterior.units[which] * posterior.hyper.bends[which] / posterior.modal_mass[0]
+    std = size * np.exp(basis.directions @ posterior.hyper.along)
     return SmoothingSpline.through(knots, values, jax.device_put(scale), argument, std)
 
 

@@ -43,12 +43,12 @@ def relative_to_base(
     if motion not in get_args(MotionKind):
         raise ValueError(f"the motion must be 'absolute' or 'relative', but is {motion!r}.")
     if len(responses.references) != 1 or responses.references[0].quantity not in _POWERS:
-        listed = ", ".join(str(one) for one in responses.references)
+        listed = ", ".join(str(channel) for channel in responses.references)
         raise ValueError(
             "motion over a base needs one reference that is a displacement, velocity or "
             f"acceleration, but has {listed}."
         )
-    names = [one.name for one in responses.responses]
+    names = [channel.name for channel in responses.responses]
     for name in along or {}:
         if name not in names:
             raise ValueError(f"there is no sensor {name!r}; there are {', '.join(names)}.")
@@ -56,15 +56,15 @@ def relative_to_base(
     keep = responses.frequency > 0
     s = 1j * responses.frequency[keep]
     turned, spread = [], []
-    for one, row, known in zip(
+    for channel, row, known in zip(
         responses.responses, responses.values[:, 0], responses.coherence[:, 0], strict=True
     ):
-        if one.quantity not in _POWERS:
-            raise ValueError(f"{one.name} must be a motion, but is {one.quantity}.")
-        over = row[keep] * s ** (_POWERS[reference.quantity] - _POWERS[one.quantity])
+        if channel.quantity not in _POWERS:
+            raise ValueError(f"{channel.name} must be a motion, but is {channel.quantity}.")
+        over = row[keep] * s ** (_POWERS[reference.quantity] - _POWERS[channel.quantity])
         spread.append(coherence_std(np.abs(over), known[keep], responses.averages))
-        own = (along or {}).get(one.name, 1.0) if motion == "absolute" else 0.0
-        turned.append(over - own)
+        of_base = (along or {}).get(channel.name, 1.0) if motion == "absolute" else 0.0
+        turned.append(over - of_base)
     std = np.array(spread)
     relative = dataclasses.replace(
         responses,
@@ -72,8 +72,8 @@ def relative_to_base(
         values=np.array(turned)[:, None],
         coherence=np.full((len(names), 1, int(keep.sum())), np.nan),
         responses=tuple(
-            one._replace(quantity="acceleration", unit="m/s^2", calibration=1.0)
-            for one in responses.responses
+            channel._replace(quantity="acceleration", unit="m/s^2", calibration=1.0)
+            for channel in responses.responses
         ),
         references=(Channel(reference.name, "acceleration", "m/s^2", 1.0, *reference[4:]),),
     )

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 from scipy.signal import decimate
 
-from snrmjax.identify.modal.modal_fit import AbstractModalFit, phase_collinearity
+from snrmjax.identify.modal.modal_fit import REAL, AbstractModalFit, phase_collinearity
 from snrmjax.identify.modal.pole_orders import PoleOrders, clusters, gathered
 from snrmjax.identify.modal.separable_fit import (
     ChannelRows,
@@ -22,9 +22,10 @@ from snrmjax.identify.modal.separable_fit import (
 )
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.time_recording import TimeRecording
-from snrmjax.numerics.result import Variable
+from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.result import quantity
+from snrmjax.numerics.units import HERTZ
 
-_HERTZ = 2 * np.pi
 _MOTIONS = ("displacement", "velocity", "acceleration")
 _HIGHEST = 30  # half the model order
 _MOST_ROWS, _MOST_COLUMNS = 240, 3000  # of a Hankel matrix
@@ -33,6 +34,7 @@ _FEWEST_SAMPLES = 40
 _SAMPLES_PER_CYCLE = 5  # kept of the highest frequency asked for
 _SIGNIFICANT = 4.0  # standard errors of a mode's largest amplitude, without which it is none
 _MOST_DAMPED = 0.5
+_CORRELATED = 2.0  # sum of the correlations of residuals, from which on it is worth a note
 _MOST_GROWTH = 3.0  # of a mode's logarithm over the record
 
 
@@ -51,8 +53,10 @@ class DecayModes(AbstractModalFit):
     the first decay; shapes are its ratios.
     """
 
-    shape: Float[np.ndarray, "sensor mode"]  # one at the largest sensor
-    shape_std: Float[np.ndarray, "sensor mode"]
+    shape: Float[np.ndarray, "sensor mode"] = quantity(
+        "sensor mode", "1", "shape, one at its largest sensor"
+    )
+    shape_std: Float[np.ndarray, "sensor mode"] = quantity("sensor mode", "1", "its 1σ")
     amplitude: Complex[np.ndarray, "sensor mode"]
     curves: DecayCurves
 
@@ -60,15 +64,6 @@ class DecayModes(AbstractModalFit):
         """See `AbstractModalFit`."""
         duration = self.curves.time[-1] - self.curves.time[0]
         return f"at {', '.join(self.sensor_names)} from {duration:.4g} s"
-
-    def variables(self) -> dict[str, Variable]:
-        """See `AbstractResult`."""
-        both = ("sensor", "mode")
-        return {
-            **super().variables(),
-            "shape": Variable(both, self.shape, "1", "shape, one at its largest sensor"),
-            "shape_std": Variable(both, self.shape_std, "1", "its 1σ"),
-        }
 
 
 def fit_free_decay(
@@ -95,14 +90,16 @@ def fit_free_decay(
     samples, signals of zeros, and where no pole is stable over the order.
     Validity: nothing acts on the structure in that part; linear and time-invariant.
     """
-    every = [decays] if isinstance(decays, TimeRecording) else list(decays)
-    used = _channels(every, channels)
-    rate = every[0].sampling_rate
-    parts = [_part(one, used, start_time, end_time, k) for k, one in enumerate(every)]
+    recordings = [decays] if isinstance(decays, TimeRecording) else list(decays)
+    used = _channels(recordings, channels)
+    rate = recordings[0].sampling_rate
+    parts = [
+        _part(recording, used, start_time, end_time, k) for k, recording in enumerate(recordings)
+    ]
     length = min(part.shape[1] for part in parts)
     values = np.concatenate([part[:, :length] for part in parts])
     if to_frequency is not None:
-        step = max(1, int(rate / (_SAMPLES_PER_CYCLE * to_frequency / _HERTZ)))
+        step = max(1, int(rate / (_SAMPLES_PER_CYCLE * to_frequency / HERTZ)))
         for factor in _factors(step):
             values = decimate(values, factor, axis=1, zero_phase=True)
             rate /= factor
@@ -118,9 +115,9 @@ def fit_free_decay(
     return _fitted(values, rate, start, orders, tuple(used), poles is not None)
 
 
-def _channels(every: Sequence[TimeRecording], names: Sequence[str] | None) -> list[Channel]:
-    first = every[0]
-    for one in every[1:]:
+def _channels(recordings: Sequence[TimeRecording], names: Sequence[str] | None) -> list[Channel]:
+    first = recordings[0]
+    for one in recordings[1:]:
         if one.channel_names != first.channel_names or one.sampling_rate != first.sampling_rate:
             raise ValueError(
                 "decays must share their channels and sampling rate, but have "
@@ -128,13 +125,13 @@ def _channels(every: Sequence[TimeRecording], names: Sequence[str] | None) -> li
                 f"{', '.join(first.channel_names)} at {first.sampling_rate:.6g} Hz."
             )
     if names is None:
-        found = [one for one in first.channels if one.quantity in _MOTIONS]
-        if not found:
+        motions = [one for one in first.channels if one.quantity in _MOTIONS]
+        if not motions:
             raise ValueError(
                 "a decay needs a channel that is a displacement, velocity or acceleration, but "
                 f"there are {', '.join(map(str, first.channels))}."
             )
-        return found
+        return motions
     by_name = {one.name: one for one in first.channels}
     for name in names:
         if name not in by_name:
@@ -149,7 +146,7 @@ def _part(
     end: float | None,
     number: int,
 ) -> np.ndarray:
-    values = recording.values([one.name for one in channels])
+    values = recording.values([channel.name for channel in channels])
     time = recording.time()
     if not np.isfinite(values).all():
         raise ValueError(f"decay {number + 1} has samples that are not finite.")
@@ -170,12 +167,12 @@ def _part(
 
 def _factors(step: int) -> list[int]:
     """A thinning by steps of at most eight, as the filter wants."""
-    found = []
+    factors = []
     while step > 1:
         factor = min(step, 8)
-        found.append(factor)
+        factors.append(factor)
         step //= factor
-    return found
+    return factors
 
 
 def _realised(values: np.ndarray, rate: float, highest: int) -> PoleOrders:
@@ -189,14 +186,14 @@ def _realised(values: np.ndarray, rate: float, highest: int) -> PoleOrders:
     hankel = windows.transpose(1, 0, 2).reshape(rows * channels, columns)
     left, singular, _ = np.linalg.svd(hankel, full_matrices=False)
     highest = max(1, min(highest, (len(singular) - channels) // 2))
-    found = []
+    poles = []
     for half in range(1, highest + 1):
         observed = left[:, : 2 * half] * np.sqrt(singular[: 2 * half])
         step = np.linalg.lstsq(observed[:-channels], observed[channels:], rcond=None)[0]
         root = np.linalg.eigvals(step)
         root = root[(root.imag > 0) & (np.abs(root) > 0)]
-        found.append((half, np.log(root) * rate))
-    return gathered(found, highest)
+        poles.append((half, np.log(root) * rate))
+    return gathered(poles, highest)
 
 
 def _start(
@@ -207,18 +204,18 @@ def _start(
         damped = orders.pole[(orders.pole.real < 0) & (orders.damping_ratio < 0.25)]
         if not wanted.size or np.any(wanted <= 0) or np.any(wanted >= top) or not damped.size:
             raise ValueError(
-                f"poles must be from 0 to {top / _HERTZ:.6g} Hz, where the decay shows some, but "
-                f"are {', '.join(f'{one / _HERTZ:.6g}' for one in wanted) or 'none'}."
+                f"poles must be from 0 to {top / HERTZ:.6g} Hz, where the decay shows some, but "
+                f"are {', '.join(f'{one / HERTZ:.6g}' for one in wanted) or 'none'}."
             )
         return np.array([damped[np.argmin(np.abs(np.abs(damped) - one))] for one in wanted])
-    found = clusters(orders, (0.0, top))
-    found = found[found.real < 0]
-    if not found.size:
+    stable = clusters(orders, (0.0, top))
+    stable = stable[stable.real < 0]
+    if not stable.size:
         raise ValueError(
             "no pole is stable over the model orders of the decay: choose the part that decays, "
             "a lower highest frequency, or the natural frequencies by hand."
         )
-    return found
+    return stable
 
 
 def _columns(time: np.ndarray, unknowns: np.ndarray) -> list[TermColumns]:
@@ -294,10 +291,10 @@ def _result(
     n = len(unknowns) // 2
     rank = np.argsort(unknowns[:n])
     covariance = np.stack([fit.covariance[np.ix_([k, n + k], [k, n + k])] for k in rank])
-    own = len(channels)
-    every = fit.coefficients[:, :n] + 1j * fit.coefficients[:, n : 2 * n]
+    n_channels = len(channels)
+    amplitudes = fit.coefficients[:, :n] + 1j * fit.coefficients[:, n : 2 * n]
     fitted = fit.coefficients @ _columns(time, unknowns)[0].columns.T
-    amplitude, spread = every[:own, rank], np.sqrt(variance[:own, rank])
+    amplitude, spread = amplitudes[:n_channels, rank], np.sqrt(variance[:n_channels, rank])
     top = np.argmax(np.abs(amplitude), axis=0)
     largest = amplitude[top, np.arange(n)]
     ratio = amplitude / largest
@@ -305,17 +302,16 @@ def _result(
     shape_std[top, np.arange(n)] = 0.0
     collinearity, _ = phase_collinearity(ratio)
     notes = [
-        f"mode {k + 1} is complex: modal phase collinearity {value:.2f}"
-        for k, value in enumerate(collinearity)
-        if value < 0.9
+        Fact("complex_mode", mode=k + 1, frequency_hz=float(omega) / HERTZ, collinearity=value)
+        for k, (omega, value) in enumerate(
+            zip(unknowns[:n][rank], collinearity.tolist(), strict=True)
+        )
+        if value < REAL
     ]
     if not fit.status.found_minimum:
-        notes.append("the least-squares fit had not settled after its last step")
-    if fit.correlation.sum() > 2:
-        notes.append(
-            "residuals of neighbouring samples are correlated (a mode that was missed, or a decay "
-            "that is not linear): errors are widened for it"
-        )
+        notes.append(Fact("modal_fit_not_settled"))
+    if fit.correlation.sum() > _CORRELATED:
+        notes.append(Fact("decay_residuals_correlated"))
     return DecayModes(
         natural_frequency=unknowns[:n][rank],
         damping_ratio=unknowns[n:][rank],
@@ -328,5 +324,5 @@ def _result(
         shape=ratio.real,
         shape_std=shape_std,
         amplitude=amplitude,
-        curves=DecayCurves(time, values[:own], fitted[:own]),
+        curves=DecayCurves(time, values[:n_channels], fitted[:n_channels]),
     )

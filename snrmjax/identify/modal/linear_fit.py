@@ -19,9 +19,13 @@ from snrmjax.identify.modal.modal_notes import (
     fit_notes,
     lines_in_half_power,
 )
-from snrmjax.identify.modal.noise_model import std_from_residuals
 from snrmjax.identify.modal.pole_orders import PoleOrders, clusters, poles_of_responses
-from snrmjax.identify.modal.response_data import ResponseData, coherence_std, response_data
+from snrmjax.identify.modal.response_data import (
+    ResponseData,
+    coherence_std,
+    response_data,
+    std_from_residuals,
+)
 from snrmjax.identify.modal.separable_fit import (
     ChannelRows,
     SeparableFit,
@@ -29,10 +33,10 @@ from snrmjax.identify.modal.separable_fit import (
     fit_separable,
 )
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
+from snrmjax.numerics.units import HERTZ
 
 ResidualTerms = Literal["auto", "both", "lower", "upper", "none"]
 
-_HERTZ = 2 * np.pi
 _HIGHEST = 40  # order, where there are lines enough
 _LINES_PER_ORDER = 4
 _MOST_DAMPED = 0.9
@@ -187,14 +191,14 @@ def _start(
         if not mine.size:
             raise ValueError(f"model order {order} has no lightly damped pole in the band.")
         return mine[np.argsort(np.abs(mine))]
-    found = clusters(orders, band)
-    damped, growing = found[found.real < 0], found[found.real > 0]
+    stable = clusters(orders, band)
+    damped, growing = stable[stable.real < 0], stable[stable.real > 0]
     if damped.size:
         return damped
-    where = f"between {band[0] / _HERTZ:.6g} and {band[1] / _HERTZ:.6g} Hz"
+    where = f"between {band[0] / HERTZ:.6g} and {band[1] / HERTZ:.6g} Hz"
     if growing.size:
         listed = ", ".join(
-            f"{100 * -p.real / abs(p):.3g} % at {abs(p) / _HERTZ:.6g} Hz" for p in growing[:3]
+            f"{100 * -p.real / abs(p):.3g} % at {abs(p) / HERTZ:.6g} Hz" for p in growing[:3]
         )
         raise ValueError(
             f"all modes {where} have negative damping ({listed}): the responses seem to be "
@@ -211,12 +215,12 @@ def _by_hand(
 ) -> Complex[np.ndarray, " mode"]:
     if not wanted.size or not np.isfinite(wanted).all():
         raise ValueError("`poles` must be natural frequencies, at least one.")
-    found = []
+    chosen = []
     for omega in np.sort(wanted):
         if not band[0] <= omega <= band[1]:
             raise ValueError(
-                f"a pole must lie in the band, {band[0] / _HERTZ:.6g} to {band[1] / _HERTZ:.6g} "
-                f"Hz, but {omega / _HERTZ:.6g} Hz was given."
+                f"a pole must lie in the band, {band[0] / HERTZ:.6g} to {band[1] / HERTZ:.6g} "
+                f"Hz, but {omega / HERTZ:.6g} Hz was given."
             )
         damped = orders.pole[(orders.pole.real < 0) & (orders.damping_ratio < 0.25)]
         away = np.abs(np.abs(damped) - omega)
@@ -225,8 +229,8 @@ def _by_hand(
         if near.size:
             best = near[np.argmin(away[away < _NEAR * omega])]
             ratio = float(-best.real / abs(best))
-        found.append(complex(-ratio * omega, omega * np.sqrt(1 - ratio**2)))
-    return np.array(found)
+        chosen.append(complex(-ratio * omega, omega * np.sqrt(1 - ratio**2)))
+    return np.array(chosen)
 
 
 class _Spread(NamedTuple):
@@ -353,13 +357,13 @@ def _check_found(fit: SeparableFit, settings: BasisSettings) -> None:
     if np.all(ratio < 0):
         raise ValueError(
             f"all modes have negative damping ({100 * ratio[0]:.3g} % at "
-            f"{natural[0] / _HERTZ:.6g} Hz): the responses seem to be conjugated (time dependence "
+            f"{natural[0] / HERTZ:.6g} Hz): the responses seem to be conjugated (time dependence "
             "e^(-iΩt)); change the sign of their imaginary parts."
         )
     if np.any(ratio <= 0) or np.any(ratio >= _MOST_DAMPED):
         k = int(np.argmax((ratio <= 0) | (ratio >= _MOST_DAMPED)))
         raise ValueError(
-            f"the mode at {natural[k] / _HERTZ:.6g} Hz has the damping ratio {ratio[k]:.3g}: the "
+            f"the mode at {natural[k] / HERTZ:.6g} Hz has the damping ratio {ratio[k]:.3g}: the "
             "responses do not show such a mode; give other poles or another band."
         )
 
@@ -376,9 +380,9 @@ def _result(
     n, sensors = len(natural), len(data.channels)
     covariance = np.zeros((n, 2 + sensors, 2 + sensors))
     for place, k in enumerate(rank):
-        own = [k, n + k]
-        covariance[place, :2, :2] = fit.covariance[np.ix_(own, own)]
-        cross = fit.cross_covariance(k)[own]
+        pair = [k, n + k]
+        covariance[place, :2, :2] = fit.covariance[np.ix_(pair, pair)]
+        cross = fit.cross_covariance(k)[pair]
         covariance[place, :2, 2:], covariance[place, 2:, :2] = cross, cross.T
         covariance[place, 2:, 2:] = fit.term_covariance(k)
     terms = [k for k, used in enumerate((settings.lower, settings.upper)) if used]
@@ -397,7 +401,7 @@ def _result(
     collinearity, mean_phase, mean_phase_std = complex_residues(
         data, settings, fit, spread.std, rank
     )
-    found = LinearModalFit(
+    modes = LinearModalFit(
         natural_frequency=natural[rank],
         damping_ratio=ratio[rank],
         mode_covariance=covariance,
@@ -421,5 +425,5 @@ def _result(
         reference=data.reference,
         source=data.source,
     )
-    notes = (*data.notes, *fit_notes(found, data, settings, fit, rank))
-    return dataclasses.replace(found, notes=notes)
+    notes = (*data.notes, *fit_notes(modes, data, settings, fit, rank))
+    return dataclasses.replace(modes, notes=notes)

@@ -10,11 +10,14 @@ from jaxtyping import Complex, Float
 from snrmjax.identify.modal.pole_orders import PoleOrders
 from snrmjax.identify.modal.response_data import ErrorSource
 from snrmjax.measure.recordings.channels import Channel
+from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
-from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
+from snrmjax.numerics.units import HERTZ
 
-_HERTZ = 2 * np.pi
 _WIDE = 1.96  # standard deviations of a 95 % band
+REAL = 0.9
+"""Phase collinearity below which a mode is called complex."""
 
 
 class ResponseCurves(NamedTuple):
@@ -34,14 +37,17 @@ class AbstractModalFit(AbstractResult):
 
     coordinates: ClassVar[tuple[str, ...]] = ("mode", "sensor")
 
-    natural_frequency: Float[np.ndarray, " mode"]  # rad/s
-    damping_ratio: Float[np.ndarray, " mode"]
+    natural_frequency: Float[np.ndarray, " mode"] = quantity("mode", "Hz", "natural frequency")
+    damping_ratio: Float[np.ndarray, " mode"] = quantity("mode", "1", "damping ratio")
     mode_covariance: Float[np.ndarray, "mode entry entry"]
-    collinearity: Float[np.ndarray, " mode"]  # modal phase collinearity, 1 = real; NaN: one sensor
+    # 1 for a real mode, NaN for one sensor.
+    collinearity: Float[np.ndarray, " mode"] = quantity(
+        "mode", "1", "modal phase collinearity", name="phase_collinearity"
+    )
     orders: PoleOrders
     sensors: tuple[Channel, ...] = eqx.field(static=True)
-    status: MinimisationStatus = eqx.field(static=True)
-    notes: tuple[str, ...] = eqx.field(static=True)
+    status: MinimisationStatus = setting()
+    notes: tuple[Fact | str, ...] = setting()
 
     @property
     def n_modes(self) -> int:
@@ -51,7 +57,7 @@ class AbstractModalFit(AbstractResult):
     @property
     def sensor_names(self) -> tuple[str, ...]:
         """Names of the responses in order."""
-        return tuple(one.name for one in self.sensors)
+        return tuple(sensor.name for sensor in self.sensors)
 
     @property
     def natural_frequency_std(self) -> Float[np.ndarray, " mode"]:
@@ -70,8 +76,8 @@ class AbstractModalFit(AbstractResult):
     def summary(self) -> tuple[str, ...]:
         """See `AbstractResult`; 95 % bands."""
         rows = zip(
-            self.natural_frequency / _HERTZ,
-            _WIDE * self.natural_frequency_std / _HERTZ,
+            self.natural_frequency / HERTZ,
+            _WIDE * self.natural_frequency_std / HERTZ,
             100 * self.damping_ratio,
             _WIDE * 100 * self.damping_ratio_std,
             strict=True,
@@ -87,19 +93,19 @@ class AbstractModalFit(AbstractResult):
         )
 
     def variables(self) -> dict[str, Variable]:
-        """See `AbstractResult`."""
-        columns = {
-            "natural_frequency_hz": (self.natural_frequency / _HERTZ, "Hz", "natural frequency"),
-            "natural_frequency_std_hz": (self.natural_frequency_std / _HERTZ, "Hz", "its 1σ"),
-            "damping_ratio": (self.damping_ratio, "1", "damping ratio"),
-            "damping_ratio_std": (self.damping_ratio_std, "1", "its 1σ"),
-            "phase_collinearity": (self.collinearity, "1", "modal phase collinearity"),
-        }
+        """Those of the fields, with errors, by mode and sensor."""
+        mode, hertz = ("mode",), self.natural_frequency_std / HERTZ
         return {
-            "mode": Variable(("mode",), np.arange(1, self.n_modes + 1), "1", "mode"),
+            "mode": Variable(mode, np.arange(1, self.n_modes + 1), "1", "mode"),
             "sensor": Variable(("sensor",), np.array(self.sensor_names), "", "sensor"),
-            **{name: Variable(("mode",), *rest) for name, rest in columns.items()},
+            **super().variables(),
+            "natural_frequency_std_hz": Variable(mode, hertz, "Hz", "its 1σ"),
+            "damping_ratio_std": Variable(mode, self.damping_ratio_std, "1", "its 1σ"),
         }
+
+    def attributes(self) -> dict[str, str | float | int]:
+        """How the fit ended, and what it has to tell."""
+        return {**super().attributes(), "status": self.status.value}
 
 
 def phase_collinearity(
@@ -111,9 +117,9 @@ def phase_collinearity(
     """
     a, b = shape.real, shape.imag
     xx, yy, xy = np.sum(a * a, axis=0), np.sum(b * b, axis=0), np.sum(a * b, axis=0)
-    found = ((xx - yy) ** 2 + 4 * xy**2) / np.maximum(xx + yy, 1e-300) ** 2
+    collinearity = ((xx - yy) ** 2 + 4 * xy**2) / np.maximum(xx + yy, 1e-300) ** 2
     angle = 0.5 * np.arctan2(2 * xy, xx - yy)
-    return found if len(shape) > 1 else np.full(shape.shape[1], np.nan), angle
+    return collinearity if len(shape) > 1 else np.full(shape.shape[1], np.nan), angle
 
 
 class LinearModalFit(AbstractModalFit):
@@ -127,14 +133,22 @@ class LinearModalFit(AbstractModalFit):
     residue: Float[np.ndarray, "sensor mode"]  # displacement over reference, times s^-2
     lower: Float[np.ndarray, " sensor"]  # of 1/Ω²; 0 where it was not fitted
     lower_std: Float[np.ndarray, " sensor"]
-    upper: Float[np.ndarray, " sensor"]  # constant
-    upper_std: Float[np.ndarray, " sensor"]
+    upper: Float[np.ndarray, " sensor"] = quantity(
+        "sensor", "SI", "constant receptance", name="upper_residual"
+    )
+    upper_std: Float[np.ndarray, " sensor"] = quantity(
+        "sensor", "SI", "its 1σ", name="upper_residual_std"
+    )
     phase: float  # rad, ψ of the instrument; 0 where it was not fitted
     phase_std: float
-    mean_phase: Float[np.ndarray, " mode"]  # rad, of complex residues, away from real
+    # Away from real.
+    mean_phase: Float[np.ndarray, " mode"] = quantity("mode", "deg", "phase of complex residues")
     mean_phase_std: Float[np.ndarray, " mode"]
-    lines_in_band: Float[np.ndarray, " mode"]  # spectral lines in the half-power band
-    misfit: Float[np.ndarray, " sensor"]  # rms residual over stated 1σ; NaN where none is stated
+    lines_in_band: Float[np.ndarray, " mode"] = quantity(
+        "mode", "1", "lines in the half-power band", name="lines_in_half_power_band"
+    )
+    # NaN where none is stated.
+    misfit: Float[np.ndarray, " sensor"] = quantity("sensor", "1", "rms residual over stated 1σ")
     curves: ResponseCurves
     reference: Channel = eqx.field(static=True)
     source: ErrorSource = eqx.field(static=True)
@@ -154,36 +168,25 @@ class LinearModalFit(AbstractModalFit):
 
     def source_in_words(self) -> str:
         """See `AbstractModalFit`."""
-        omega = self.curves.omega / _HERTZ
+        omega = self.curves.omega / HERTZ
         return (
             f"at {len(self.sensors)} sensors over {self.reference.name}, {omega[0]:.6g} to "
             f"{omega[-1]:.6g} Hz"
         )
 
     def variables(self) -> dict[str, Variable]:
-        """See `AbstractResult`."""
-        mode, both, sensor = ("mode",), ("sensor", "mode"), ("sensor",)
-        unit, phase = "1/kg" if self.reference.quantity == "force" else "SI", self.mean_phase
+        """Those of the fields, with residues and residual terms in the reference's unit."""
+        both, sensor = ("sensor", "mode"), ("sensor",)
+        unit = "1/kg" if self.reference.quantity == "force" else "SI"
         return {
             **super().variables(),
-            "mean_phase_deg": Variable(mode, np.degrees(phase), "deg", "phase of complex residues"),
-            "lines_in_half_power_band": Variable(
-                mode, self.lines_in_band, "1", "lines in the half-power band"
-            ),
             "residue": Variable(both, self.residue, unit, "residue of the receptance"),
             "residue_std": Variable(both, self.residue_std, unit, "its 1σ"),
             "lower_residual": Variable(sensor, self.lower, unit, "coefficient of 1/Ω²"),
             "lower_residual_std": Variable(sensor, self.lower_std, unit, "its 1σ"),
-            "upper_residual": Variable(sensor, self.upper, "SI", "constant receptance"),
-            "upper_residual_std": Variable(sensor, self.upper_std, "SI", "its 1σ"),
-            "misfit": Variable(sensor, self.misfit, "1", "rms residual over stated 1σ"),
         }
 
     def attributes(self) -> dict[str, str | float | int]:
-        """See `AbstractResult`."""
-        return {
-            "reference": self.reference.name,
-            "errors_from": self.source,
-            "status": self.status.value,
-            "notes": "\n".join(self.notes),
-        }
+        """The reference, where errors are from, how the fit ended, what it has to tell."""
+        more = {"reference": self.reference.name, "errors_from": self.source}
+        return {**super().attributes(), **more}

@@ -9,14 +9,14 @@ from snrmjax.identify.modal.modal_bases import (
     receptance_bases,
     unpacked,
 )
-from snrmjax.identify.modal.modal_fit import LinearModalFit, phase_collinearity
+from snrmjax.identify.modal.modal_fit import REAL, LinearModalFit, phase_collinearity
 from snrmjax.identify.modal.response_data import ResponseData
 from snrmjax.identify.modal.separable_fit import ChannelRows, SeparableFit, fit_separable
+from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.units import HERTZ
 
-_HERTZ = 2 * np.pi
 _FEW_LINES = 8.0  # in the half-power band, below which leakage may count
 _BIASED = 0.01  # relative bias of damping that is worth a note
-_REAL = 0.9  # phase collinearity below which a mode is called complex
 _TURNED = np.radians(5.0)  # mean phase that is worth a note
 _CERTAIN = 3.0  # standard errors
 _MISFIT = 1.5  # rms residual over stated σ that is worth a note
@@ -48,8 +48,8 @@ def complex_residues(
         weighted = both * weight[:, None]
         size = np.linalg.norm(weighted, axis=0)
         inverse = np.linalg.pinv(weighted / size, rcond=1e-10) / size[:, None]
-        found = inverse @ (row * weight)
-        residue[k] = found[:n] + 1j * found[-n:]
+        both_parts = inverse @ (row * weight)
+        residue[k] = both_parts[:n] + 1j * both_parts[-n:]
         spread[k] = np.linalg.norm(inverse[-n:], axis=1)
     collinearity, angle = phase_collinearity(residue)
     size = np.maximum(np.sum(np.abs(residue) ** 2, axis=0), 1e-300)
@@ -90,72 +90,48 @@ def leakage_bias(
     low, high = fit.unknowns.copy(), fit.unknowns.copy()
     low[:n], high[:n] = 0.9 * low[:n], 1.1 * high[:n]
     low[n:], high[n:] = low[n:] - 0.5, high[n:] + 0.5
-    found = fit_separable(
+    refit = fit_separable(
         lambda point: receptance_bases(data.omega, point, settings),
         ChannelRows(values, np.tile(weights, (1, 2)), np.zeros(len(values), dtype=int), 2),
         fit.unknowns,
         (low, high),
     )
-    return found.unknowns[n : 2 * n] / fit.unknowns[n : 2 * n] - 1
+    return refit.unknowns[n : 2 * n] / fit.unknowns[n : 2 * n] - 1
 
 
 def fit_notes(
-    found: LinearModalFit,
+    modes: LinearModalFit,
     data: ResponseData,
     settings: BasisSettings,
     fit: SeparableFit,
     rank: Int[np.ndarray, " mode"],
-) -> tuple[str, ...]:
-    """Sentences on what the fit assumes and the data do not keep."""
-    notes = [*_complexity(found), *_misfits(found)]
-    averaged = data.source == "coherence" or data.averages is not None
-    few = found.lines_in_band < _FEW_LINES
-    if settings.window_time is None and averaged and few.any():
-        bias = leakage_bias(data, settings, fit, found.curves.std)[rank]
-        notes = [*_leakage(found, np.where(few, bias, 0.0)), *notes]
-    if not found.status.found_minimum:
-        notes.append("the least-squares fit had not settled after its last step")
-    if settings.window_time is not None:
-        notes.append(
-            "leakage of Hann's window is modelled: averages of stationary random excitation, "
-            f"windows of {settings.window_time:.4g} s"
-        )
-    return tuple(notes)
-
-
-def _leakage(found: LinearModalFit, bias: np.ndarray) -> list[str]:
-    return [
-        f"the half-power band of mode {k + 1} ({found.natural_frequency[k] / _HERTZ:.6g} Hz) has "
-        f"{found.lines_in_band[k]:.1f} lines: if these are averages of random excitation under "
-        f"Hann's window, leakage makes its damping some {100 * bias[k]:.2g} % too high, which is "
-        "not in the error; model it (window hann), or measure with finer lines"
-        for k in np.flatnonzero(np.abs(bias) > _BIASED)
-    ]
-
-
-def _complexity(found: LinearModalFit) -> list[str]:
+) -> list[Fact]:
+    """What the fit assumes and the data do not keep."""
     notes = []
-    for k in range(found.n_modes):
-        where = f"mode {k + 1} ({found.natural_frequency[k] / _HERTZ:.6g} Hz)"
-        phase, std = found.mean_phase[k], found.mean_phase_std[k]
+    averaged = data.source == "coherence" or data.averages is not None
+    few = modes.lines_in_band < _FEW_LINES
+    hertz = (modes.natural_frequency / HERTZ).tolist()
+    if settings.window_time is None and averaged and few.any():
+        bias = np.where(few, leakage_bias(data, settings, fit, modes.curves.std)[rank], 0.0)
+        for k in np.flatnonzero(np.abs(bias) > _BIASED).tolist():
+            lines, share = float(modes.lines_in_band[k]), float(bias[k])
+            notes.append(
+                Fact("leakage", mode=k + 1, frequency_hz=hertz[k], lines=lines, bias=share)
+            )
+    for k, (phase, std) in enumerate(zip(modes.mean_phase, modes.mean_phase_std, strict=True)):
+        at = {"mode": k + 1, "frequency_hz": hertz[k]}
         if abs(phase) > max(_TURNED, _CERTAIN * std):
-            notes.append(
-                f"the residues of {where} are turned by {np.degrees(phase):.2g}° ± "
-                f"{np.degrees(1.96 * std):.2g}° from real ones: an instrument's phase (free it), "
-                "a neighbouring mode that was missed, or complex modes"
-            )
-        if found.collinearity[k] < _REAL:
-            notes.append(
-                f"{where} is complex: modal phase collinearity {found.collinearity[k]:.2f}; its "
-                "real shape is an approximation"
-            )
-    return notes
-
-
-def _misfits(found: LinearModalFit) -> list[str]:
-    return [
-        f"the residuals of {name} are {value:.2g} times what is stated of its errors: the "
-        "errors of the modes are scaled by that"
-        for name, value in zip(found.sensor_names, found.misfit, strict=True)
+            turn = {"phase_deg": float(np.degrees(phase)), "std_deg": float(np.degrees(std))}
+            notes.append(Fact("residues_turned", **at, **turn))
+        if modes.collinearity[k] < REAL:
+            notes.append(Fact("complex_mode", **at, collinearity=float(modes.collinearity[k])))
+    notes += [
+        Fact("misfit_of_sensor", sensor=name, times=float(value))
+        for name, value in zip(modes.sensor_names, modes.misfit, strict=True)
         if value > _MISFIT
     ]
+    if not modes.status.found_minimum:
+        notes.append(Fact("modal_fit_not_settled"))
+    if settings.window_time is not None:
+        notes.append(Fact("leakage_modelled", window_s=settings.window_time))
+    return notes

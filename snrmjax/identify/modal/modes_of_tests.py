@@ -15,6 +15,7 @@ from snrmjax.identify.modal.state_responses import (
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.states import SteadyStates
+from snrmjax.numerics.facts import Fact
 
 _OF_DECAYS = ("to_frequency", "poles", "highest_order")
 
@@ -25,7 +26,7 @@ def find_modes(
     level: int | None = None,
     base: MotionKind | None = None,
     **settings: Any,
-) -> tuple[LinearModalFit | DecayModes, tuple[str, ...]]:
+) -> tuple[LinearModalFit | DecayModes, tuple[Fact, ...]]:
     """Modes of what was measured, and notes on it.
 
     Of steady states the lowest level counts, and the next one says whether it was low enough.
@@ -38,22 +39,23 @@ def find_modes(
     if isinstance(source, FrequencyResponses):
         return _of_responses(source, base, settings), ()
     if not isinstance(source, SteadyStates):
-        own = {name: settings[name] for name in _OF_DECAYS if name in settings}
-        return fit_free_decay(source, **own), ()
+        of_decays = {name: settings[name] for name in _OF_DECAYS if name in settings}
+        return fit_free_decay(source, **of_decays), ()
     levels = levels_by_velocity(source)
     chosen = levels[0] if level is None else level
     lowest = responses_of_states(source, chosen)
-    found = _of_responses(lowest.responses, base, {**settings, "std": lowest.std})
+    modes = _of_responses(lowest.responses, base, {**settings, "std": lowest.std})
     above = levels[levels.index(chosen) + 1 :]
     if not above:
-        return found, ("one level alone: nothing says whether it was low enough to be linear",)
+        return modes, (Fact("one_level_for_modes"),)
     other = responses_of_states(source, above[0])
-    by_hand = {"poles": tuple(found.natural_frequency), "order": None, "std": other.std}
+    by_hand = {"poles": tuple(modes.natural_frequency), "order": None, "std": other.std}
     try:
         second = _of_responses(other.responses, base, {**settings, **by_hand})
     except ValueError as error:
-        return found, (f"level {above[0]} cannot be compared with level {chosen}: {error}",)
-    return amplitude_dependence(found, second, (lowest.velocity, other.velocity))
+        pair = {"level": chosen, "other": above[0]}
+        return modes, (Fact("levels_not_compared", **pair, reason=str(error)),)
+    return amplitude_dependence(modes, second, (lowest.velocity, other.velocity))
 
 
 def _of_responses(

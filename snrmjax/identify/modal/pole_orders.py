@@ -59,7 +59,7 @@ def poles_of_responses(
         x = powers * weight[:, None]
         y = -x * row[:, None]
         blocks.append((x.conj().T @ x, x.conj().T @ y, y.conj().T @ y))
-    found: list[tuple[int, np.ndarray]] = []
+    by_order: list[tuple[int, np.ndarray]] = []
     for order in range(1, n):
         part = slice(0, order + 1)
         reduced = np.zeros((order + 1, order + 1), dtype=complex)
@@ -72,21 +72,23 @@ def poles_of_responses(
         roots = roots[np.abs(roots) > 0]
         angle = np.angle(roots) % (2 * np.pi)
         pole = (np.log(np.abs(roots)) + 1j * angle) / rate + 1j * start
-        found.append((order, pole[(angle > 0) & (angle < _ARC)]))
-    return gathered(found, highest)
+        by_order.append((order, pole[(angle > 0) & (angle < _ARC)]))
+    return gathered(by_order, highest)
 
 
-def gathered(found: Sequence[tuple[int, Complex[np.ndarray, " pole"]]], highest: int) -> PoleOrders:
+def gathered(
+    by_order: Sequence[tuple[int, Complex[np.ndarray, " pole"]]], highest: int
+) -> PoleOrders:
     """Poles of all orders with what is stable among them."""
     stable, before = [], np.empty(0, dtype=complex)
-    for _, poles in found:
+    for _, poles in by_order:
         near = np.abs(poles[:, None] - before) < _STABLE * np.abs(poles.real[:, None])
         near |= np.abs(poles[:, None] - before) < _FLOOR * np.abs(poles[:, None])
         stable.append(near.any(axis=1) if before.size else np.zeros(poles.shape, dtype=bool))
         before = poles
-    order = np.concatenate([np.full(poles.size, n) for n, poles in found]).astype(int)
-    every = np.concatenate([poles for _, poles in found])
-    return PoleOrders(order, every, np.concatenate(stable), highest)
+    order = np.concatenate([np.full(poles.size, n) for n, poles in by_order]).astype(int)
+    all_poles = np.concatenate([poles for _, poles in by_order])
+    return PoleOrders(order, all_poles, np.concatenate(stable), highest)
 
 
 def clusters(
@@ -116,14 +118,14 @@ def clusters(
             mine = rest[members]
             means.append(complex(np.median(mine.real), np.median(mine.imag)))
         left[np.flatnonzero(left)[members]] = False
-    found = np.array(means, dtype=complex)
-    return found[np.argsort(found.imag, kind="stable")]
+    centres = np.array(means, dtype=complex)
+    return centres[np.argsort(centres.imag, kind="stable")]
 
 
 def _nearest_of_each(order: np.ndarray, distance: np.ndarray, among: np.ndarray) -> np.ndarray:
     """Mask of the nearest pole of every order."""
     chosen = np.zeros(len(order), dtype=bool)
-    for one in np.unique(order[among]):
-        rows = np.flatnonzero(among & (order == one))
+    for number in np.unique(order[among]):
+        rows = np.flatnonzero(among & (order == number))
         chosen[rows[np.argmin(distance[rows])]] = True
     return chosen

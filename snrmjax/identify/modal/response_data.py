@@ -6,17 +6,22 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float, Int
+from scipy.optimize import minimize
 
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
+from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.units import HERTZ
 
 ErrorSource = Literal["stated", "coherence", "residuals"]
 """Where the weights come from: stated 1σ, coherence, or the residuals themselves."""
 
-_HERTZ = 2 * np.pi
 _FEWEST_LINES = 6
 _POWERS = {"displacement": 0, "velocity": 1, "acceleration": 2}
 _LEAST_MISSING_COHERENCE = 1e-7  # 1 − γ² that a file's rounding leaves
+_FEWEST_NUMBERS = 12  # of a channel, below which its errors are one size
+_SPREAD = 1e-4  # of the largest response: where the search for the errors' sizes begins
+_SMALLEST = 1e-12  # of a channel's residuals: errors of responses without any
 _SAME_FREQUENCY = 1e-9  # relative
 
 
@@ -31,7 +36,7 @@ class ResponseData(NamedTuple):
     reference: Channel
     source: ErrorSource
     averages: int | None
-    notes: tuple[str, ...]
+    notes: tuple[Fact | str, ...]
 
     @property
     def measured_size(self) -> Float[np.ndarray, "channel line"]:
@@ -48,7 +53,7 @@ class ResponseData(NamedTuple):
         if not windowed:
             return (0,), np.zeros(len(self.powers), dtype=int)
         powers = tuple(dict.fromkeys(self.powers))
-        return powers, np.array([powers.index(one) for one in self.powers])
+        return powers, np.array([powers.index(power) for power in self.powers])
 
 
 def response_data(
@@ -72,7 +77,7 @@ def response_data(
     high = np.inf if to_frequency is None else to_frequency
     if not low < high:
         raise ValueError(
-            f"the band must rise, but is from {low / _HERTZ:.6g} to {high / _HERTZ:.6g} Hz."
+            f"the band must rise, but is from {low / HERTZ:.6g} to {high / HERTZ:.6g} Hz."
         )
     omega = responses.frequency
     keep = (omega > 0) & (omega >= low * (1 - 1e-12)) & (omega <= high * (1 + 1e-12))
@@ -83,18 +88,18 @@ def response_data(
             f"{len(omega)} lie in the band and were measured."
         )
     raw = responses.values[:, column][:, keep]
-    for one, row in zip(responses.responses, raw, strict=True):
+    for channel, row in zip(responses.responses, raw, strict=True):
         if not np.any(np.nan_to_num(row)):
-            raise ValueError(f"the response {one.name} is zero or missing all over the band.")
+            raise ValueError(f"the response {channel.name} is zero or missing all over the band.")
     coherence = responses.coherence[:, column][:, keep]
     bad = np.argwhere((coherence < 0) | (coherence > 1 + 1e-9))
     if bad.size:
         k, line = bad[0]
         raise ValueError(
             f"a coherence must be from 0 to 1, but that of {responses.responses[k].name} at "
-            f"{omega[keep][line] / _HERTZ:.6g} Hz is {coherence[k, line]:.6g}."
+            f"{omega[keep][line] / HERTZ:.6g} Hz is {coherence[k, line]:.6g}."
         )
-    powers = tuple(_POWERS[one.quantity] for one in responses.responses)
+    powers = tuple(_POWERS[channel.quantity] for channel in responses.responses)
     size = omega[keep] ** np.array(powers)[:, None]
     turned = raw / (1j * omega[keep]) ** np.array(powers)[:, None]
     spread, source, notes = _errors(responses, raw, coherence, std, keep)
@@ -117,39 +122,39 @@ def joined_responses(parts: Sequence[FrequencyResponses]) -> FrequencyResponses:
     Raises `ValueError` where frequencies or references differ, or a channel comes twice.
     """
     first = parts[0]
-    for one in parts[1:]:
-        place = one.name or "one file"
-        if one.frequency.shape != first.frequency.shape or np.any(
-            np.abs(one.frequency - first.frequency) > _SAME_FREQUENCY * first.frequency[-1]
+    for part in parts[1:]:
+        place = part.name or "one file"
+        if part.frequency.shape != first.frequency.shape or np.any(
+            np.abs(part.frequency - first.frequency) > _SAME_FREQUENCY * first.frequency[-1]
         ):
             raise ValueError(
                 f"responses of one test must share their frequencies, but {place} has "
-                f"{len(one.frequency)} lines to {one.frequency[-1] / _HERTZ:.6g} Hz and "
+                f"{len(part.frequency)} lines to {part.frequency[-1] / HERTZ:.6g} Hz and "
                 f"{first.name or 'the first'} {len(first.frequency)} to "
-                f"{first.frequency[-1] / _HERTZ:.6g} Hz."
+                f"{first.frequency[-1] / HERTZ:.6g} Hz."
             )
-        if [r.name for r in one.references] != [r.name for r in first.references]:
+        if [r.name for r in part.references] != [r.name for r in first.references]:
             raise ValueError(
                 f"responses of one test must share their references, but {place} has "
-                f"{', '.join(r.name for r in one.references)} and {first.name or 'the first'} "
+                f"{', '.join(r.name for r in part.references)} and {first.name or 'the first'} "
                 f"{', '.join(r.name for r in first.references)}."
             )
-    channels = tuple(c for one in parts for c in one.responses)
+    channels = tuple(c for part in parts for c in part.responses)
     names = [c.name for c in channels]
     for name in names:
         if names.count(name) > 1:
             raise ValueError(f"the response {name} comes {names.count(name)} times in the files.")
     return dataclasses.replace(
         first,
-        values=np.concatenate([one.values for one in parts]),
-        coherence=np.concatenate([one.coherence for one in parts]),
+        values=np.concatenate([part.values for part in parts]),
+        coherence=np.concatenate([part.coherence for part in parts]),
         responses=channels,
-        notes=tuple(dict.fromkeys(note for one in parts for note in one.notes)),
+        notes=tuple(dict.fromkeys(note for part in parts for note in part.notes)),
     )
 
 
 def _reference(responses: FrequencyResponses, name: str | None) -> int:
-    names = [one.name for one in responses.references]
+    names = [channel.name for channel in responses.references]
     if name is None and len(names) == 1:
         return 0
     if name is None:
@@ -163,11 +168,12 @@ def _reference(responses: FrequencyResponses, name: str | None) -> int:
 
 
 def _check_quantities(responses: FrequencyResponses) -> None:
-    for one in responses.responses:
-        if one.quantity not in _POWERS:
+    for channel in responses.responses:
+        if channel.quantity not in _POWERS:
+            named = channel.quantity if channel.quantity != "unknown" else "of no stated quantity"
             raise ValueError(
-                f"a response must be a displacement, velocity or acceleration, but {one.name} is "
-                f"{one.quantity if one.quantity != 'unknown' else 'of no stated quantity'}."
+                "a response must be a displacement, velocity or acceleration, but "
+                f"{channel.name} is {named}."
             )
 
 
@@ -177,7 +183,7 @@ def _errors(
     coherence: np.ndarray,
     std: np.ndarray | None,
     keep: np.ndarray,
-) -> tuple[np.ndarray, ErrorSource, list[str]]:
+) -> tuple[np.ndarray, ErrorSource, list[Fact]]:
     """1σ of real and imaginary part, in the unit of what was measured."""
     unknown = np.full(raw.shape, np.nan)
     if std is not None:
@@ -195,9 +201,9 @@ def _errors(
     if not stated.any():
         return unknown, "residuals", []
     if np.any(~stated & np.isfinite(raw)):
-        return unknown, "residuals", ["the coherence is stated in part and not used"]
+        return unknown, "residuals", [Fact("coherence_in_part")]
     if np.median(coherence[stated]) > 1 - _LEAST_MISSING_COHERENCE:
-        return unknown, "residuals", ["the coherence is 1 at most lines: it says nothing of errors"]
+        return unknown, "residuals", [Fact("coherence_is_one")]
     if np.median(coherence[stated]) <= 0:
         raise ValueError("the coherence is zero at most lines: nothing follows the reference.")
     return coherence_std(np.abs(raw), coherence, responses.averages), "coherence", []
@@ -216,3 +222,41 @@ def coherence_std(
     """
     kept = np.clip(coherence, 1e-6, 1 - _LEAST_MISSING_COHERENCE)
     return size * np.sqrt((1 - kept) / kept / 2 / (averages or 1))
+
+
+def std_from_residuals(
+    data: ResponseData,
+    residuals: Float[np.ndarray, "channel line"],
+    fitted: Float[np.ndarray, "channel line"],
+) -> Float[np.ndarray, "channel line"]:
+    """1σ of each part by σ² = a² + b²|H|² of what was measured, a and b by maximum likelihood.
+
+    Arguments: complex residuals and sizes of the fit, receptances; NaN where not measured.
+    """
+    size = data.measured_size
+    std = np.full(residuals.shape, np.nan)
+    for k in range(len(residuals)):
+        good = np.isfinite(residuals[k])
+        left = 0.5 * np.abs(residuals[k][good] * size[k][good]) ** 2
+        model = (np.abs(fitted[k]) * size[k]) ** 2
+        floor = max(_SMALLEST**2 * float(model[good].max()), float(np.mean(left)) * _SMALLEST)
+        scale = float(np.mean(left)) + floor
+        if 2 * good.sum() < _FEWEST_NUMBERS:
+            std[k] = np.sqrt(scale) / size[k]
+            continue
+        relative = model / np.mean(model[good])
+
+        def unlikely(logs: np.ndarray, of: np.ndarray, at: np.ndarray) -> float:
+            variance = np.exp(logs[0]) + np.exp(logs[1]) * at + _SPREAD**2
+            return float(np.sum(np.log(variance) + of / variance))
+
+        best = minimize(
+            unlikely,
+            np.log([0.5, 0.5]),
+            args=(left / scale, relative[good]),
+            method="L-BFGS-B",
+            bounds=[(-20.0, 10.0)] * 2,
+        )
+        variance = np.exp(best.x[0]) + np.exp(best.x[1]) * relative + _SPREAD**2
+        std[k] = np.sqrt(variance * scale) / size[k]
+    return std

@@ -93,8 +93,8 @@ def fit_separable(
         return [_compressed(basis_at(point), measured) for point in points]
 
     begin = np.clip(start, *bounds)[None]
-    found = minimise(linearised, begin, linearised(begin), bounds, _RULE)[0]
-    return _with_covariance(basis_at(found.point), measured, found.point, found.status)
+    end = minimise(linearised, begin, linearised(begin), bounds, _RULE)[0]
+    return _with_covariance(basis_at(end.point), measured, end.point, end.status)
 
 
 class _Compressed(NamedTuple):
@@ -119,25 +119,27 @@ def _projected(basis: TermColumns, values: np.ndarray, weights: np.ndarray) -> _
     orthogonal, triangle = np.linalg.qr(weighted / size)
     inverse = np.linalg.pinv(triangle, rcond=1e-12) @ orthogonal.T / size[:, None]
     rows = values * weights
-    found = inverse @ rows
-    slopes = np.einsum("urt,t->ru", basis.derivatives, found) * weights[:, None]
+    coefficients = inverse @ rows
+    slopes = np.einsum("urt,t->ru", basis.derivatives, coefficients) * weights[:, None]
     outside = slopes - orthogonal @ (orthogonal.T @ slopes)
     residuals = rows - orthogonal @ (orthogonal.T @ rows)
-    return _Projected(found, inverse, slopes, outside, residuals)
+    return _Projected(coefficients, inverse, slopes, outside, residuals)
 
 
 def _compressed(bases: Sequence[TermColumns], measured: ChannelRows) -> _Compressed:
     parts = []
-    if not all(np.isfinite(one.columns).all() for one in bases):
+    if not all(np.isfinite(projected.columns).all() for projected in bases):
         unknowns = bases[0].derivatives.shape[0]
         return _Compressed(np.array([np.inf]), np.zeros((1, unknowns)))
     for values, weights, group in zip(*measured[:3], strict=True):
-        one = _projected(bases[group], values, weights)
-        parts.append(np.linalg.qr(np.column_stack([-one.outside, one.residuals]), mode="r"))
-    every = np.concatenate(parts)
-    if not np.isfinite(every).all():
-        every = np.full_like(every, np.inf)
-    return _Compressed(every[:, -1], every[:, :-1])
+        projected = _projected(bases[group], values, weights)
+        parts.append(
+            np.linalg.qr(np.column_stack([-projected.outside, projected.residuals]), mode="r")
+        )
+    triangle = np.concatenate(parts)
+    if not np.isfinite(triangle).all():
+        triangle = np.full_like(triangle, np.inf)
+    return _Compressed(triangle[:, -1], triangle[:, :-1])
 
 
 def _with_covariance(
@@ -146,23 +148,25 @@ def _with_covariance(
     point: np.ndarray,
     status: MinimisationStatus,
 ) -> SeparableFit:
-    every = [
+    channels = [
         _projected(bases[group], values, weights)
         for values, weights, group in zip(*measured[:3], strict=True)
     ]
-    residuals = np.stack([one.residuals for one in every])
+    residuals = np.stack([channel.residuals for channel in channels])
     correlation = _correlation(residuals, measured)
     spread = _Spread(correlation, measured.sequences)
-    information = sum(one.outside.T @ one.outside for one in every)
+    information = sum(channel.outside.T @ channel.outside for channel in channels)
     gain = np.linalg.pinv(np.asarray(information), rcond=1e-15, hermitian=True)
-    meat = sum(spread.between(one.outside, one.outside) for one in every)
-    slopes = np.stack([one.inverse @ one.slopes for one in every])
-    own = np.stack([spread.between(one.inverse.T, one.inverse.T) for one in every])
-    mixed = np.stack([spread.between(one.inverse.T, one.outside) @ gain for one in every])
-    found = np.stack([one.coefficients for one in every])
+    meat = sum(spread.between(channel.outside, channel.outside) for channel in channels)
+    slopes = np.stack([channel.inverse @ channel.slopes for channel in channels])
+    own = np.stack([spread.between(channel.inverse.T, channel.inverse.T) for channel in channels])
+    mixed = np.stack(
+        [spread.between(channel.inverse.T, channel.outside) @ gain for channel in channels]
+    )
+    coefficients = np.stack([channel.coefficients for channel in channels])
     covariance = gain @ meat @ gain
     return SeparableFit(
-        point, found, residuals, covariance, slopes, own, mixed, correlation, status
+        point, coefficients, residuals, covariance, slopes, own, mixed, correlation, status
     )
 
 
@@ -174,15 +178,15 @@ class _Spread(NamedTuple):
 
     def between(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """aᵀRb for the correlation matrix R of the rows."""
-        found = a.T @ b
+        total = a.T @ b
         if not self.correlation.size:
-            return found
+            return total
         x, y = (m.reshape(self.sequences, -1, m.shape[1]) for m in (a, b))
         for lag, value in enumerate(self.correlation, start=1):
             early, late = slice(None, -lag), slice(lag, None)
-            found = found + value * np.einsum("snu,snv->uv", x[:, early], y[:, late])
-            found = found + value * np.einsum("snu,snv->uv", x[:, late], y[:, early])
-        return found
+            total = total + value * np.einsum("snu,snv->uv", x[:, early], y[:, late])
+            total = total + value * np.einsum("snu,snv->uv", x[:, late], y[:, early])
+        return total
 
 
 def _correlation(residuals: np.ndarray, measured: ChannelRows) -> np.ndarray:
@@ -191,7 +195,7 @@ def _correlation(residuals: np.ndarray, measured: ChannelRows) -> np.ndarray:
     rows = np.where(used, residuals.reshape(used.shape), 0.0)
     length = rows.shape[1]
     variance = np.sum(rows**2) / max(used.sum(), 1)
-    found: list[float] = []
+    correlations: list[float] = []
     for lag in range(1, min(_LAGS, length // 4) + 1):
         pairs = np.sum(used[:, :-lag] & used[:, lag:])
         if not pairs or variance == 0:
@@ -199,5 +203,5 @@ def _correlation(residuals: np.ndarray, measured: ChannelRows) -> np.ndarray:
         value = np.sum(rows[:, :-lag] * rows[:, lag:]) / pairs / variance
         if value * np.sqrt(pairs) < _WHITE:
             break
-        found.append(float(value) * (1 - lag / length))
-    return np.array(found)
+        correlations.append(float(value) * (1 - lag / length))
+    return np.array(correlations)

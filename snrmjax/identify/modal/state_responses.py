@@ -10,8 +10,9 @@ from snrmjax.identify.modal.modal_fit import LinearModalFit
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses, frequency_responses
 from snrmjax.measure.states import SteadyStates, relative_errors
+from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.units import HERTZ
 
-_HERTZ = 2 * np.pi
 _CERTAIN = 2.0  # standard errors of a difference between levels
 
 
@@ -28,7 +29,7 @@ def levels_by_velocity(data: SteadyStates) -> list[int]:
     """The levels of a test, that of the smallest largest velocity first."""
     size = np.where(np.asarray(data.measured), np.abs(np.asarray(data.velocity)), 0.0).max(axis=1)
     level = np.asarray(data.level)
-    return sorted(np.unique(level).tolist(), key=lambda one: size[level == one].max())
+    return sorted(np.unique(level).tolist(), key=lambda number: size[level == number].max())
 
 
 def responses_of_states(data: SteadyStates, level: int) -> StateResponses:
@@ -64,7 +65,7 @@ def responses_of_states(data: SteadyStates, level: int) -> StateResponses:
         variance[:, row] += np.where(seen[k], parts[k] ** 2, 0.0)
     values = np.where(count > 0, total / np.maximum(count, 1), np.nan)
     std = np.sqrt(variance) / np.maximum(count, 1)
-    found = frequency_responses(
+    responses = frequency_responses(
         omega,
         values[:, None],
         [Channel(name, "velocity", "m/s") for name in data.sensors],
@@ -72,14 +73,14 @@ def responses_of_states(data: SteadyStates, level: int) -> StateResponses:
         name=f"level {level}",
     )
     largest = float(np.nanmax(np.abs(velocity)))
-    return StateResponses(found, std if known else None, level, largest)
+    return StateResponses(responses, std if known else None, level, largest)
 
 
 def amplitude_dependence(
     lowest: LinearModalFit,
     next_level: LinearModalFit,
     velocities: tuple[float, float],
-) -> tuple[LinearModalFit, tuple[str, ...]]:
+) -> tuple[LinearModalFit, tuple[Fact, ...]]:
     """Whether modes differ between the two lowest levels by more than their errors.
 
     Where one does, its value at no amplitude may differ from that of the lower level by the change
@@ -90,32 +91,27 @@ def amplitude_dependence(
     """
     low, high = velocities
     rest = low / (high - low) if high > 1.01 * low else 1.0
-    added = np.zeros((2, lowest.n_modes))
-    notes = []
-    for k in range(lowest.n_modes):
-        omega = lowest.natural_frequency[k]
+    added, notes = np.zeros((2, lowest.n_modes)), []
+    pairs = (
+        (lowest.natural_frequency, next_level.natural_frequency),
+        (lowest.damping_ratio, next_level.damping_ratio),
+    )
+    stds = (
+        (lowest.natural_frequency_std, next_level.natural_frequency_std),
+        (lowest.damping_ratio_std, next_level.damping_ratio_std),
+    )
+    for k, omega in enumerate(lowest.natural_frequency.tolist()):
         other = int(np.argmin(np.abs(next_level.natural_frequency - omega)))
-        change = next_level.natural_frequency[other] - omega
-        error = np.hypot(next_level.natural_frequency_std[other], lowest.natural_frequency_std[k])
-        ratio = next_level.damping_ratio[other] - lowest.damping_ratio[k]
-        ratio_error = np.hypot(next_level.damping_ratio_std[other], lowest.damping_ratio_std[k])
-        for row, name, moved, spread, unit, size in (
-            (0, "frequency", change, error, "Hz", 1 / _HERTZ),
-            (1, "damping", ratio, ratio_error, "%", 100.0),
-        ):
-            if abs(moved) > _CERTAIN * spread:
-                added[row, k] = abs(moved) * rest
-                notes.append(
-                    f"the {name} of mode {k + 1} ({omega / _HERTZ:.6g} Hz) depends on the "
-                    f"amplitude: {size * moved:+.3g} {unit} from {low:.3g} to {high:.3g} m/s, "
-                    f"where the errors allow {size * _CERTAIN * spread:.2g} {unit}; at the lowest "
-                    f"level some {size * added[row, k]:.2g} {unit} may be left, which is added to "
-                    "its error (1σ)"
-                )
+        for row, (values, errors) in enumerate(zip(pairs, stds, strict=True)):
+            change = float(values[1][other] - values[0][k])
+            allowed = _CERTAIN * float(np.hypot(errors[1][other], errors[0][k]))
+            if abs(change) > allowed:
+                added[row, k] = abs(change) * rest
+                at = {"mode": k + 1, "frequency_hz": omega / HERTZ, "of_damping": row == 1}
+                sizes = {"change": change, "allowed": allowed, "left": float(added[row, k])}
+                notes.append(Fact("amplitude_dependence", **at, **sizes, velocities=velocities))
     if not notes:
-        notes.append(
-            "the two lowest levels agree within their errors: no amplitude dependence shows"
-        )
+        notes.append(Fact("levels_agree"))
     covariance = lowest.mode_covariance.copy()
     covariance[:, (0, 1), (0, 1)] += added.T**2
     return dataclasses.replace(lowest, mode_covariance=covariance), tuple(notes)

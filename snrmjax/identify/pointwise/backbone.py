@@ -9,13 +9,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from snrmjax.identify.curves.family_base import AbstractCurve
-from snrmjax.identify.pointwise.inversion_result import spans
 from snrmjax.identify.pointwise.points_result import AmplitudeArgument
 from snrmjax.numerics.compiled import compiled
-from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.result import AbstractResult, Variable, quantity
 
 _SAMPLES = 200  # as many as files have: one compiled function serves both
-_HERTZ = 2 * np.pi
 
 
 class BackboneValues(AbstractResult):
@@ -23,38 +21,17 @@ class BackboneValues(AbstractResult):
 
     coordinates: ClassVar[tuple[str, ...]] = ("velocity_m_s",)
 
-    velocity: Float[Array, " point"]  # m/s
-    natural_frequency: Float[Array, " point"]  # rad/s
-    natural_frequency_std: Float[Array, " point"]
-    damping_ratio: Float[Array, " point"]
-    damping_ratio_std: Float[Array, " point"]
-    modal_damping: Float[Array, " point"]  # 2ζ̃ω̃, 1/s
-    modal_damping_std: Float[Array, " point"]
-
-    def summary(self) -> tuple[str, ...]:
-        """See `AbstractResult`."""
-        return (
-            f"BackboneValues: {np.size(self.velocity)} amplitudes, {spans(self.velocity)} m/s",
-            f"natural frequency {spans(np.asarray(self.natural_frequency) / _HERTZ)} Hz",
-            f"damping ratio {spans(100 * np.asarray(self.damping_ratio))} %",
-        )
-
-    def variables(self) -> dict[str, Variable]:
-        """See `AbstractResult`; the columns of `backbone.csv`."""
-
-        def column(values: Array | np.ndarray, unit: str, meaning: str) -> Variable:
-            return Variable(("velocity_m_s",), np.asarray(values).reshape(-1), unit, meaning)
-
-        natural, natural_std = self.natural_frequency, self.natural_frequency_std
-        return {
-            "velocity_m_s": column(self.velocity, "m/s", "velocity amplitude"),
-            "natural_frequency_hz": column(np.asarray(natural) / _HERTZ, "Hz", "natural frequency"),
-            "natural_frequency_std_hz": column(np.asarray(natural_std) / _HERTZ, "Hz", "its 1σ"),
-            "damping_ratio": column(self.damping_ratio, "1", "damping ratio"),
-            "damping_ratio_std": column(self.damping_ratio_std, "1", "its 1σ"),
-            "modal_damping_1_s": column(self.modal_damping, "1/s", "modal damping 2ζω"),
-            "modal_damping_std_1_s": column(self.modal_damping_std, "1/s", "its 1σ"),
-        }
+    velocity: Float[Array, " point"] = quantity("velocity_m_s", "m/s", "velocity amplitude")
+    natural_frequency: Float[Array, " point"] = quantity("velocity_m_s", "Hz", "natural frequency")
+    natural_frequency_std: Float[Array, " point"] = quantity("velocity_m_s", "Hz", "its 1σ")
+    damping_ratio: Float[Array, " point"] = quantity("velocity_m_s", "1", "damping ratio")
+    damping_ratio_std: Float[Array, " point"] = quantity("velocity_m_s", "1", "its 1σ")
+    modal_damping: Float[Array, " point"] = quantity(
+        "velocity_m_s", "1/s", "modal damping 2ζω", name="modal_damping_1_s"
+    )
+    modal_damping_std: Float[Array, " point"] = quantity(
+        "velocity_m_s", "1/s", "its 1σ", name="modal_damping_std_1_s"
+    )
 
 
 class Backbone(AbstractResult):
@@ -70,31 +47,18 @@ class Backbone(AbstractResult):
     modal_damping: AbstractCurve
     covariance: Float[Array, "parameter parameter"]
     modal_constant: Float[Array, ""]  # Φ_r Φᵀb, 1/kg: acceleration per newton at resonance
-    smallest: Float[Array, ""]  # amplitude of the smallest state used, zero if anchored there
+    smallest: Float[Array, ""]  # amplitude of the smallest state used
     largest: Float[Array, ""]  # amplitude of the largest state used
     argument: AmplitudeArgument = eqx.field(static=True)
     sensor: str = eqx.field(static=True)
     coordinates: ClassVar[tuple[str, ...]] = ("velocity_m_s",)
 
-    def summary(self) -> tuple[str, ...]:
-        """See `AbstractResult`."""
-        ends = self.sampled()
-        sizes = [
-            curve.parameters.shape[0] for curve in (self.squared_frequency, self.modal_damping)
-        ]
-        return (
-            f"Backbone at {self.sensor!r} against {self.argument}: {sizes[0]} and {sizes[1]} "
-            "parameters of natural frequency and damping",
-            *ends.summary()[1:],
-            f"velocity {spans(ends.velocity)} m/s",
-        )
-
     def variables(self) -> dict[str, Variable]:
-        """See `AbstractResult`; between the smallest and the largest measured amplitude."""
-        return self.sampled().variables()
+        """Those between the smallest and the largest measured amplitude."""
+        return dict(self.sampled().variables())
 
     def attributes(self) -> dict[str, str | float | int]:
-        """See `AbstractResult`."""
+        """The sensor, and the amplitude that the curves are functions of."""
         return {"sensor": self.sensor, "amplitude": self.argument}
 
     def sampled(self, n_points: int = _SAMPLES, *, reach: float = 1.0) -> BackboneValues:
@@ -128,7 +92,7 @@ class Backbone(AbstractResult):
         """
         at = np.asarray(amplitude, dtype=float)
         curves = self.squared_frequency, self.modal_damping
-        (squared, by_squared), (modal, by_modal) = (c.values_and_slopes(at) for c in curves)
+        (squared, by_squared, _), (modal, by_modal, _) = (c.linearised(at) for c in curves)
         slopes = np.zeros((len(at), 2, by_squared.shape[1] + by_modal.shape[1]))
         slopes[:, 0, : by_squared.shape[1]] = by_squared
         slopes[:, 1, by_squared.shape[1] :] = by_modal

@@ -114,7 +114,7 @@ def _identify(
         modes, r, amplitude, data.frequency, inputs, share, usable
     )
     natural, damping = solved.natural_frequency, solved.damping_ratio
-    found = jnp.isfinite(natural)
+    solved_well = jnp.isfinite(natural)
     natural_std, damping_std = _ratios_std(
         natural, damping, sensitivity, filtered_std, linear_variance
     )
@@ -126,7 +126,7 @@ def _identify(
         )
     on_backbone = jnp.abs(mode_velocity)
     if amplitude == "displacement":
-        on_backbone = on_backbone * jnp.where(found, natural, 1.0) / data.frequency
+        on_backbone = on_backbone * jnp.where(solved_well, natural, 1.0) / data.frequency
     measured = mode_velocity + residual_velocity(modes, data.frequency, data.force)[:, r]
     # Nothing is subtracted where nothing drives the other modes, or nothing moves.
     bare = jnp.where(sound | (raw.force == 0), combined, jnp.nan)
@@ -144,8 +144,8 @@ def _identify(
         natural_frequency_std=natural_std,
         damping_ratio=damping,
         damping_ratio_std=damping_std,
-        amplitude=jnp.where(found, argument, jnp.nan),
-        backbone_velocity=jnp.where(found, on_backbone, jnp.nan),
+        amplitude=jnp.where(solved_well, argument, jnp.nan),
+        backbone_velocity=jnp.where(solved_well, on_backbone, jnp.nan),
         alternative_natural_frequency=solved.alternative_natural_frequency,
         alternative_damping_ratio=solved.alternative_damping_ratio,
         sensitivity=sensitivity,
@@ -237,7 +237,7 @@ def modal_filter(
     measured = data.measured & jnp.isfinite(velocity)
     velocity = jnp.where(measured, velocity, 0.0)
     residual = residual_velocity(modes, data.frequency, data.force)
-    own = jnp.where(measured, velocity - residual, 0.0)
+    of_mode = jnp.where(measured, velocity - residual, 0.0)
     errors = relative_std[..., 1:]
     stated = jnp.isfinite(errors)
     absolute = jnp.where(stated, errors, 0.0) * jnp.abs(velocity)[..., None]
@@ -248,21 +248,21 @@ def modal_filter(
     norm = jnp.sum(weight * shape**2, axis=1, keepdims=True)
     seen = norm > 0
     share = jnp.where(seen, weight * shape * shape[r] / jnp.where(seen, norm, 1.0), 0.0)
-    modal = jnp.sum(share * own, axis=1, keepdims=True) / shape[r]
-    misfit = jnp.where(measured, own - shape * modal, 0.0)
+    modal = jnp.sum(share * of_mode, axis=1, keepdims=True) / shape[r]
+    misfit = jnp.where(measured, of_mode - shape * modal, 0.0)
 
     def size_of(parts: Complex[Array, "state sensor"]) -> Float[Array, " state"]:
         return safe_root(jnp.sum(weight * (parts.real**2 + parts.imag**2), axis=1))
 
-    relative_misfit = _ratio(size_of(misfit), size_of(own))
+    relative_misfit = _ratio(size_of(misfit), size_of(of_mode))
     combined = jnp.sum(share * velocity, axis=1)
     length = jnp.abs(combined)
 
     # Errors of the sensors are independent; amplitude and phase errors lie along and across V.
     def error(component: int) -> Array:
         each = jnp.where(measured, share * absolute[..., component], 0.0)
-        told = jnp.all(stated[..., component] | ~measured, axis=1)
-        return jnp.where(told, _ratio(safe_root(jnp.sum(each**2, axis=1)), length), jnp.nan)
+        known_all = jnp.all(stated[..., component] | ~measured, axis=1)
+        return jnp.where(known_all, _ratio(safe_root(jnp.sum(each**2, axis=1)), length), jnp.nan)
 
     std = jnp.stack([relative_std[:, 0, 0], error(0), error(1)], axis=1)
     return jnp.where(seen[:, 0], combined, jnp.nan), share, std, relative_misfit

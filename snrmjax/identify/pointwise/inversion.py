@@ -39,10 +39,10 @@ class CramersRule(lx.AbstractLinearSolver[Any]):
         (a, b), (c, d) = state
         x = (d * vector[0] - b * vector[1]) / (a * d - b * c)
         y = (a * vector[1] - c * vector[0]) / (a * d - b * c)
-        found = jnp.stack([x, y])
+        answer = jnp.stack([x, y])
         if self.zero_stays_zero:
-            found = jnp.where(jnp.all(vector == 0), 0.0, found)
-        return found, lx.RESULTS.successful, {}
+            answer = jnp.where(jnp.all(vector == 0), 0.0, answer)
+        return answer, lx.RESULTS.successful, {}
 
     def transpose(self, state: Array, options: dict[str, Any]) -> tuple[Array, dict[str, Any]]:
         """See `lineax.AbstractLinearSolver.transpose`."""
@@ -113,9 +113,9 @@ def invert_phasor(
 def _invert_phasor(
     modal_constant: Array, frequency: Array, velocity: Array, residual: Array
 ) -> SnrmPoints:
-    own = velocity - residual
-    measured = (modal_constant, frequency, _length(velocity), *_direction(own), residual)
-    return _invert(_Member(*measured, _length(own)))
+    of_mode = velocity - residual
+    measured = (modal_constant, frequency, _length(velocity), *_direction(of_mode), residual)
+    return _invert(_Member(*measured, _length(of_mode)))
 
 
 def invert_amplitude_phase(

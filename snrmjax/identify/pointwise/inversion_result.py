@@ -5,10 +5,8 @@ from typing import ClassVar
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.result import AbstractResult, Variable, quantity
 from snrmjax.numerics.status import Status
-
-_HERTZ = 2 * np.pi
 
 
 class PointStatus(Status):
@@ -39,71 +37,36 @@ _USUAL_CAUSE: dict[PointStatus, str] = {
 }
 
 
-def statuses_in_words(status: Int[np.ndarray | Array, "*batch"]) -> str:
-    """How many members have which status: "12 ok, 1 two_roots"."""
-    kinds, counts = np.unique(np.asarray(status), return_counts=True)
-    pairs = zip(kinds, counts, strict=True)
-    return ", ".join(f"{n} {PointStatus(int(kind)).name.lower()}" for kind, n in pairs)
-
-
 def reasons_in_words(status: Int[np.ndarray | Array, " state"]) -> str:
     """Why states have no point, the most frequent reason first, and what most often causes it."""
     kinds, counts = np.unique(np.asarray(status), return_counts=True)
     order = [k for k in np.argsort(-counts, kind="stable") if kinds[k] != PointStatus.OK]
-    found = [(PointStatus(int(kinds[k])), int(counts[k])) for k in order]
-    listed = "; ".join(f"{count} have {kind.message}" for kind, count in found)
-    causes = [_USUAL_CAUSE[kind] for kind, _ in found[:1] if kind in _USUAL_CAUSE]
+    reasons = [(PointStatus(int(kinds[k])), int(counts[k])) for k in order]
+    listed = "; ".join(f"{count} have {kind.message}" for kind, count in reasons)
+    causes = [_USUAL_CAUSE[kind] for kind, _ in reasons[:1] if kind in _USUAL_CAUSE]
     return ". ".join([listed, *causes])
 
 
-def status_names(status: Int[np.ndarray | Array, " state"]) -> np.ndarray:
-    """The status of every member as text, as files have it."""
-    return np.array([PointStatus(int(one)).name.lower() for one in np.asarray(status)], dtype=str)
-
-
-def spans(values: Float[np.ndarray | Array, "*batch"]) -> str:
-    """From the smallest to the largest finite number, in four digits."""
-    finite = np.asarray(values)[np.isfinite(np.asarray(values))]
-    if not finite.size:
-        return "none"
-    return f"{finite.min():.4g} to {finite.max():.4g}"
-
-
 class SnrmPoints(AbstractResult):
-    """ω̃ and ζ̃ of a batch of steady states; NaN wherever the status says that there is none."""
+    """ω̃ and ζ̃ of a batch of steady states; NaN wherever the status says that there is none.
+
+    `alternative_…` is what amplitude and phase alone would also allow, NaN where there is no other
+    root.
+    """
 
     coordinates: ClassVar[tuple[str, ...]] = ("member",)
 
-    natural_frequency: Float[Array, "*batch"]  # rad/s
-    damping_ratio: Float[Array, "*batch"]
-    alternative_natural_frequency: Float[Array, "*batch"]  # rad/s, NaN = there is no other root
-    alternative_damping_ratio: Float[Array, "*batch"]
-    status: Int[Array, "*batch"]  # `PointStatus`
-
-    def summary(self) -> tuple[str, ...]:
-        """See `AbstractResult`."""
-        return (
-            f"SnrmPoints: {np.size(self.status)} inversions ({statuses_in_words(self.status)})",
-            f"natural frequency {spans(np.asarray(self.natural_frequency) / _HERTZ)} Hz",
-            f"damping ratio {spans(100 * np.asarray(self.damping_ratio))} %",
-        )
+    natural_frequency: Float[Array, "*batch"] = quantity("member", "Hz", "natural frequency")
+    damping_ratio: Float[Array, "*batch"] = quantity("member", "1", "damping ratio")
+    alternative_natural_frequency: Float[Array, "*batch"] = quantity("member", "Hz", "other root")
+    alternative_damping_ratio: Float[Array, "*batch"] = quantity("member", "1", "other root")
+    status: Int[Array, "*batch"] = quantity("member", "", "outcome", of=PointStatus)
 
     def variables(self) -> dict[str, Variable]:
-        """See `AbstractResult`; the batch in one row."""
-
-        def column(values: Array | np.ndarray, unit: str, meaning: str) -> Variable:
-            return Variable(("member",), np.asarray(values).reshape(-1), unit, meaning)
-
-        other = self.alternative_natural_frequency, self.alternative_damping_ratio
+        """Those of the fields, the batch in one row."""
+        number = np.arange(np.size(self.status))
+        rows = super().variables().items()
         return {
-            "member": column(np.arange(np.size(self.status)), "1", "member of the batch"),
-            "natural_frequency_hz": column(
-                np.asarray(self.natural_frequency) / _HERTZ, "Hz", "natural frequency"
-            ),
-            "damping_ratio": column(self.damping_ratio, "1", "damping ratio"),
-            "alternative_natural_frequency_hz": column(
-                np.asarray(other[0]) / _HERTZ, "Hz", "natural frequency of the other root"
-            ),
-            "alternative_damping_ratio": column(other[1], "1", "damping ratio of the other root"),
-            "status": column(status_names(np.ravel(self.status)), "", "what became of it"),
+            "member": Variable(("member",), number, "1", "member of the batch"),
+            **{name: row._replace(values=np.ravel(row.values)) for name, row in rows},
         }

@@ -7,11 +7,11 @@ from jaxtyping import Float
 
 from snrmjax.identify.pointwise.backbone import Backbone
 from snrmjax.measure.states import SteadyStates
+from snrmjax.numerics.units import HERTZ
 
 _SAME_FORCE = 0.05  # relative difference of a level's force from the one that was asked for
 _ONE_BRANCH = np.radians(45.0)  # of phase, that states beside a resonance may be apart
 _STEEPER = 2.0  # times as steep as beside it, from which on tan φ jumps
-_HERTZ = 2 * np.pi
 
 
 class MeasuredResonance(NamedTuple):
@@ -32,7 +32,7 @@ def measured_resonances(data: SteadyStates, sensor: int, sign: float) -> list[Me
     force, frequency = np.asarray(data.force), np.asarray(data.frequency)
     level = np.asarray(data.level)
     good = np.isfinite(force) & np.isfinite(np.abs(velocity)) & (velocity.real > 0)
-    found = []
+    enclosed = []
     for number in np.unique(level[good]):
         mine = np.flatnonzero(good & (level == number))
         tangent = velocity[mine].imag / velocity[mine].real
@@ -42,10 +42,10 @@ def measured_resonances(data: SteadyStates, sensor: int, sign: float) -> list[Me
         rows = np.sort(tangent)
         if jump_at_resonance(rows, frequency[order]) is not None:
             continue
-        columns = (force, frequency / _HERTZ, np.abs(velocity))
+        columns = (force, frequency / HERTZ, np.abs(velocity))
         at = (float(np.interp(0.0, rows, column[order])) for column in columns)
-        found.append(MeasuredResonance(int(number), *at))
-    return found
+        enclosed.append(MeasuredResonance(int(number), *at))
+    return enclosed
 
 
 def jump_at_resonance(
@@ -71,8 +71,8 @@ def jump_at_resonance(
     slopes = [_slope(tangent[k : k + 2], frequency[k : k + 2]) for k in beside]
     if not slopes:
         return None
-    own = _slope(tangent[pair], frequency[pair])
-    return ends if own >= 0 or own < _STEEPER * min(*slopes, 0.0) else None
+    slope = _slope(tangent[pair], frequency[pair])
+    return ends if slope >= 0 or slope < _STEEPER * min(*slopes, 0.0) else None
 
 
 def _slope(tangent: Float[np.ndarray, " 2"], frequency: Float[np.ndarray, " 2"]) -> float:
@@ -85,6 +85,6 @@ def level_in_resonance(
 ) -> MeasuredResonance | None:
     """The phase resonance of the level whose force is about this one in N; None without one."""
     sensor, sign = data.sensors.index(backbone.sensor), np.sign(float(backbone.modal_constant))
-    every = measured_resonances(data, sensor, sign)
-    near = min(every, key=lambda one: abs(one.force / force - 1), default=None)
+    measured = measured_resonances(data, sensor, sign)
+    near = min(measured, key=lambda resonance: abs(resonance.force / force - 1), default=None)
     return None if near is None or abs(near.force / force - 1) > _SAME_FORCE else near

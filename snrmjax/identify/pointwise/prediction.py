@@ -15,6 +15,7 @@ from snrmjax.identify.pointwise.points_result import AmplitudeArgument
 from snrmjax.identify.pointwise.prediction_result import PredictedResponse, Resonance
 from snrmjax.identify.pointwise.snrm import nonlinear_mode_velocity
 from snrmjax.model.modes import LinearModes, residual_velocity
+from snrmjax.numerics.facts import Fact
 
 LARGEST_AMPLITUDE_RATIO = 1.5
 """Predictions end, unless asked for more, at this multiple of the largest measured amplitude."""
@@ -51,11 +52,11 @@ def resonances(
         return np.signbit(at.excess(load))
 
     weak = too_weak(_on_backbone(backbone, amplitude))
-    found = []
+    tips = []
     for k in np.flatnonzero(weak[:-1] != weak[1:]):
         root = np.mean(_change(backbone, too_weak, amplitude[k], amplitude[k + 1]))
-        found.append(_resonance(backbone, modes, force, float(root)))
-    return found
+        tips.append(_resonance(backbone, modes, force, float(root)))
+    return tips
 
 
 def predict_response(
@@ -188,6 +189,7 @@ def _on_backbone(backbone: Backbone, amplitude: Float[np.ndarray, " point"]) -> 
 def _values_and_slopes(
     backbone: Backbone, amplitude: Float[np.ndarray, " point"]
 ) -> tuple[Array, Array, Array, Array]:
+    """A compiled program: scans of thousands of amplitudes take the host ten times as long."""
     at = jnp.asarray(amplitude)
 
     def curves(a: Array) -> tuple[Array, Array]:
@@ -277,7 +279,7 @@ def _one_curve(
         branch=tuple(np.where(frequency <= natural, "lead", "lag").tolist()),
         continued=both.amplitude > float(backbone.largest) * (1 + 1e-9),
         isolated=closed,
-        note="",
+        notes=(),
     )
     return _part(curve, keep, backbone)
 
@@ -285,13 +287,11 @@ def _one_curve(
 def _part(curve: PredictedResponse, keep: np.ndarray, backbone: Backbone) -> PredictedResponse:
     """Some points of a curve, and the note on those that extrapolate the backbone."""
     amplitude, continued = curve.amplitude[keep], curve.continued[keep]
-    note = ""
+    notes: tuple[Fact, ...] = ()
     if continued.any():
-        note = (
-            f"{int(continued.sum())} of {len(continued)} points lie beyond the largest measured "
-            f"amplitude, up to {amplitude.max() / float(backbone.largest):.3g} times it: there the "
-            "backbone is extrapolated, which no measurement supports."
-        )
+        ratio = float(amplitude.max() / float(backbone.largest))
+        count = {"n_points": int(continued.sum()), "of": len(continued)}
+        notes = (Fact("beyond_measured_amplitudes", **count, ratio=ratio),)
     return dataclasses.replace(
         curve,
         frequency=curve.frequency[keep],
@@ -300,5 +300,5 @@ def _part(curve: PredictedResponse, keep: np.ndarray, backbone: Backbone) -> Pre
         stable=curve.stable[keep],
         branch=tuple(np.asarray(curve.branch)[keep].tolist()),
         continued=continued,
-        note=note,
+        notes=notes,
     )

@@ -5,83 +5,56 @@ from typing import ClassVar
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 
-from snrmjax.identify.pointwise.inversion_result import spans
-from snrmjax.numerics.result import AbstractResult, Variable
-
-_HERTZ = 2 * np.pi
+from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.result import AbstractResult, Variable, quantity
 
 
 class Resonance(AbstractResult):
     """A phase resonance under a given force: the nonlinear mode moves in phase with it."""
 
-    force: float  # N
+    force: float = quantity("", "N", "force amplitude")
     amplitude: float  # of the backbone's argument, m or m/s
-    frequency: float  # rad/s
-    damping_ratio: float
-    velocity: float  # m/s at the backbone's sensor, residual modes included
-    continued: bool  # beyond the measured amplitudes
-
-    def summary(self) -> tuple[str, ...]:
-        """See `AbstractResult`."""
-        where = "beyond the measured amplitudes" if self.continued else "as far as was measured"
-        return (
-            f"Resonance under {self.force:.4g} N at {self.frequency / _HERTZ:.6g} Hz",
-            f"velocity {self.velocity:.4g} m/s, damping ratio {100 * self.damping_ratio:.4g} %",
-            where,
-        )
-
-    def variables(self) -> dict[str, Variable]:
-        """See `AbstractResult`."""
-        return {
-            "force_n": Variable((), self.force, "N", "force amplitude"),
-            "frequency_hz": Variable((), self.frequency / _HERTZ, "Hz", "frequency"),
-            "velocity_m_s": Variable((), self.velocity, "m/s", "velocity amplitude"),
-            "damping_ratio": Variable((), self.damping_ratio, "1", "damping ratio"),
-            "continued": Variable((), self.continued, "1", "beyond the measured amplitudes"),
-        }
+    frequency: float = quantity("", "Hz", "frequency")  # rad/s
+    damping_ratio: float = quantity("", "1", "damping ratio")
+    # At the backbone's sensor, residual modes included.
+    velocity: float = quantity("", "m/s", "velocity amplitude")
+    continued: bool = quantity("", "1", "beyond the measured amplitudes")
 
 
 class PredictedResponse(AbstractResult):
-    """One connected response curve in order: up the low-frequency side, down the other."""
+    """One connected response curve in order: up the low-frequency side, down the other.
+
+    `isolated` is a closed curve, apart from the main one.
+    """
 
     coordinates: ClassVar[tuple[str, ...]] = ("point",)
 
     force: float  # N
-    frequency: Float[np.ndarray, " point"]  # rad/s
+    frequency: Float[np.ndarray, " point"] = quantity("point", "Hz", "frequency")  # rad/s
     velocity: Complex[np.ndarray, " point"]  # m/s at the backbone's sensor
     amplitude: Float[np.ndarray, " point"]  # of the backbone's argument
-    stable: Bool[np.ndarray, " point"]
+    stable: Bool[np.ndarray, " point"] = quantity("point", "1", "whether the motion is stable")
     branch: tuple[str, ...]  # "lead" (velocity leads the force) or "lag" for every point
-    continued: Bool[np.ndarray, " point"]  # beyond the measured amplitudes
-    isolated: bool  # a closed curve, apart from the main one
-    note: str  # where the curve extrapolates the backbone; empty where it nowhere does
+    continued: Bool[np.ndarray, " point"] = quantity("point", "1", "beyond the measured amplitudes")
+    isolated: bool
+    # Where it extrapolates the backbone, and what was not located.
+    notes: tuple[Fact, ...]
 
-    def summary(self) -> tuple[str, ...]:
-        """See `AbstractResult`."""
-        kind = "isolated curve" if self.isolated else "main curve"
-        lines = [
-            f"PredictedResponse under {self.force:.4g} N: {kind} of {len(self.frequency)} points",
-            f"{spans(np.asarray(self.frequency) / _HERTZ)} Hz",
-            f"velocity {spans(np.abs(self.velocity))} m/s",
-            f"{int(np.sum(~np.asarray(self.stable)))} points unstable",
-        ]
-        return (*lines, self.note) if self.note else tuple(lines)
+    @property
+    def note(self) -> str:
+        """The notes in words."""
+        return " ".join(map(str, self.notes))
 
     def variables(self) -> dict[str, Variable]:
-        """See `AbstractResult`; the columns of `prediction.csv`."""
-
-        def column(values: np.ndarray, unit: str, meaning: str) -> Variable:
-            return Variable(("point",), np.asarray(values), unit, meaning)
-
+        """Those of the fields, with both parts of the velocity."""
+        point, real, imaginary = ("point",), self.velocity.real, self.velocity.imag
         return {
-            "point": column(np.arange(len(self.frequency)), "1", "point along the curve"),
-            "frequency_hz": column(np.asarray(self.frequency) / _HERTZ, "Hz", "frequency"),
-            "velocity_re_m_s": column(self.velocity.real, "m/s", "velocity in phase"),
-            "velocity_im_m_s": column(self.velocity.imag, "m/s", "velocity 90° ahead"),
-            "stable": column(self.stable, "1", "whether the motion is stable"),
-            "continued": column(self.continued, "1", "beyond the measured amplitudes"),
+            "point": Variable(point, np.arange(len(real)), "1", "point along the curve"),
+            **super().variables(),
+            "velocity_re_m_s": Variable(point, real, "m/s", "velocity in phase"),
+            "velocity_im_m_s": Variable(point, imaginary, "m/s", "velocity 90° ahead"),
         }
 
     def attributes(self) -> dict[str, str | float | int]:
-        """See `AbstractResult`."""
+        """The force, whether the curve is isolated, and notes."""
         return {"force_n": self.force, "isolated": int(self.isolated), "note": self.note}

@@ -1,11 +1,10 @@
 """The single nonlinear resonant mode function: one mode with amplitude-dependent properties."""
 
-import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from snrmjax.model.modes import LinearModes, residual_velocity
+from snrmjax.model.modes import reference_sensor as reference_sensor
 
 
 def nonlinear_mode_velocity(
@@ -49,23 +48,10 @@ def snrm_velocity(
     """
     j = modes.mode_of_interest
     constant = modes.mode_shape[:, j] * (modes.participation[j] * jnp.asarray(force)[..., None])
-    own = nonlinear_mode_velocity(
+    of_mode = nonlinear_mode_velocity(
         constant,
         jnp.asarray(natural_frequency)[..., None],
         jnp.asarray(damping_ratio)[..., None],
         jnp.asarray(frequency)[..., None],
     )
-    return own + residual_velocity(modes, frequency, force)
-
-
-def reference_sensor(modes: LinearModes) -> int:
-    """The sensor at which the mode of interest moves most: amplitudes are given there.
-
-    Within `jax.jit` mode shapes of several sensors must be known while compiling (not arguments).
-    """
-    if modes.mode_shape.shape[0] == 1:
-        return 0
-    shape = modes.mode_shape
-    if isinstance(shape, jax.core.Tracer):  # of a derivative: it still has its value
-        shape = jax.lax.stop_gradient(shape)
-    return int(np.argmax(np.abs(np.asarray(shape)[:, modes.mode_of_interest])))
+    return of_mode + residual_velocity(modes, frequency, force)

@@ -57,9 +57,9 @@ def new_level(
     """
     std = np.array(fit.prior.level, dtype=float)
     trends = _trends(fit, force) if fit.data.n_levels >= _FEWEST else ()
-    for one in trends:
-        place = LEVEL_ERRORS.index(one.kind)
-        std[place] = np.hypot(std[place], one.there)
+    for trend in trends:
+        place = LEVEL_ERRORS.index(trend.kind)
+        std[place] = np.hypot(std[place], trend.there)
     record = float(fit.recorded_force(np.array(force))) if as_recorded else None
     return NewLevel(further_std(std, day), record, trends, day is not None)
 
@@ -74,7 +74,7 @@ def further_std(
 
 
 def _trends(fit: JointFit, force: float) -> tuple[LevelTrend, ...]:
-    found, level = [], np.asarray(fit.data.level)
+    trends, level = [], np.asarray(fit.data.level)
     known = fit.force_of_drive(np.asarray(fit.data.force))
     size = np.array([np.median(known[level == k]) for k in range(fit.data.n_levels)])
     if not np.ptp(size) > 0:
@@ -82,10 +82,10 @@ def _trends(fit: JointFit, force: float) -> tuple[LevelTrend, ...]:
     from scipy.stats import linregress  # slow to import, and rarely needed
 
     deviation = np.asarray(fit.unknowns.level * fit.prior.level)
-    for kind, own in zip(LEVEL_ERRORS, deviation.T, strict=True):
-        line = linregress(size, own) if np.any(own != 0) else None
+    for kind, errors in zip(LEVEL_ERRORS, deviation.T, strict=True):
+        line = linregress(size, errors) if np.any(errors != 0) else None
         if line is not None and line.pvalue < _CHANCE:
             places = (size.min(), size.max(), force)
             first, last, there = (float(line.intercept + line.slope * at) for at in places)
-            found.append(LevelTrend(kind, first, last, there, float(line.pvalue)))
-    return tuple(found)
+            trends.append(LevelTrend(kind, first, last, there, float(line.pvalue)))
+    return tuple(trends)

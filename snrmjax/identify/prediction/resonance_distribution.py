@@ -10,10 +10,9 @@ from jaxtyping import Complex, Float
 from snrmjax.identify.pointwise.prediction import LARGEST_AMPLITUDE_RATIO
 from snrmjax.identify.prediction.new_level import NewLevel
 from snrmjax.model.modes import LinearModes, residual_velocity
-from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
 
 QUANTILES = (0.025, 0.16, 0.5, 0.84, 0.975)
-_HERTZ = 2 * np.pi  # rad/s
 _DRAWS = 4000
 _POINTS = 201  # amplitudes of each drawn curve
 # One law in so many ends with the data: damping stays what it was at the largest amplitude.
@@ -30,13 +29,14 @@ class ResonanceDistribution(AbstractResult):
 
     coordinates: ClassVar[tuple[str, ...]] = ("quantile",)
 
-    force: float  # N
+    force: float = setting()  # N
     drive: float | None  # what the test records of it, where that was asked for
-    largest_amplitude_ratio: float  # the range, in largest measured amplitudes
-    probability: float  # that the resonance lies within the range
-    frequency: Float[np.ndarray, " quantile"]  # rad/s, at `QUANTILES`
-    velocity: Float[np.ndarray, " quantile"]  # m/s, as the level would record it
-    negative_damping: float  # share of the curves left out: no passive structure has them
+    largest_amplitude_ratio: float = setting()  # the range, in largest measured amplitudes
+    probability: float = setting()  # that the resonance lies within the range
+    frequency: Float[np.ndarray, " quantile"] = quantity("quantile", "Hz", "frequency")
+    # As the level would record it.
+    velocity: Float[np.ndarray, " quantile"] = quantity("quantile", "m/s", "velocity")
+    negative_damping: float = setting()  # share of the curves left out: none is passive
     another_day: bool  # whether the errors are another day's too
 
     @property
@@ -45,31 +45,14 @@ class ResonanceDistribution(AbstractResult):
         more = " and another day's" if self.another_day else ""
         return f"a further level's errors{more}"
 
-    def summary(self) -> tuple[str, ...]:
-        """See `AbstractResult`."""
-        hertz, speed = self.frequency[[0, 2, -1]] / _HERTZ, self.velocity[[0, 2, -1]]
-        return (
-            f"ResonanceDistribution under {self.force:.4g} N, with {self.holds}",
-            f"probability {self.probability:.3g} within {self.largest_amplitude_ratio:g} times the "
-            "largest measured amplitude",
-            f"frequency {hertz[1]:.6g} Hz, 95 % {hertz[0]:.6g} to {hertz[2]:.6g} Hz",
-            f"velocity {speed[1]:.4g} m/s, 95 % {speed[0]:.4g} to {speed[2]:.4g} m/s",
-            f"{100 * self.negative_damping:.2g} % of the curves left out: negative damping",
-        )
-
     def variables(self) -> dict[str, Variable]:
-        """See `AbstractResult`."""
-        per = ("quantile",)
-        return {
-            "quantile": Variable(per, np.array(QUANTILES), "1", "share below"),
-            "frequency_hz": Variable(per, self.frequency / _HERTZ, "Hz", "frequency"),
-            "velocity_m_s": Variable(per, self.velocity, "m/s", "velocity"),
-        }
+        """Frequency and velocity at `QUANTILES`."""
+        quantile = Variable(("quantile",), np.array(QUANTILES), "1", "share below")
+        return {"quantile": quantile, **super().variables()}
 
     def attributes(self) -> dict[str, str | float | int]:
-        """See `AbstractResult`."""
-        names = ("force", "largest_amplitude_ratio", "probability", "negative_damping")
-        return {name: getattr(self, name) for name in names} | {"holds": self.holds}
+        """The force, the range, probabilities, and which errors the quantiles hold."""
+        return {**super().attributes(), "holds": self.holds}
 
 
 class KnownCurves(NamedTuple):
@@ -122,12 +105,12 @@ def resonance_distribution(
     speed = amplitude * omega
     root = _Root.of(speed * damping / load[:, None])
     kept = root.found | ~np.any(damping[:, edge:] <= 0, axis=1) | self_excited
-    at, own = root.at(omega), root.at(speed, at_rest=0.0)
+    at, of_mode = root.at(omega), root.at(speed, at_rest=0.0)
     recorded = np.exp(0 * gain if gain_of_force else gain)
     known = np.isfinite(at)
     quantiles = np.full((2, len(QUANTILES)), np.nan)
     if known.sum() >= _FEWEST:
-        total = recorded * np.abs(own + other(np.where(known, at, np.nanmedian(at))))
+        total = recorded * np.abs(of_mode + other(np.where(known, at, np.nanmedian(at))))
         quantiles = np.quantile([at[known], total[known]], QUANTILES, axis=1).T
     return ResonanceDistribution(
         force=force,

@@ -6,8 +6,9 @@ import numpy as np
 from jaxtyping import Float
 
 from snrmjax.identify.modal.modal_fit import LinearModalFit
+from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.units import HERTZ
 
-_HERTZ = 2 * np.pi
 _CERTAIN = 3.0  # standard errors of a shift, without which it gives no scale
 _LARGE = 0.1  # relative shift of frequency, beyond which the shapes change too
 _STEP = 1e-7
@@ -18,7 +19,7 @@ class SquaredShapes(NamedTuple):
 
     squared: Float[np.ndarray, " mode"]
     squared_std: Float[np.ndarray, " mode"]
-    notes: tuple[str, ...]
+    notes: tuple[Fact, ...]
 
 
 def squared_shapes(
@@ -44,8 +45,8 @@ def squared_shapes(
         if shift[k] < _CERTAIN * spread[k]:
             raise ValueError(
                 f"the added mass of {mass:.4g} kg must lower the frequency of mode {k + 1}, but "
-                f"it goes from {before[k] / _HERTZ:.7g} to {after[k] / _HERTZ:.7g} Hz, "
-                f"{shift[k] / _HERTZ:.2g} ± {1.96 * spread[k] / _HERTZ:.2g} Hz (95 %) lower: take "
+                f"it goes from {before[k] / HERTZ:.7g} to {after[k] / HERTZ:.7g} Hz, "
+                f"{shift[k] / HERTZ:.2g} ± {1.96 * spread[k] / HERTZ:.2g} Hz (95 %) lower: take "
                 "a larger mass, or a place that moves more."
             )
     squared = _solved(before, after, mass)
@@ -65,13 +66,18 @@ def squared_shapes(
             variance = variance + ((other - squared) / (_STEP * values[k]) * error) ** 2
     first = 2 * shift / before / mass / squared - 1
     notes = [
-        f"mode {k + 1}: the mass of {mass:.4g} kg lowers the frequency by "
-        f"{shift[k] / _HERTZ:.4g} ± {1.96 * spread[k] / _HERTZ:.2g} Hz; the first-order formula "
-        f"would give a squared shape {100 * first[k]:+.2g} % from this one"
+        Fact(
+            "added_mass_shift",
+            mode=k + 1,
+            mass_kg=mass,
+            shift_hz=float(shift[k]) / HERTZ,
+            std_hz=float(spread[k]) / HERTZ,
+            first_order=float(first[k]),
+        )
         for k in range(len(before))
     ]
     if np.any(shift > _LARGE * before):
-        notes.append("the added mass is so large that shapes change with it: take a smaller one")
+        notes.append(Fact("added_mass_large"))
     return SquaredShapes(squared, np.sqrt(variance), tuple(notes))
 
 
@@ -91,7 +97,10 @@ def _partners(without: LinearModalFit, with_mass: LinearModalFit) -> tuple[np.nd
             f"it, but shows {len(after)}: choose the same band, or the poles by hand."
         )
     # A mass lowers each frequency, and not below the next lower one.
-    chosen = [int(np.argmin(np.where(after <= one, one - after, np.inf))) for one in before]
+    chosen = [
+        int(np.argmin(np.where(after <= frequency, frequency - after, np.inf)))
+        for frequency in before
+    ]
     if len(set(chosen)) < len(chosen):
         raise ValueError(
             "the modes of both tests cannot be paired: choose the same band, or the poles by hand."

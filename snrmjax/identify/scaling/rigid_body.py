@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from snrmjax.identify.modal.modal_fit import LinearModalFit
+from snrmjax.numerics.facts import Fact
 
 _CERTAIN = 5.0  # standard errors of a low residual
 _APART = 1.2  # ratio of the residual's mass and the stated one that is worth a note
@@ -16,7 +17,7 @@ class RigidBodyMode(NamedTuple):
 
     shape: Float[np.ndarray, " sensor"] | None
     participation: float
-    notes: tuple[str, ...]
+    notes: tuple[Fact, ...]
 
 
 def rigid_body_mode(
@@ -24,7 +25,7 @@ def rigid_body_mode(
     gain: float,
     free: float | None,
     drive: tuple[int, float] | None,
-    scaled_by: str,
+    scaled_by: Fact,
 ) -> RigidBodyMode:
     """What the low residuals, or the stated mass of a free structure, say of its rigid motion.
 
@@ -36,43 +37,36 @@ def rigid_body_mode(
     """
     lower, std = fit.lower / gain, fit.lower_std / abs(gain)
     at, sign = drive or (0, 1.0)
-    own = own_std = np.nan
+    residual = residual_std = np.nan
     if drive is not None and std[at] > 0:
-        own, own_std = sign * lower[at], std[at]
-    shows = own < -_CERTAIN * own_std
+        residual, residual_std = sign * lower[at], std[at]
+    shows = residual < -_CERTAIN * residual_std
     if free is None:
-        note = (
-            f"the low residual at the drive point is that of a free mass of {-1 / own:.4g} kg or "
-            "of modes below the band: it is written as a rigid-body mode where the structure is "
-            "said to be free"
-        )
-        return RigidBodyMode(None, 0.0, (note,) if shows else ())
+        note = (Fact("low_residual_of_free_mass", mass_kg=float(-1 / residual)),) if shows else ()
+        return RigidBodyMode(None, 0.0, note)
     if free < 0 or not np.isfinite(free):
         raise ValueError(f"the mass of a free structure must be positive (kg), but is {free:g}.")
     if free > 0:
         ones = np.full(len(fit.sensors), free**-0.5)
         if not shows:
-            note = "the rigid-body mode is that of the stated mass alone"
-            return RigidBodyMode(ones, free**-0.5, (note,))
-        ratio = -1 / own / free
-        said = f"the low residual at the drive point is that of {-1 / own:.4g} kg"
-        if not 1 / _APART < ratio < _APART:
-            said += (
-                f", {ratio:.2g} times the stated mass: the force acts off the centre of mass, or "
-                "the suspension's modes or missed modes are in it"
-            )
+            return RigidBodyMode(ones, free**-0.5, (Fact("rigid_body_of_stated_mass"),))
+        ratio = float(-1 / residual / free)
+        off = not 1 / _APART < ratio < _APART
+        note = (Fact("low_residual_of_mass", mass_kg=ratio * free, ratio=ratio, off=off),)
         signs = np.sign(lower) * np.sign(lower[at])
         ones = ones * np.where(signs == 0, 1.0, signs) * sign
-        return RigidBodyMode(ones, free**-0.5, (said,))
+        return RigidBodyMode(ones, free**-0.5, note)
     if not shows:
-        what = "is not known" if np.isnan(own) else f"is {own:.3g} ± {1.96 * own_std:.2g} 1/kg"
+        what = (
+            "is not known"
+            if np.isnan(residual)
+            else f"is {residual:.3g} ± {1.96 * residual_std:.2g} 1/kg"
+        )
         raise ValueError(
             f"a free structure answers −1/(m Ω²) at low frequency, but the low residual at the "
             f"drive point {what}: state its mass, or do not call it free."
         )
-    participation = float(np.sqrt(-own))
-    note = (
-        f"rigid-body mode from the low residuals ({scaled_by}): the force feels {-1 / own:.4g} ± "
-        f"{1.96 * own_std / own**2:.2g} kg"
-    )
-    return RigidBodyMode(-lower / participation, participation, (note,))
+    participation = float(np.sqrt(-residual))
+    mass = {"mass_kg": float(-1 / residual), "std_kg": float(residual_std / residual**2)}
+    note = (Fact("rigid_body_of_residuals", **mass, scaled_by=scaled_by),)
+    return RigidBodyMode(-lower / participation, participation, note)

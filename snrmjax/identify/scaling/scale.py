@@ -11,17 +11,10 @@ from snrmjax.identify.modal.modal_fit import LinearModalFit
 from snrmjax.identify.scaling.added_mass import squared_shapes
 from snrmjax.identify.scaling.rigid_body import rigid_body_mode
 from snrmjax.identify.scaling.scaled_modes import ScaledModes
+from snrmjax.numerics.facts import Fact
 
 _PER = {"force": "N", "voltage": "V", "acceleration": "m/s²"}
 _CERTAIN = 3.0  # standard errors of a drive point's residue, without which it gives no scale
-_NOT_SCALED = (
-    "shapes and participations are not mass-normalised: only frequencies, damping ratios and "
-    "ratios of a shape hold; the gain of the force must be free in what follows"
-)
-_PER_VOLT = (
-    "participations are per volt: states with `drive_v` and the gain of the force in newtons per "
-    "volt free, or fixed to one, fit this model"
-)
 _DRIVE_NAMES = ("drive_point", "drive point", "driving_point", "driving point")
 
 
@@ -32,8 +25,8 @@ class _Scaled(NamedTuple):
     relative_std: Float[np.ndarray, " mode"]  # of it, beside the residues' errors
     by_residues: Float[np.ndarray, "mode sensor"]  # d ln p / d residue
     keep: Bool[np.ndarray, " mode"]
-    by: str
-    notes: tuple[str, ...]
+    by: Fact
+    notes: tuple[Fact, ...]
     # An error of response over force enters ln φ with this exponent and ln p with the rest.
     exponent: float
 
@@ -57,45 +50,45 @@ class DrivePoint(NamedTuple):
                 "shape."
             )
         d, sign = self._place(fit)
-        own = sign * residue[d]
+        drive_residue = sign * residue[d]
         std = fit.residue_std[d] * np.abs(residue[d] / fit.residue[d])
-        sure = np.abs(own) > _CERTAIN * std
+        sure = np.abs(drive_residue) > _CERTAIN * std
         hertz = fit.natural_frequency / 2 / np.pi
-        if np.all(own[sure] < 0) and sure.any():
+        if np.all(drive_residue[sure] < 0) and sure.any():
             raise ValueError(
                 f"the residues at the drive point {fit.sensor_names[d]} are negative "
-                f"({own[sure][0]:.4g} 1/kg at {hertz[sure][0]:.6g} Hz): sensor and force point "
-                "against one another; say that the sensor is turned, or change a sign."
+                f"({drive_residue[sure][0]:.4g} 1/kg at {hertz[sure][0]:.6g} Hz): sensor and force "
+                "point against one another; say that the sensor is turned, or change a sign."
             )
-        keep = sure & (own > 0)
+        keep = sure & (drive_residue > 0)
         if not keep.any():
             raise ValueError(
                 f"the residues at the drive point {fit.sensor_names[d]} are within three standard "
                 "errors of zero: it lies at a node of all modes and gives no scale."
             )
+        left_out = np.stack([hertz, drive_residue, std], axis=1)[~keep].tolist()
         notes = tuple(
-            f"mode at {hertz[k]:.6g} Hz left out: its residue at the drive point is {own[k]:.3g} ± "
-            f"{1.96 * std[k]:.2g} 1/kg (95 %), from which no shape follows"
-            for k in np.flatnonzero(~keep)
+            Fact("mode_not_scaled", frequency_hz=at, residue=value, std=spread)
+            for at, value, spread in left_out
         )
-        participation = np.sqrt(np.where(keep, own, 1.0))
-        by = f"scaled by the drive point {fit.sensor_names[d]}"
+        participation = np.sqrt(np.where(keep, drive_residue, 1.0))
+        by = Fact("scaled_by_drive_point", sensor=fit.sensor_names[d])
         slopes = 0.5 * _by_one(residue, d)
-        return _Scaled(participation, np.zeros(len(own)), slopes, keep, by, notes, 0.5)
+        return _Scaled(participation, np.zeros(len(drive_residue)), slopes, keep, by, notes, 0.5)
 
     def _place(self, fit: LinearModalFit) -> tuple[int, float]:
         """The sensor's number, and its sign against the force."""
         sign = -1.0 if self.turned else 1.0
         if self.sensor is not None:
             return fit.sensor_number(self.sensor), sign
-        found = _drive_point_of(fit)
-        if found is None:
+        place = _drive_point_of(fit)
+        if place is None:
             raise ValueError(
                 "the shapes cannot be mass-normalised: no sensor is at the force "
                 f"{fit.reference.name} (point and axis of {', '.join(fit.sensor_names)} say none), "
                 "and no added mass, sensor masses or known shape was given."
             )
-        return found[0], sign * found[1]
+        return place[0], sign * place[1]
 
 
 class AddedMassTest(NamedTuple):
@@ -109,15 +102,15 @@ class AddedMassTest(NamedTuple):
     def scaled(self, fit: LinearModalFit, residue: Float[np.ndarray, "sensor mode"]) -> _Scaled:
         """p = A/φ with φ from the shift of the frequencies."""
         place = fit.sensor_number(self.sensor)
-        found = squared_shapes(fit, self.with_mass, self.mass, self.mass_std)
-        shape = np.sqrt(found.squared)
+        squares = squared_shapes(fit, self.with_mass, self.mass, self.mass_std)
+        shape = np.sqrt(squares.squared)
         return _Scaled(
             residue[place] / shape,
-            0.5 * found.squared_std / found.squared,
+            0.5 * squares.squared_std / squares.squared,
             _by_one(residue, place),
             np.ones(len(shape), dtype=bool),
-            f"scaled by an added mass of {self.mass:.4g} kg at {self.sensor}",
-            found.notes,
+            Fact("scaled_by_added_mass", mass_kg=self.mass, sensor=self.sensor),
+            squares.notes,
             0.0,
         )
 
@@ -166,16 +159,16 @@ class SensorMasses(NamedTuple):
                 "turned, or the responses are absolute where relative ones were said."
             )
         size = np.sqrt(-total / fixture)
-        note = f"the forced fixture of {fixture:.4g} kg moves as the sensors' masses balance it"
+        note = Fact("forced_fixture", mass_kg=fixture)
         if base:
-            listed = ", ".join(f"{value:.4g}" for value in -total)
-            note = f"effective masses: {listed} kg by modes, of {mass.sum():.4g} kg at the sensors"
+            masses = tuple((-total).tolist())
+            note = Fact("effective_masses", masses_kg=masses, at_sensors_kg=float(mass.sum()))
         return _Scaled(
             -size if base else size,
             np.zeros(len(size)),
             0.5 * mass[None] / total[:, None],
             np.ones(len(size), dtype=bool),
-            "scaled by the masses at the sensors",
+            Fact("scaled_by_sensor_masses"),
             (note,),
             0.5,
         )
@@ -196,13 +189,13 @@ class KnownShape(NamedTuple):
                 f"the known shape at {self.sensor} must be finite and not zero, but is "
                 f"{self.value:g}."
             )
-        note = f"the shape {self.value:.6g} at {self.sensor} was taken for every mode"
+        note = Fact("shape_for_all_modes", value=self.value, sensor=self.sensor)
         return _Scaled(
             residue[place] / self.value,
             np.full(n, abs(self.std / self.value)),
             _by_one(residue, place),
             np.ones(n, dtype=bool),
-            f"scaled by the shape stated at {self.sensor}",
+            Fact("scaled_by_known_shape", sensor=self.sensor),
             () if n == 1 else (note,),
             0.0,
         )
@@ -279,7 +272,7 @@ def scale_modes(
         *(_drive_point_of(fit), scaled.by),
     )
     per = "N" if gain != 1.0 else per
-    volts = (_PER_VOLT,) if per == "V" else ()
+    volts = (Fact("participations_per_volt"),) if per == "V" else ()
     return ScaledModes(
         natural_frequency=fit.natural_frequency[keep],
         natural_frequency_std=fit.natural_frequency_std[keep],
@@ -318,19 +311,19 @@ def _shapes(
 
 
 def _unscaled(
-    found: LinearModalFit | DecayModes,
+    modes: LinearModalFit | DecayModes,
     shape: np.ndarray,
     shape_std: np.ndarray,
     participation: np.ndarray,
     per: str,
 ) -> ScaledModes:
     """Modes with relative shapes: nothing gives their scale."""
-    unknown = np.full(found.n_modes, np.nan)
+    unknown = np.full(modes.n_modes, np.nan)
     return ScaledModes(
-        natural_frequency=found.natural_frequency,
-        natural_frequency_std=found.natural_frequency_std,
-        damping_ratio=found.damping_ratio,
-        damping_ratio_std=found.damping_ratio_std,
+        natural_frequency=modes.natural_frequency,
+        natural_frequency_std=modes.natural_frequency_std,
+        damping_ratio=modes.damping_ratio,
+        damping_ratio_std=modes.damping_ratio_std,
         shape=shape,
         shape_std=shape_std,
         participation=participation,
@@ -338,21 +331,21 @@ def _unscaled(
         modal_mass_std=unknown,
         rigid_shape=None,
         rigid_participation=0.0,
-        sensors=found.sensor_names,
-        scaled_by="not scaled",
+        sensors=modes.sensor_names,
+        scaled_by=Fact("not_scaled"),
         per=per,
         mass_normalised=False,
-        notes=(*found.notes, _NOT_SCALED),
+        notes=(*modes.notes, Fact("shapes_not_scaled")),
     )
 
 
 def _drive_point_of(fit: LinearModalFit) -> tuple[int, float] | None:
     """The sensor at the force, by point and axis or by a name that says so, and its sign."""
     point, way = fit.reference.point, fit.reference.direction
-    for k, one in enumerate(fit.sensors):
-        same_axis = one.direction.lstrip("+-") == way.lstrip("+-")
-        if point and one.point == point and same_axis:
-            return k, 1.0 if one.direction.startswith("-") == way.startswith("-") else -1.0
+    for k, sensor in enumerate(fit.sensors):
+        same_axis = sensor.direction.lstrip("+-") == way.lstrip("+-")
+        if point and sensor.point == point and same_axis:
+            return k, 1.0 if sensor.direction.startswith("-") == way.startswith("-") else -1.0
     named = [k for k, name in enumerate(fit.sensor_names) if name.lower() in _DRIVE_NAMES]
     return (named[0], 1.0) if named else None
 

@@ -7,9 +7,10 @@ import numpy as np
 from jaxtyping import Float
 
 from snrmjax.model.modes import LinearModes, LinearModesStd, RigidBodyModes, linear_modes
-from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
+from snrmjax.numerics.units import HERTZ
 
-_HERTZ = 2 * np.pi
 _WIDE = 1.96  # standard deviations of a 95 % band
 
 
@@ -23,22 +24,23 @@ class ScaledModes(AbstractResult):
 
     coordinates: ClassVar[tuple[str, ...]] = ("mode", "sensor")
 
-    natural_frequency: Float[np.ndarray, " mode"]  # rad/s
-    natural_frequency_std: Float[np.ndarray, " mode"]
-    damping_ratio: Float[np.ndarray, " mode"]
-    damping_ratio_std: Float[np.ndarray, " mode"]
+    natural_frequency: Float[np.ndarray, " mode"] = quantity("mode", "Hz", "natural frequency")
+    natural_frequency_std: Float[np.ndarray, " mode"] = quantity("mode", "Hz", "its 1σ")
+    damping_ratio: Float[np.ndarray, " mode"] = quantity("mode", "1", "damping ratio")
+    damping_ratio_std: Float[np.ndarray, " mode"] = quantity("mode", "1", "its 1σ")
     shape: Float[np.ndarray, "sensor mode"]  # kg^-1/2
     shape_std: Float[np.ndarray, "sensor mode"]
     participation: Float[np.ndarray, " mode"]  # kg^-1/2 per `per`
     participation_std: Float[np.ndarray, " mode"]
-    modal_mass_std: Float[np.ndarray, " mode"]  # relative, of shape times participation
+    # Of shape times participation.
+    modal_mass_std: Float[np.ndarray, " mode"] = quantity("mode", "1", "relative 1σ of modal mass")
     rigid_shape: Float[np.ndarray, " sensor"] | None  # kg^-1/2; None: no rigid-body mode
     rigid_participation: float
-    sensors: tuple[str, ...] = eqx.field(static=True)
-    scaled_by: str = eqx.field(static=True)
-    per: str = eqx.field(static=True, default="N")
+    sensors: tuple[str, ...] = quantity("sensor", "", "sensor", name="sensor", static=True)
+    scaled_by: Fact = setting()
+    per: str = setting(default="N")
     mass_normalised: bool = eqx.field(static=True, default=True)
-    notes: tuple[str, ...] = eqx.field(static=True, default=())
+    notes: tuple[Fact | str, ...] = setting(default=())
 
     @property
     def n_modes(self) -> int:
@@ -83,8 +85,8 @@ class ScaledModes(AbstractResult):
         for k in range(self.n_modes):
             top = int(np.argmax(np.abs(self.shape[:, k])))
             lines.append(
-                f"mode {k + 1}: {self.natural_frequency[k] / _HERTZ:.7g} ± "
-                f"{_WIDE * self.natural_frequency_std[k] / _HERTZ:.2g} Hz, damping "
+                f"mode {k + 1}: {self.natural_frequency[k] / HERTZ:.7g} ± "
+                f"{_WIDE * self.natural_frequency_std[k] / HERTZ:.2g} Hz, damping "
                 f"{100 * self.damping_ratio[k]:.4g} ± "
                 f"{_WIDE * 100 * self.damping_ratio_std[k]:.2g} %, shape "
                 f"{self.shape[top, k]:.5g} at {self.sensors[top]}, participation "
@@ -93,29 +95,14 @@ class ScaledModes(AbstractResult):
         return (*lines, *(f"note: {note}" for note in self.notes))
 
     def variables(self) -> dict[str, Variable]:
-        """See `AbstractResult`."""
+        """Those of the fields, with shapes and participations in the unit of their scale."""
         mode, both = ("mode",), ("sensor", "mode")
-        mass = "kg^-1/2" if self.mass_normalised else "1"
+        unit, driven = "kg^-1/2" if self.mass_normalised else "1", f"participation per {self.per}"
         return {
             "mode": Variable(mode, np.arange(1, self.n_modes + 1), "1", "mode"),
-            "sensor": Variable(("sensor",), np.array(self.sensors), "", "sensor"),
-            "natural_frequency_hz": Variable(
-                mode, self.natural_frequency / _HERTZ, "Hz", "natural frequency"
-            ),
-            "natural_frequency_std_hz": Variable(
-                mode, self.natural_frequency_std / _HERTZ, "Hz", "its 1σ"
-            ),
-            "damping_ratio": Variable(mode, self.damping_ratio, "1", "damping ratio"),
-            "damping_ratio_std": Variable(mode, self.damping_ratio_std, "1", "its 1σ"),
-            "participation": Variable(
-                mode, self.participation, mass, f"participation per {self.per}"
-            ),
-            "participation_std": Variable(mode, self.participation_std, mass, "its 1σ"),
-            "modal_mass_std": Variable(mode, self.modal_mass_std, "1", "relative 1σ of modal mass"),
-            "shape": Variable(both, self.shape, mass, "mode shape"),
-            "shape_std": Variable(both, self.shape_std, mass, "its 1σ"),
+            **super().variables(),
+            "participation": Variable(mode, self.participation, unit, driven),
+            "participation_std": Variable(mode, self.participation_std, unit, "its 1σ"),
+            "shape": Variable(both, self.shape, unit, "mode shape"),
+            "shape_std": Variable(both, self.shape_std, unit, "its 1σ"),
         }
-
-    def attributes(self) -> dict[str, str | float | int]:
-        """See `AbstractResult`."""
-        return {"scaled_by": self.scaled_by, "per": self.per, "notes": "\n".join(self.notes)}

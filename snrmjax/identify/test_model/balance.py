@@ -76,8 +76,8 @@ class Balance(NamedTuple):
         """ln of the forcing frequency over the natural one that the record itself has."""
         states = self.states
         z = 1j * states.frequency * states.constant * states.force / states.velocity
-        own = np.maximum(1 + z.real / states.frequency**2, _SOFTEST)
-        return -0.5 * np.log(own)
+        natural = np.maximum(1 + z.real / states.frequency**2, _SOFTEST)
+        return -0.5 * np.log(natural)
 
     def stiffer(self, unknowns: np.ndarray, errors: np.ndarray) -> Float[np.ndarray, " state"]:
         """Relative deviations of the stiffness: of levels, along a trend, and of states whose own
@@ -155,15 +155,15 @@ class Balance(NamedTuple):
         """
         states, places = self.states, self.places
         now, omega = self.at(unknowns, errors), states.frequency
-        own = now.z if first else now.model
+        z = now.z if first else now.model
         slope = 0.0 * now.slope if first else now.slope
         slopes = now._replace(slope=slope).by_error
         stiffer = self.stiffer(unknowns, errors)
         lossier = unknowns[places.levels][states.level][:, 3]
         design = np.zeros((len(omega), len(unknowns)), dtype=complex)
         design[:, MASS] = (1 + stiffer) * places.reference - omega**2
-        design[:, PHASE] = -1j * own
-        design[:, OFFSET] = -own * np.min(states.force) / now.force
+        design[:, PHASE] = -1j * z
+        design[:, OFFSET] = -z * np.min(states.force) / now.force
         design[:, TREND] = states.trend * now.stiffness
         design[:, WITH_FREQUENCY] = now.with_frequency
         (softer, faster), (k, d) = unknowns[WITH_FREQUENCY], self.units
@@ -174,14 +174,14 @@ class Balance(NamedTuple):
         design[:, places.damping] = (1j * omega * d * lossier)[:, None] * values
         if states.beside is not None:
             moved = -states.beside / self.own_velocity(unknowns)[:, None]
-            design[:, places.others] = own[:, None] * moved + slope[:, None] * moved.real
-        of_gain = own if states.force_is_free else -own - slope
-        columns = (of_gain, -1j * own, now.stiffness, now.damping)
+            design[:, places.others] = z[:, None] * moved + slope[:, None] * moved.real
+        of_gain = z if states.force_is_free else -z - slope
+        columns = (of_gain, -1j * z, now.stiffness, now.damping)
         for k, column in enumerate(columns):
-            own = places.levels[:, k]
-            design[np.arange(len(omega)), own[states.level]] = column
+            level = places.levels[:, k]
+            design[np.arange(len(omega)), level[states.level]] = column
             if apart and not states.level_std[k] > 0:
-                design[:, own] -= np.mean(design[:, own], axis=1, keepdims=True)
+                design[:, level] -= np.mean(design[:, level], axis=1, keepdims=True)
         design[:, places.beside] = self.beside
         # Residual at the record: rows − design @ unknowns, by its straight line.
         rows = now.z - now.model - np.sum(slopes * errors, axis=1) + design @ unknowns

@@ -87,11 +87,11 @@ NOISE, BENDS, LEVELS, FIRST_ALONG = 0, slice(1, 3), slice(3, 7), 7
 def hyper_at(point: np.ndarray, basis: CurveBasis) -> Hyper:
     """The hyperparameters of a point: logarithms of sizes, and how those of bends change."""
     end = FIRST_ALONG + basis.directions.shape[1]
-    noise, one, two, *levels = np.exp(point[:FIRST_ALONG]).tolist()
+    noise, first, second, *levels = np.exp(point[:FIRST_ALONG]).tolist()
     more = np.exp(point[end:]).tolist() or (0.0, 0.0)
     return Hyper(
         noise,
-        (one, two),
+        (first, second),
         (levels[0], levels[1], levels[2], levels[3]),
         point[FIRST_ALONG:end],
         (more[0], more[1]),
@@ -155,9 +155,9 @@ def prior_variances(basis: CurveBasis, places: Places, states: TestStates) -> Pr
     held = (states.mass_std, states.phase_std, states.offset_std, states.trend_std)
     with np.errstate(divide="ignore"):
         constant[: WITH_FREQUENCY.stop] = 2 * np.log([*held, *states.off_resonance_std])
-    for k, own in enumerate((places.stiffness, places.damping)):
-        constant[own], by = basis.log_variances()
-        slopes[own, BENDS.start + k], slopes[own, FIRST_ALONG:end] = by[:, 0], by[:, 1:]
+    for k, functions in enumerate((places.stiffness, places.damping)):
+        constant[functions], by = basis.log_variances()
+        slopes[functions, BENDS.start + k], slopes[functions, FIRST_ALONG:end] = by[:, 0], by[:, 1:]
     for k in range(4):
         slopes[places.levels[:, k], LEVELS.start + k] = 2.0
     for k in range(2 * with_more):
@@ -220,22 +220,22 @@ def sizes_of_bends(
     """The points of a grid about the likeliest: from neighbour to neighbour, while they count."""
     step, low = priors.CURVE_BENDS.spread, np.log(_STRAIGHT)
     middle, high = np.maximum(likeliest[BENDS], low), np.transpose(bounds[BENDS])[1]
-    found: dict[tuple[int, int], SizedPoint] = {}
+    sized: dict[tuple[int, int], SizedPoint] = {}
     queue = [((0, 0), likeliest)]
     while queue:
         (a, b), start = queue.pop(0)
         sizes = middle + step * np.array([a, b])
-        if (a, b) in found or np.any((sizes < low - step / 2) | (sizes > high)):
+        if (a, b) in sized or np.any((sizes < low - step / 2) | (sizes > high)):
             continue
         held, start = list(bounds), start.copy()
         start[BENDS] = np.maximum(sizes, low)
         held[BENDS] = [(size, size) for size in start[BENDS]]
         point = maximised(objective, start, held)
-        one = SizedPoint(laplace_evidence(objective, point, held), point)
-        found[a, b] = one
-        if one.log_evidence > max(each.log_evidence for each in found.values()) - _LEAST:
+        here = SizedPoint(laplace_evidence(objective, point, held), point)
+        sized[a, b] = here
+        if here.log_evidence > max(other.log_evidence for other in sized.values()) - _LEAST:
             queue += [((a + i, b + j), point) for i, j in ((1, 0), (-1, 0), (0, 1), (0, -1))]
-    return list(found.values())
+    return list(sized.values())
 
 
 def averaged(
@@ -251,8 +251,8 @@ def averaged(
     within = np.einsum("k,kij->ij", weight, np.array([one.covariance for one in each]))
     off = means - mean
     point = weight @ np.array([one.point for one in points])
-    told = float(weight @ np.array([one.told for one in each]))
-    return point, Gaussian(mean, within + (off * weight[:, None]).T @ off, told)
+    effective = float(weight @ np.array([one.told for one in each]))
+    return point, Gaussian(mean, within + (off * weight[:, None]).T @ off, effective)
 
 
 def differing_levels(

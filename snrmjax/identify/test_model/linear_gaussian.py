@@ -84,14 +84,14 @@ class LinearRows(NamedTuple):
         both *= unit[:, None]
         both, _ = dtrtrs(factor, both, lower=True, overwrite_b=True)
         arms, along = both[:, :-1], both[:, -1]
-        told = np.einsum("ij,ij->j", arms, arms)  # of every unknown by the rows: m less noise's
+        informed = np.einsum("ij,ij->j", arms, arms)  # of every unknown by the rows: m less noise's
         weighed = dtrtrs(factor, along, lower=True, trans=1)[0] * unit
         log_det = 2 * float(np.sum(np.log(np.diagonal(factor) / unit)))
         square = float(along @ along) + self.across / scale**2
         value = -0.5 * (constant - m * np.log(scale**2) + log_det + square)
         by_scale = scale**2 * float(weighed @ weighed) + self.across / scale**2
-        by_scale += float(told.sum()) - n
-        return value + self.offset, by_scale, 0.5 * ((along @ arms) ** 2 - told)
+        by_scale += float(informed.sum()) - n
+        return value + self.offset, by_scale, 0.5 * ((along @ arms) ** 2 - informed)
 
 
 Objective = Callable[[Float[np.ndarray, " hyper"]], tuple[float, Float[np.ndarray, " hyper"]]]
@@ -129,7 +129,7 @@ def maximised(
         value, slopes = objective(point)
         return -value, -slopes
 
-    found = minimize(
+    best = minimize(
         downhill,
         np.clip(start, [low for low, _ in bounds], [high for _, high in bounds]),
         jac=True,
@@ -137,4 +137,4 @@ def maximised(
         bounds=bounds,
         options={"maxiter": _STEPS, "ftol": 1e-9, "gtol": 1e-3},
     )
-    return np.asarray(found.x)
+    return np.asarray(best.x)

@@ -114,10 +114,12 @@ class TestPosterior(NamedTuple):
     def curves(self, amplitude: Float[np.ndarray, " point"]) -> CurveValues:
         """ω̃² and δ at displacement amplitudes (m), with their covariance."""
         values, by_log = self.basis.values(amplitude)
-        found, steep = (self._rows(terms) @ self.mean for terms in (values, by_log))
+        values_at, steep = (self._rows(terms) @ self.mean for terms in (values, by_log))
         rows = self.slopes(amplitude)
         covariance = np.einsum("npi,ij,nqj->npq", rows, self.covariance, rows)
-        return CurveValues(found[:, 0] + self.places.reference, found[:, 1], covariance, steep)
+        return CurveValues(
+            values_at[:, 0] + self.places.reference, values_at[:, 1], covariance, steep
+        )
 
     def slopes(self, amplitude: Float[np.ndarray, " point"]) -> Float[np.ndarray, "point two n"]:
         """Derivatives of ω̃² and δ at displacement amplitudes (m) by all unknowns."""
@@ -129,8 +131,8 @@ class TestPosterior(NamedTuple):
         """Curves of these functions by the unknowns, at their modal mass."""
         rows = np.zeros((len(terms), 2, len(self.mean)))
         both = zip((self.places.stiffness, self.places.damping), self.units, strict=True)
-        for k, (own, unit) in enumerate(both):
-            rows[:, k, own] = unit * terms / (1 + self.mean[MASS])
+        for k, (functions, unit) in enumerate(both):
+            rows[:, k, functions] = unit * terms / (1 + self.mean[MASS])
         return rows
 
 
@@ -172,13 +174,13 @@ def fit_test(
     beside = np.zeros((n, 2 * ALONG * discrepancy), dtype=complex)
     balance = Balance(states, basis, places, units, np.ones(n), beside)
     walk = likeliest_walk(balance, rounds, robust=robust, tempered=tempered)
-    found = walk.found
-    if found is None:
+    reached = walk.found
+    if reached is None:
         raise ValueError(f"`rounds.most` must be at least one, not {rounds.most}.")
     # The size of what few levels differ by is not well known: as Student's t has it. What they have
     # in common may be anything of that size.
-    last = walk.balance.straight(found.mean, found.errors, apart=False)
-    equations = last.equations._replace(share=found.equations.share)
+    last = walk.balance.straight(reached.mean, reached.errors, apart=False)
+    equations = last.equations._replace(share=reached.equations.share)
 
     variances = prior_variances(basis, places, states)
 
@@ -186,49 +188,45 @@ def fit_test(
         noise, variance = np.exp(point[NOISE]), variances(point)
         mean, covariance = equations.posterior(noise, variance)
         known = variance > 0
-        told = np.zeros_like(variance)  # curves take what they can of levels' errors
-        told[known] = 1 - np.diag(covariance)[known] / variance[known]
-        for own, std in zip(places.levels.T, states.level_std, strict=True):
-            variance[own] *= 1.0 if std > 0 else students_factor(float(np.sum(told[own]))) ** 2
+        informed = np.zeros_like(variance)  # curves take what they can of levels' errors
+        informed[known] = 1 - np.diag(covariance)[known] / variance[known]
+        for errors_of_kind, std in zip(places.levels.T, states.level_std, strict=True):
+            variance[errors_of_kind] *= (
+                1.0 if std > 0 else students_factor(float(np.sum(informed[errors_of_kind]))) ** 2
+            )
         wide = equations.posterior(noise, variance)[1]
-        return Gaussian(mean, wide, float(np.sum(told)))
+        return Gaussian(mean, wide, float(np.sum(informed)))
 
-    objective = objective_of(found.equations, states, basis, places)
-    bounds = bounds_of(states, basis, found.point)
-    point, said = found.point, gaussian(found.point)
+    objective = objective_of(reached.equations, states, basis, places)
+    bounds = bounds_of(states, basis, reached.point)
+    point, summary = reached.point, gaussian(reached.point)
     if over_sizes:
-        sized = sizes_of_bends(objective, found.point, bounds)
-        point, said = averaged(sized, gaussian)
-    flat = objective_of(found.equations, states, basis, places, flat=True)
+        sized = sizes_of_bends(objective, reached.point, bounds)
+        point, summary = averaged(sized, gaussian)
+    flat = objective_of(reached.equations, states, basis, places, flat=True)
     return TestPosterior(
         states,
         basis,
         units,
-        said.mean,
-        said.covariance,
+        summary.mean,
+        summary.covariance,
         hyper_at(point, basis),
-        laplace_evidence(objective, found.point, bounds),
-        found.errors,
-        found.residuals * np.exp(found.point[NOISE] - point[NOISE]),
+        laplace_evidence(objective, reached.point, bounds),
+        reached.errors,
+        reached.residuals * np.exp(reached.point[NOISE] - point[NOISE]),
         last.arms_of_stiffness,
-        said.told,
+        summary.told,
         places,
-        differing_levels(flat, found.point, bounds, states) if compare_levels else (False,) * 4,
+        differing_levels(flat, reached.point, bounds, states) if compare_levels else (False,) * 4,
         walk.balance.weight,
-        found.equations.share,
+        reached.equations.share,
         walk.still,
     )
 
 
-def few_levels_factor(n_levels: int) -> float:
-    """By how much a 95 % band is wider whose 1σ had to be found from so few levels.
-
-    Student's t over the normal. Two levels count as three: with t of one degree no band would be of
-    use.
-    """
-    return students_factor(n_levels - 1)
-
-
 def students_factor(freedom: float) -> float:
-    """By how much a 95 % band is wider whose 1σ was found with so many degrees of freedom."""
+    """By how much a 95 % band is wider whose 1σ was found with so many degrees of freedom.
+
+    Student's t over the normal. One counts as two: with t of one no band would be of use.
+    """
     return float(stdtrit(max(freedom, 2), 0.975) / ndtri(0.975))

@@ -57,17 +57,17 @@ class JointDensity(NamedTuple):
         """Of one density a number; None says nothing."""
         normal, half = [], []
         constant = 0.0
-        for place, one in enumerate(densities):
-            if isinstance(one, HalfNormalSize):
-                half.append((place, np.log(one.scale)))
+        for place, density in enumerate(densities):
+            if isinstance(density, HalfNormalSize):
+                half.append((place, np.log(density.scale)))
                 constant += np.log(2) - _LOG_ROOT
-            elif isinstance(one, FlatSize):
-                constant -= np.log(one.high - one.low)
-            elif one is not None:
+            elif isinstance(density, FlatSize):
+                constant -= np.log(density.high - density.low)
+            elif density is not None:
                 pair = (
-                    (np.log(one.median), one.spread)
-                    if isinstance(one, LogNormalSize)
-                    else (0.0, one.std)
+                    (np.log(density.median), density.spread)
+                    if isinstance(density, LogNormalSize)
+                    else (0.0, density.std)
                 )
                 normal.append((place, *pair))
                 constant -= np.log(pair[1]) + _LOG_ROOT

@@ -162,8 +162,8 @@ class Walk:
         along = slice(FIRST_ALONG, FIRST_ALONG + basis.directions.shape[1])
         if k == 0:  # no level differs from another yet, and bends are of one size
             bounds[LEVELS] = [
-                own if self.apart and kind == _STIFFNESS else (own[0], own[0])
-                for kind, own in enumerate(bounds[LEVELS])
+                bound if self.apart and kind == _STIFFNESS else (bound[0], bound[0])
+                for kind, bound in enumerate(bounds[LEVELS])
             ]
             bounds[along] = [(0.0, 0.0)] * (along.stop - along.start)
         if k < _SETTLED and self.straight:
@@ -194,8 +194,8 @@ class Walk:
         self.point, self.mean, self.errors = point, moved.unknowns, moved.errors
         self.turn += 1
         if self.tempered:
-            told = share_told_by(left, states.level, states.frequency)
-            self.share = max(told, priors.LEAST_SHARE)
+            share = share_told_by(left, states.level, states.frequency)
+            self.share = max(share, priors.LEAST_SHARE)
         if self.robust:
             square = np.sum(left**2, axis=1) / noise**2
             weight = (priors.STUDENT_FREEDOM + 2) / (priors.STUDENT_FREEDOM + square)
@@ -221,25 +221,25 @@ def _step(
 ) -> _Moved:
     """Towards the goal of the straight problem as far as the true one agrees; all of it if free."""
 
-    def cost(unknowns: np.ndarray, own: np.ndarray) -> float:
-        if not np.all(np.isfinite(own)):
+    def cost(unknowns: np.ndarray, nearest: np.ndarray) -> float:
+        if not np.all(np.isfinite(nearest)):
             return np.inf
         bound = variance > 0
         prior = float(np.sum(unknowns[bound] ** 2 / variance[bound]))
-        return balance.misfit(unknowns, own) / noise**2 + prior
+        return balance.misfit(unknowns, nearest) / noise**2 + prior
 
     if free:
-        own = balance.nearest_errors(goal, errors)
+        nearest = balance.nearest_errors(goal, errors)
         # Where phasors are no mode's the way may be lost.
-        return _Moved(goal, own) if np.all(np.isfinite(own)) else _Moved(mean, errors)
+        return _Moved(goal, nearest) if np.all(np.isfinite(nearest)) else _Moved(mean, errors)
     before = cost(mean, balance.nearest_errors(mean, errors))
     share, best = 1.0, (np.inf, mean, errors)
     while share > _SHORTEST:
         unknowns = mean + share * (goal - mean)
-        own = balance.nearest_errors(unknowns, errors)
-        value = cost(unknowns, own)
+        nearest = balance.nearest_errors(unknowns, errors)
+        value = cost(unknowns, nearest)
         if np.isfinite(value) and value < best[0]:
-            best = (value, unknowns, own)
+            best = (value, unknowns, nearest)
         if value <= before:
             break
         share *= 0.5

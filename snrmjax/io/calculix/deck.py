@@ -7,7 +7,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from snrmjax.io.calculix.blocks import Block, Line, read_blocks
-from snrmjax.io.calculix.flatten import flattened
 from snrmjax.io.files import FilePath, file_name, shown
 
 # CalculiX reads a coordinate from this many characters and drops the rest without a word.
@@ -24,6 +23,8 @@ _REFUSED = {
     "TRANSFORM": "displacements in local systems cannot be read back; write the supports in "
     "global directions or with *EQUATION",
     "USER ELEMENT": "user elements are linear",
+    "PART": "CalculiX reads no parts and assemblies; in Abaqus/CAE choose `Do not use parts and "
+    "assemblies in input files`",
 }
 # What steps say that changes nothing about the structure, and need not be said to be left out.
 _QUIET = {
@@ -54,13 +55,13 @@ class Deck(eqx.Module):
 
     def node_index(self, number: int) -> int:
         """Row of a node in `nodes`. Raises `ValueError` where no element has it."""
-        found = np.flatnonzero(self.nodes == number)
-        if not len(found):
+        rows = np.flatnonzero(self.nodes == number)
+        if not len(rows):
             raise ValueError(
                 f"{self.name} has no element with node {number} (nodes {self.nodes[0]} to "
                 f"{self.nodes[-1]})."
             )
-        return int(found[0])
+        return int(rows[0])
 
     def nearest_node(self, point: tuple[float, float, float]) -> int:
         """The number of the node next to a point (m)."""
@@ -69,17 +70,16 @@ class Deck(eqx.Module):
 
 
 def read_deck(path: FilePath) -> Deck:
-    """Read a CalculiX (or Abaqus) input deck with beam, shell or solid elements.
+    """Read a CalculiX input deck (or one of Abaqus without parts) of beams, shells or solids.
 
-    Keywords that are not known here are kept as they stand. *INCLUDE files are read in their
-    place; one part with one instance is written flat.
+    Keywords that are not known here are kept as they stand, *INCLUDE files read in their place.
 
     Arguments: `path` of the deck. Returns the `Deck`. Raises `ValueError`, with file and line, for
     what a condensation cannot use: no mesh, an element or a support with a missing node, a
     prescribed displacement, a material without density or elastic law, plasticity and other
     materials with losses, contact, local coordinate systems.
     """
-    blocks = flattened(read_blocks(path))
+    blocks = read_blocks(path)
     name = file_name(path)
     model, supports, left_out = _split(blocks)
     nodes = _nodes(model, name)
@@ -125,20 +125,20 @@ def _small_displacements(blocks: list[Block]) -> bool:
 
 def _thickness(blocks: list[Block], coordinates: Float[np.ndarray, "node 3"]) -> float:
     """The smallest dimension of shell and beam sections, or of the mesh where it has neither."""
-    found = []
+    dimensions = []
     for block in blocks:
         beam = block.keyword == "BEAM SECTION"
         if (beam or block.keyword == "SHELL SECTION") and block.data:
             line = block.data[0]
             entries = line.entries[: 2 if beam else 1]
-            found += [_number(line, entry, "a dimension") for entry in entries if entry]
-            if found[-1:] and not min(found) > 0:
+            dimensions += [_number(line, entry, "a dimension") for entry in entries if entry]
+            if dimensions[-1:] and not min(dimensions) > 0:
                 raise ValueError(
                     f"{line.place}: dimensions of a section must be positive, but one is "
-                    f"{min(found):g}."
+                    f"{min(dimensions):g}."
                 )
-    if found:
-        return min(found)
+    if dimensions:
+        return min(dimensions)
     spans = np.ptp(coordinates, axis=0)
     return float(np.min(spans[spans > 0], initial=np.inf)) if np.any(spans > 0) else 1.0
 

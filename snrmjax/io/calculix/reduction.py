@@ -12,6 +12,7 @@ from snrmjax.io.calculix.modes import DeckModes, modes_of_deck
 from snrmjax.io.calculix.static import STEP_OF_CASES, run_static_cases
 from snrmjax.io.files import FilePath
 from snrmjax.io.reduction.source import ASSUMED_DAMPING, ReductionSource, ShapeLines
+from snrmjax.numerics.facts import Fact
 
 Place = tuple[int, str]
 """A node's number and a direction, "x", "y" or "z"."""
@@ -67,24 +68,14 @@ def read_deck_source(
     )
 
 
-def _notes(deck: Deck, drive: Place, *, forced: bool) -> tuple[str, ...]:
-    notes = [f"no damping is stated: {ASSUMED_DAMPING:g} is taken for every mode"]
+def _notes(deck: Deck, drive: Place, *, forced: bool) -> tuple[Fact, ...]:
+    notes = [Fact("damping_assumed", ratio=ASSUMED_DAMPING)]
     if not forced:
-        notes.append(
-            f"the model is driven and observed at node {drive[0]} in {drive[1]}, where its first "
-            "mode is largest"
-        )
+        notes.append(Fact("driven_at_largest", node=drive[0], direction=drive[1]))
     if deck.small_displacements:
-        notes.append(
-            "no step of the deck has NLGEOM, without which it would be linear: the load cases ran "
-            f"with large displacements, as `{STEP_OF_CASES}` in place of the deck's steps"
-        )
+        notes.append(Fact("large_displacements_taken", step=STEP_OF_CASES))
     if deck.left_out:
-        notes.append(
-            "loads of the deck are left out ("
-            + ", ".join(f"*{word}" for word in deck.left_out)
-            + "): the model is that of the unloaded structure"
-        )
+        notes.append(Fact("loads_left_out", keywords=deck.left_out))
     return tuple(notes)
 
 

@@ -51,14 +51,14 @@ def eigenvalues(text: str) -> Float[np.ndarray, " mode"]:
     begin = text.find("E I G E N V A L U E   O U T P U T")
     if begin < 0:
         return np.zeros(0)
-    found: list[float] = []
+    squares: list[float] = []
     for line in text[begin:].splitlines()[1:]:
         row = _EIGENVALUE.match(line)
-        if row and int(row[1]) == len(found) + 1:
-            found.append(float(row[2]))
-        elif found and line.strip():
+        if row and int(row[1]) == len(squares) + 1:
+            squares.append(float(row[2]))
+        elif squares and line.strip():
             break
-    return np.array(found)
+    return np.array(squares)
 
 
 def last_energy(text: str) -> float | None:
@@ -72,5 +72,5 @@ def last_energy(text: str) -> float | None:
 
 def first_error(log: str) -> str:
     """The first *ERROR of CalculiX's log on one line, or an empty text."""
-    found = _ERROR.search(log)
-    return " ".join(found[0].split()) if found else ""
+    match = _ERROR.search(log)
+    return " ".join(match[0].split()) if match else ""

@@ -28,10 +28,10 @@ def write_netcdf(path: FilePath, record: TimeRecording) -> None:
     width = len(record.channels)
     words = {
         "channels": record.channel_names,
-        "quantity": [one.quantity for one in record.channels],
-        "unit": [one.si_unit for one in record.channels],
-        "point": [one.point for one in record.channels],
-        "direction": [one.direction for one in record.channels],
+        "quantity": [channel.quantity for channel in record.channels],
+        "unit": [channel.si_unit for channel in record.channels],
+        "point": [channel.point for channel in record.channels],
+        "direction": [channel.direction for channel in record.channels],
     }
     numbers = {"sampling_rate_hz": record.sampling_rate, "start_time_s": record.start_time}
     with written_whole(path) as new, h5netcdf.File(new, "w") as target:
@@ -47,7 +47,7 @@ def write_netcdf(path: FilePath, record: TimeRecording) -> None:
             values[:, block.start : block.start + block.values.shape[1]] = block.values
 
 
-def write_import(folder: Path, found: Imported, files: Sequence[str] = ()) -> list[str]:
+def write_import(folder: Path, imported: Imported, files: Sequence[str] = ()) -> list[str]:
     """Write `measured.csv` (or `record.csv`, `record_2.csv`, …, or `.nc` of long ones), `map.toml`.
 
     Records have the columns `time_s`, `force_n` or `drive_v`, and one motion a sensor
@@ -55,22 +55,24 @@ def write_import(folder: Path, found: Imported, files: Sequence[str] = ()) -> li
     Returns the names of the files.
     """
     written = []
-    if found.states is not None:
-        write_steady_states(folder / "measured.csv", found.states)
+    if imported.states is not None:
+        write_steady_states(folder / "measured.csv", imported.states)
         written.append("measured.csv")
-    for k, record in enumerate(found.records):
+    for k, record in enumerate(imported.records):
         stem = "record" if k == 0 else f"record_{k + 1}"
-        columns = record_columns(record, found.used)
+        columns = record_columns(record, imported.used)
         if record.n_samples * len(columns) > _MOST_ROWS:
             write_netcdf(folder / f"{stem}.nc", record)
             written.append(f"{stem}.nc")
             continue
-        values = np.vstack([record.time(), record.values([one.name for one in columns.values()])])
+        values = np.vstack(
+            [record.time(), record.values([channel.name for channel in columns.values()])]
+        )
         lines = [",".join(("time_s", *columns))]
         lines += [",".join(map(repr, row)) for row in values.T.tolist()]
         write_atomically(folder / f"{stem}.csv", "\n".join(lines) + "\n")
         written.append(f"{stem}.csv")
-    notes = tuple(dict.fromkeys(found.notes))
-    text = map_text(found.used, found.assumed, notes, files, found.steps)
+    notes = tuple(dict.fromkeys(imported.notes))
+    text = map_text(imported.used, imported.assumed, notes, files, imported.steps)
     write_atomically(folder / "map.toml", text)
     return [*written, "map.toml"]

@@ -1,12 +1,14 @@
 """What number of level each imported state gets."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float
 
-from snrmjax.io.exchange.import_map import Assumption, Assumptions
-from snrmjax.measure.recordings.velocity_states import counted_levels, number_levels
+from snrmjax.io.exchange.import_map import Assumptions
+from snrmjax.measure.recordings.velocity_states import number_levels
+from snrmjax.numerics.facts import Fact
 
 
 class MeasuredPart(NamedTuple):
@@ -15,13 +17,13 @@ class MeasuredPart(NamedTuple):
     frequency: Float[np.ndarray, " state"]  # rad/s
     force: Float[np.ndarray, " state"]  # N or V
     velocity: Complex[np.ndarray, "state sensor"]  # m/s
-    key: Float[np.ndarray, " state"] | None = None  # what a column or the order says of levels
-    velocity_std: Float[np.ndarray, "state sensor"] | None = None  # m/s
-    phase_std: Float[np.ndarray, "state sensor"] | None = None  # rad
+    key: Float[np.ndarray, " state"] | None  # what a column or the order says of levels
+    velocity_std: Float[np.ndarray, "state sensor"]  # m/s; NaN where nobody states it
+    phase_std: Float[np.ndarray, "state sensor"]  # rad
 
 
 def numbered_levels(
-    parts: list[MeasuredPart], level: str, assumed: Assumptions
+    parts: Sequence[MeasuredPart], level: str, assumed: Assumptions
 ) -> tuple[np.ndarray, str]:
     """The level of every state of all parts, and the rule that was used, for the map.
 
@@ -29,11 +31,11 @@ def numbered_levels(
     file has, then one level a file, then groups of the force.
     Raises `ValueError` for a rule that the data do not have.
     """
-    lengths = [len(one.frequency) for one in parts]
+    lengths = [len(part.frequency) for part in parts]
     files = np.repeat(np.arange(1, len(parts) + 1), lengths)
-    force = np.concatenate([one.force for one in parts])
-    frequency = np.concatenate([one.frequency for one in parts])
-    keyed = all(one.key is not None for one in parts)
+    force = np.concatenate([part.force for part in parts])
+    frequency = np.concatenate([part.frequency for part in parts])
+    keyed = all(part.key is not None for part in parts)
     if level not in ("", "file", "force", "runs") or (not level and keyed):
         keys = np.concatenate([np.full(0, 0.0) if p.key is None else p.key for p in parts])
         if not keyed:
@@ -48,9 +50,9 @@ def numbered_levels(
         return np.unique(keys, return_inverse=True)[1] + 1, level
     if level == "file" or (not level and len(parts) > 1):
         if not level:
-            assumed["level"] = Assumption("one level a file, in the order in which they were named")
+            assumed.add("level", Fact("level_a_file"))
         return files, "file"
     number, rule = number_levels(level or "auto", force, None, frequency)  # type: ignore[arg-type]
     if not level:
-        assumed["level"] = Assumption(counted_levels(number, rule))
+        assumed.add("level", Fact("levels_counted", n=len(np.unique(number)), by=rule))
     return number, rule

@@ -2,14 +2,16 @@
 
 import shlex
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import tomli_w
 
-from snrmjax.io.files import FilePath, file_name, read_text, shown
+from snrmjax.io.files import FilePath, file_name, read_text, shown, suggestion
 from snrmjax.io.laboratory.contents import TextFormat
 from snrmjax.io.toml_table import TomlTable, parsed_toml
 from snrmjax.measure.recordings.step_counts import StepCounts
+from snrmjax.numerics.facts import Fact
 
 _MOTIONS = ("displacement", "velocity", "acceleration")
 _CHANNELS, _NUMBERS, _TEXTS = "Channels and columns", "What the numbers are", "Text files"
@@ -24,14 +26,12 @@ class MapKey(NamedTuple):
     choices: tuple[str, ...] = ()
 
 
-RECORD_KINDS = ("steps", "sweep", "decay", "broadband")
-"""What a time record may be: the last two are written as records, not as steady states."""
+# What a time record may be: the last two are written as records, not as steady states.
+_RECORDS = ("steps", "sweep", "decay", "broadband")
 
 KEYS = {
     "dataset": MapKey("which of the file's datasets"),
-    "record": MapKey(
-        f"what a time record is: {', '.join(RECORD_KINDS)}", "KIND", _NUMBERS, RECORD_KINDS
-    ),
+    "record": MapKey(f"what a time record is: {', '.join(_RECORDS)}", "KIND", _NUMBERS, _RECORDS),
     "frequency": MapKey("column of the forcing frequency"),
     "frequency_unit": MapKey("unit of the frequency: Hz or rad/s", "UNIT", _NUMBERS),
     "force": MapKey("channel or column of the force (or of the voltage that drives it)"),
@@ -81,22 +81,26 @@ RESPONSE_KEYS = {
 class Assumption(NamedTuple):
     """Why something was taken that nobody stated, and its value where the map has none yet."""
 
-    why: str
+    why: Fact
     value: str = ""
 
     def __str__(self) -> str:
-        return f"{self.value}: {self.why}" if self.value else self.why
+        return f"{self.value}: {self.why}" if self.value else str(self.why)
 
 
 class Assumptions(dict[str, Assumption]):
     """What was taken for each key of the map that nobody stated, and why."""
 
-    def unit(self, key: str, told: str, file_unit: str) -> None:
+    def add(self, key: str, why: Fact, value: str = "") -> None:
+        """Record an assumption."""
+        self[key] = Assumption(why, value)
+
+    def unit(self, key: str, stated: str, file_unit: str) -> None:
         """Record where a unit comes from: the map wins over the file."""
-        if not told and file_unit:
-            self[key] = Assumption("the file says so", file_unit)
-        elif told and file_unit and told != file_unit:
-            self[key] = Assumption(f"stated, though the file says {file_unit}", told)
+        if not stated and file_unit:
+            self.add(key, Fact("unit_of_file"), file_unit)
+        elif stated and file_unit and stated != file_unit:
+            self.add(key, Fact("unit_stated_over_file", unit=file_unit), stated)
 
 
 class ResponseMap(NamedTuple):
@@ -167,43 +171,108 @@ def response_word(word: str, unit: str = "") -> ResponseMap:
     return ResponseMap(word, "", unit)
 
 
+def map_of_options(map_file: Path | None, given: Mapping[str, Any]) -> ImportMap:
+    """The map that options and a file state; options win.
+
+    Arguments: `given` has the options by the keys of a map, `response` as for `response_word`;
+    what is empty was not given.
+    Raises `ValueError` that names the option for words that are none of its choices, and for
+    sensors and phases of another number than responses.
+    """
+    words = {key: given[key] for key in KEYS if given.get(key)}
+    for key, word in words.items():
+        choices = KEYS[key].choices
+        if choices and word not in choices:
+            raise ValueError(
+                f"{_option(key)} must be one of {', '.join(choices)}, but is {shown(word)}"
+                f"{suggestion(word, choices)}."
+            )
+    if "force_amplitude" in words:
+        words["force_amplitude"] = _stated_amplitudes(words["force_amplitude"])
+    base = ImportMap() if map_file is None else read_import_map(map_file)
+    unit, response = words.pop("unit", ""), given.get("response") or ()
+    responses = tuple(response_word(word, unit) for word in response) or base.responses
+    stated = [word for word in response if response_word(word).unit]
+    if unit and stated:
+        raise ValueError(
+            f"--unit {unit} is of responses whose unit is not stated, but --response {stated[0]} "
+            "states one: leave one of the two out."
+        )
+    if unit and not response:
+        responses = tuple(response._replace(unit=unit) for response in responses)
+    for key in RESPONSE_KEYS:
+        each = given.get(key) or ()
+        if each and len(each) != len(responses):
+            raise ValueError(
+                f"{_option(key)} must be given once for each of the {len(responses)} responses, "
+                f"but is given {len(each)} times."
+            )
+        if each:
+            pairs = zip(responses, each, strict=True)
+            responses = tuple(response._replace(**{key: word}) for response, word in pairs)
+    names = [response.sensor for response in responses if response.sensor]
+    for what, listed in (
+        ("--sensor", names),
+        ("--response", [response.channel for response in responses]),
+    ):
+        doubled = [name for name in listed if listed.count(name) > 1]
+        if doubled:
+            raise ValueError(f"{what} names {doubled[0]!r} twice.")
+    if unit and not responses:  # of our own table, which has no responses to be named
+        words["unit"] = unit
+    return base._replace(**words, responses=responses)
+
+
+def _option(key: str) -> str:
+    return f"--{key.replace('_', '-')}"
+
+
+def _stated_amplitudes(words: Sequence[str]) -> tuple[str, ...]:
+    if list(words) == ["z"]:
+        return ("z",)
+    amplitudes = []
+    for word in words:
+        try:
+            number = float(word)
+        except ValueError:
+            number = 0.0
+        if not 0 < number < float("inf"):
+            raise ValueError(
+                f"--force-amplitude must be a positive number in N, or z alone, but is "
+                f"{shown(word)}."
+            )
+        amplitudes.append(repr(number))
+    return tuple(amplitudes)
+
+
 def read_import_map(path: FilePath) -> ImportMap:
     """A map from its TOML. Raises `ValueError` that names file, key and what was expected."""
     file = file_name(path)
     table = parsed_toml(read_text(path), file)
     table.check_keys((), (*KEYS, "response", "steps"))
-    found: dict[str, Any] = {}
-    for key in (one for one in KEYS if one in table.entries):
-        if key == "over_force":
-            if not isinstance(table.entries[key], bool):
-                raise table.refusal(key, "true or false", table.entries[key])
-            found[key] = table.entries[key]
-        elif key == "header_row":
-            found[key] = table.whole(key, 0)
-        elif key == "force_amplitude":
-            found[key] = _amplitudes(table)
-        elif KEYS[key].choices:
-            found[key] = table.choice(key, ("", *KEYS[key].choices))
-        else:
-            found[key] = table.text(key)
+    values = {key: _value(table, key) for key in KEYS if key in table.entries}
     responses = []
-    for one in table.tables("response", file):
-        one.check_keys(("channel",), ResponseMap._fields[1:])
-        if "quantity" in one.entries:
-            one.choice("quantity", ("", *_MOTIONS))
-        responses.append(
-            ResponseMap(**{key: one.text(key) for key in ResponseMap._fields if key in one.entries})
-        )
-    return ImportMap(tuple(responses), **found)
+    for response in table.tables("response", file):
+        response.check_keys(("channel",), ResponseMap._fields[1:])
+        if "quantity" in response.entries:
+            response.choice("quantity", ("", *_MOTIONS))
+        responses.append(ResponseMap(**{key: response.text(key) for key in response.entries}))
+    return ImportMap(tuple(responses), **values)
 
 
-def _amplitudes(table: TomlTable) -> tuple[str, ...]:
-    value = table.entries["force_amplitude"]
-    if value == "z":
-        return ("z",)
-    if isinstance(value, list) and not value:
-        return ()
-    return tuple(map(repr, table.numbers("force_amplitude", each="entry")))
+def _value(table: TomlTable, key: str) -> Any:
+    """A key's value in the map."""
+    value = table.entries[key]
+    if key == "over_force":
+        if not isinstance(value, bool):
+            raise table.refusal(key, "true or false", value)
+        return value
+    if key == "header_row":
+        return table.whole(key, 0)
+    if key == "force_amplitude":
+        return ("z",) if value == "z" else tuple(map(repr, table.numbers(key, each="entry")))
+    choices = KEYS[key].choices
+    return table.choice(key, ("", *choices)) if choices else table.text(key)
 
 
 def steps_of_map(path: FilePath) -> StepCounts | None:
@@ -222,7 +291,7 @@ def steps_of_map(path: FilePath) -> StepCounts | None:
 def map_text(
     used: ImportMap,
     assumed: Mapping[str, Assumption],
-    notes: tuple[str, ...] = (),
+    notes: Sequence[Fact | str] = (),
     files: Sequence[str] = (),
     steps: StepCounts | None = None,
 ) -> str:
@@ -236,13 +305,13 @@ def map_text(
         "# How the laboratory's files were read. Take it for the next test: snrmjax import "
         "FILE --map map.toml --out DIR",
         *(["# files: " + shlex.join(files)] if files else []),
-        *(f"# note: {' '.join(note.split())}" for note in notes),
+        *(f"# note: {' '.join(str(note).split())}" for note in notes),
     ]
-    for key, one in KEYS.items():
+    for key, spec in KEYS.items():
         value = getattr(used, key)
         if key == "force_amplitude":
-            value = "z" if value == ("z",) else [float(one) for one in value]
-        lines.append(f"{_line(key, value)}  # {_comment(key, value, assumed) or one.meaning}")
+            value = "z" if value == ("z",) else [float(spec) for spec in value]
+        lines.append(f"{_line(key, value)}  # {_comment(key, value, assumed) or spec.meaning}")
     for k, response in enumerate(used.responses):
         lines += ["", "[[response]]"]
         for key, value in response._asdict().items():
@@ -257,8 +326,8 @@ def _comment(key: str, value: object, assumed: Mapping[str, Assumption]) -> str:
     """Why a value was assumed, and what else it could be; empty for one that was stated."""
     if key not in assumed:
         return ""
-    one = assumed[key]
-    why = " ".join((one.why if one.value == value else str(one)).split())
+    assumption = assumed[key]
+    why = " ".join(str(assumption.why if assumption.value == value else assumption).split())
     choices = KEYS[key].choices if key in KEYS else ()
     others = ", ".join(word for word in choices if word != value)
     return f"assumed: {why}" + (f" (else {others})" if others else "")

@@ -6,10 +6,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from snrmjax.io.exchange.import_map import Assumption, Assumptions, ImportMap
+from snrmjax.io.exchange.import_map import Assumptions, ImportMap
 from snrmjax.io.files import near_miss
 from snrmjax.io.laboratory.physical_units import UnitMeaning, unit_meaning
 from snrmjax.measure.recordings.channels import SI_UNIT
+from snrmjax.numerics.facts import Fact
 
 AMPLITUDE_FACTORS = {"peak": 1.0, "": 1.0, "rms": np.sqrt(2.0), "peak_to_peak": 0.5}
 """What makes peak amplitudes of peak, rms and peak-to-peak ones."""
@@ -36,9 +37,9 @@ def require_name(option: str, name: str, known: Iterable[str], what: str, file: 
         )
 
 
-def force_meaning(told: ImportMap, file_unit: str, what: str) -> Force:
+def force_meaning(mapping: ImportMap, file_unit: str, what: str) -> Force:
     """The unit of the force. Raises `ValueError` with a question where nobody states it."""
-    unit = told.force_unit or file_unit
+    unit = mapping.force_unit or file_unit
     if not unit:
         raise ValueError(
             f"in which unit is {what}? State it: --force-unit N (or lbf, V for a drive voltage)."
@@ -93,55 +94,53 @@ def motion_meaning(
     return meaning.dimension, meaning.factor, stated
 
 
-def amplitude_factor(told: ImportMap, units: Mapping[str, str], assumed: Assumptions) -> float:
+def amplitude_factor(mapping: ImportMap, units: Mapping[str, str], assumed: Assumptions) -> float:
     """What turns amplitudes into peak amplitudes: stated, said by a unit, else peak is assumed."""
     said = {unit_meaning(unit).size for unit in units.values() if unit}
     sizes = said - {""}
-    if told.amplitude:
-        if sizes - {told.amplitude}:
+    if mapping.amplitude:
+        if sizes - {mapping.amplitude}:
             raise ValueError(
-                f"--amplitude says {told.amplitude}, but a unit says {min(sizes)}: which is right?"
+                f"--amplitude says {mapping.amplitude}, but a unit says {min(sizes)}: which is "
+                "right?"
             )
-        return float(AMPLITUDE_FACTORS[told.amplitude])
+        return float(AMPLITUDE_FACTORS[mapping.amplitude])
     if len(sizes) > 1 or (sizes and "" in said and sizes != {"peak"}):
         raise ValueError(
             f"units say {' and '.join(sorted(sizes))} of some columns and not of others: which "
             "holds for all? --amplitude peak, rms or peak_to_peak."
         )
     size = next(iter(sizes), "peak")
-    why = "the units say so" if sizes else "nothing is said"
-    assumed["amplitude"] = Assumption(why, size)
+    assumed.add("amplitude", Fact("units_say_so") if sizes else Fact("nothing_is_said"), size)
     return float(AMPLITUDE_FACTORS[size])
 
 
 def frequency_in_rad(
-    values: Float[np.ndarray, " row"], told: ImportMap, file_unit: str, assumed: Assumptions
+    values: Float[np.ndarray, " row"], mapping: ImportMap, file_unit: str, assumed: Assumptions
 ) -> Float[np.ndarray, " row"]:
     """Frequencies in rad/s; hertz where nothing is said."""
-    unit = told.frequency_unit or file_unit
+    unit = mapping.frequency_unit or file_unit
     if not unit:
-        if told.frequency.lower().rsplit(".", 1)[-1] in ("w", "omega", "om"):
+        if mapping.frequency.lower().rsplit(".", 1)[-1] in ("w", "omega", "om"):
             raise ValueError(
-                f"is {told.frequency} in Hz or in rad/s? State it: --frequency-unit Hz or rad/s."
+                f"is {mapping.frequency} in Hz or in rad/s? State it: --frequency-unit Hz or rad/s."
             )
-        assumed["frequency_unit"] = Assumption("nothing is said", "Hz")
+        assumed.add("frequency_unit", Fact("nothing_is_said"), "Hz")
         return values * _HERTZ
-    assumed.unit("frequency_unit", told.frequency_unit, file_unit)
+    assumed.unit("frequency_unit", mapping.frequency_unit, file_unit)
     meaning = _understood(unit, "--frequency-unit")
     if meaning.dimension != "frequency":
         raise ValueError(
-            f"{told.frequency} must be a frequency, but its unit {unit} is of {meaning.dimension}: "
-            "--frequency names another column."
+            f"{mapping.frequency} must be a frequency, but its unit {unit} is of "
+            f"{meaning.dimension}: --frequency names another column."
         )
-    if abs(meaning.factor / _HERTZ - 1) < 1e-14:
-        return values * _HERTZ
     return values * meaning.factor
 
 
 def phase_in_rad(
     values: Float[np.ndarray, "*row"],
     column: str,
-    told: ImportMap,
+    mapping: ImportMap,
     file_unit: str,
     assumed: Assumptions,
 ) -> Float[np.ndarray, "*row"]:
@@ -149,37 +148,36 @@ def phase_in_rad(
 
     Raises `ValueError` with a question where degrees and radians are both possible.
     """
-    unit, why = told.phase_unit, ""
-    if not unit and file_unit:
-        meaning = unit_meaning(file_unit)
-        if meaning.dimension != "angle":
-            raise ValueError(
-                f"{column} must be an angle, but its unit is {file_unit}: --phase names another "
-                "column, --phase-unit its unit."
-            )
-        unit, why = ("rad" if meaning.factor == 1 else "deg"), "the file says so"
-    if told.phase_unit and file_unit and unit_meaning(file_unit).dimension == "angle":
-        found = "rad" if unit_meaning(file_unit).factor == 1 else "deg"
-        if found != told.phase_unit:
-            raise ValueError(
-                f"--phase-unit says {told.phase_unit}, but {column} is in {file_unit}: which is "
-                "right?"
-            )
+    stated = unit_meaning(file_unit) if file_unit else None
+    if stated and stated.dimension != "angle" and not mapping.phase_unit:
+        raise ValueError(
+            f"{column} must be an angle, but its unit is {file_unit}: --phase names another "
+            "column, --phase-unit its unit."
+        )
+    of_file = (
+        "" if not stated or stated.dimension != "angle" else "rad" if stated.factor == 1 else "deg"
+    )
+    if mapping.phase_unit and of_file not in ("", mapping.phase_unit):
+        raise ValueError(
+            f"--phase-unit says {mapping.phase_unit}, but {column} is in {file_unit}: which is "
+            "right?"
+        )
+    unit = mapping.phase_unit or of_file
+    if not mapping.phase_unit and of_file:
+        assumed.add("phase_unit", Fact("unit_of_file"), unit)
     if not unit:
         ends = [word for word in ("deg", "rad") if column.lower().rstrip("_)]s").endswith(word)]
-        if ends:
-            unit, why = ends[0], f"{column} says so"
-        elif np.nanmax(np.abs(values), initial=0.0) > 2 * _HERTZ:
-            unit, why = "deg", f"{column} reaches beyond two turns in radians"
-        else:
+        if not ends and not np.nanmax(np.abs(values), initial=0.0) > 2 * _HERTZ:
             raise ValueError(f"is {column} in degrees or in radians? --phase-unit deg or rad.")
-    if why:
-        assumed["phase_unit"] = Assumption(why, unit)
-    if not told.phase_sign:
-        assumed["phase_sign"] = Assumption(
-            "a positive phase is ahead of the force, e^(+iwt)", "lead"
+        said, beyond = (
+            Fact("column_says_so", column=column),
+            Fact("phase_beyond_two_turns", column=column),
         )
-    sign = -1.0 if told.phase_sign == "lag" else 1.0
+        unit, why = (ends[0], said) if ends else ("deg", beyond)
+        assumed.add("phase_unit", why, unit)
+    if not mapping.phase_sign:
+        assumed.add("phase_sign", Fact("phase_ahead_of_the_force"), "lead")
+    sign = -1.0 if mapping.phase_sign == "lag" else 1.0
     return sign * (np.radians(values) if unit == "deg" else values)
 
 

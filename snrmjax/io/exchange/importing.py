@@ -8,16 +8,12 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from snrmjax.io.columns import is_ours
 from snrmjax.io.exchange.import_levels import MeasuredPart, numbered_levels
-from snrmjax.io.exchange.import_map import Assumption, Assumptions, ImportMap
+from snrmjax.io.exchange.import_map import Assumptions, ImportMap
 from snrmjax.io.exchange.import_units import Force
-from snrmjax.io.exchange.own_tables import (
-    is_own_table,
-    restated,
-    restated_in_words,
-    states_of_own_table,
-)
-from snrmjax.io.exchange.record_import import import_record, told_record
+from snrmjax.io.exchange.own_tables import restated, restated_how, states_of_own_table
+from snrmjax.io.exchange.record_import import import_record, mapped_record
 from snrmjax.io.exchange.response_import import import_responses
 from snrmjax.io.exchange.table_import import import_table
 from snrmjax.io.laboratory.contents import LaboratoryFile, NumberTable
@@ -31,6 +27,7 @@ from snrmjax.measure.states import (
     steady_states,
     with_levels_apart,
 )
+from snrmjax.numerics.facts import Fact
 
 
 class Imported(NamedTuple):
@@ -43,7 +40,7 @@ class Imported(NamedTuple):
     records: tuple[TimeRecording, ...]
     used: ImportMap
     assumed: Assumptions
-    notes: tuple[str, ...]
+    notes: tuple[Fact, ...]
     steps: StepCounts | None = None  # of all records that are stepped sines
 
 
@@ -56,163 +53,136 @@ class _Dataset(NamedTuple):
     z: tuple[float, ...] = ()
 
 
-def import_files(paths: Sequence[Path], told: ImportMap) -> Imported:
+def import_files(paths: Sequence[Path], mapping: ImportMap) -> Imported:
     """Import the files of one test.
 
-    Arguments: `told` says which channel or column is what; the same for all files.
+    Arguments: `mapping` says which channel or column is what; the same for all files.
     Returns `Imported`. Raises `ValueError`: as `read_laboratory_file` does, and with a question
     that names the option where something cannot be told.
     """
-    assumed, notes = Assumptions(), list[str]()
-    chosen: list[_Dataset] = []
+    assumed, notes = Assumptions(), list[Fact]()
+    datasets: list[_Dataset] = []
     for path in paths:
-        held = read_laboratory_file(path, told.text_format)
-        chosen += _datasets(held, told)
-        notes += [f"{held.name}: {note}" for note in held.notes]
-    kinds = {type(one.content) for one in chosen}
-    if len(kinds) > 1:
-        listed = ", ".join(f"{one.file}: {one.name}" for one in chosen)
+        held = read_laboratory_file(path, mapping.text_format)
+        datasets += _datasets(held, mapping)
+        notes += [Fact("note_of_file", file=held.name, note=note) for note in held.notes]
+    if len({type(dataset.content) for dataset in datasets}) > 1:
+        listed = ", ".join(f"{dataset.file}: {dataset.name}" for dataset in datasets)
         raise ValueError(f"files of one test must hold things of one kind, but have {listed}.")
-    if told.dataset == "" and len(chosen) == 1:
-        told = told._replace(dataset=chosen[0].name)
-    if isinstance(chosen[0].content, TimeRecording):
-        return _records(chosen, told, assumed, notes)
-    own = [
-        one for one in chosen if isinstance(one.content, NumberTable) and is_own_table(one.content)
+    if mapping.dataset == "" and len(datasets) == 1:
+        mapping = mapping._replace(dataset=datasets[0].name)
+    file = datasets[0].file
+    contents = [(dataset.content, dataset.file) for dataset in datasets]
+    records = [(content, name) for content, name in contents if isinstance(content, TimeRecording)]
+    tables = [(content, name) for content, name in contents if isinstance(content, NumberTable)]
+    if records:
+        return _records(records, mapping, assumed, notes)
+    ours = [(table, name) for table, name in tables if is_ours(table.columns)]
+    if ours and not mapping.responses:
+        parts = [restated(states_of_own_table(table, name), mapping) for table, name in ours]
+        notes.append(restated_how(mapping))
+        return Imported(join_steady_states(parts), (), mapping, assumed, tuple(notes))
+    imported = [import_table(table, mapping, name, assumed) for table, name in tables] or [
+        import_responses(content, z, mapping, name, assumed)
+        for _, name, content, z in datasets
+        if not isinstance(content, TimeRecording | NumberTable)
     ]
-    if own and not told.responses:
-        parts = [
-            restated(states_of_own_table(one.content, one.file), told)
-            for one in own
-            if isinstance(one.content, NumberTable)
-        ]
-        taken = restated_in_words(told) or "taken as they are"
-        notes.append(f"the columns are those of our table: {taken}.")
-        return Imported(_joined(parts), (), told, assumed, tuple(notes))
-    return _phasors(chosen, told, assumed, notes)
+    used, force = imported[-1][1:3]
+    measured = [part for part, *_ in imported]
+    notes += [note for *_, further in imported for note in further]
+    return _phasors(measured, used, force, file, mapping.level, assumed, notes)
 
 
-def _datasets(held: LaboratoryFile, told: ImportMap) -> list[_Dataset]:
+def _datasets(held: LaboratoryFile, mapping: ImportMap) -> list[_Dataset]:
     """What of a file is imported. Raises `ValueError` with a question where that is not one."""
-    every = [_Dataset(one.name or "record", held.name, one) for one in held.recordings]
-    every += [_Dataset(one.name, held.name, one) for one in held.tables]
+    parts = [_Dataset(record.name or "record", held.name, record) for record in held.recordings]
+    parts += [_Dataset(table.name, held.name, table) for table in held.tables]
     if held.responses:
-        every.append(_Dataset("responses", held.name, held.responses, held.levels))
-    names = [one.name for one in every]
-    if told.dataset:
-        alike = [one for one in every if one.name == told.dataset]
-        if alike:
-            return alike
-        if len(every) > 1:
-            raise ValueError(
-                f"--dataset names {told.dataset!r}, but {held.name} has {', '.join(names)}."
-            )
-    if len(every) > 1 and all(isinstance(one.content, TimeRecording) for one in every):
-        return every
-    if len(every) > 1:
-        raise ValueError(
-            f"which part of {held.name} is meant? --dataset names it, of {', '.join(names)}."
-        )
-    return every
+        parts.append(_Dataset("responses", held.name, held.responses, held.levels))
+    names = ", ".join(dataset.name for dataset in parts)
+    named = [dataset for dataset in parts if dataset.name == mapping.dataset != ""]
+    if named or len(parts) == 1:
+        return named or parts
+    if mapping.dataset:
+        raise ValueError(f"--dataset names {mapping.dataset!r}, but {held.name} has {names}.")
+    if len(parts) > len(held.recordings):
+        raise ValueError(f"which part of {held.name} is meant? --dataset names it, of {names}.")
+    return parts
 
 
 def _records(
-    chosen: Sequence[_Dataset], told: ImportMap, assumed: Assumptions, notes: list[str]
+    records: Sequence[tuple[TimeRecording, str]],
+    mapping: ImportMap,
+    assumed: Assumptions,
+    notes: list[Fact],
 ) -> Imported:
-    if told.phase_sign == "lag":
+    if mapping.phase_sign == "lag":
         raise ValueError(
-            f"--phase-sign must be left out of the time records of {chosen[0].file}: phases follow "
+            f"--phase-sign must be left out of the time records of {records[0][1]}: phases follow "
             "from force and motion there. A sensor of the other sign is turned in the model's "
             "`shape`."
         )
     parts: list[SteadyStates] = []
     kept: list[TimeRecording] = []
     steps: list[StepCounts] = []
-    used = told
-    for one in chosen:
-        if isinstance(one.content, TimeRecording):
-            record, used = told_record(one.content, told, one.file, assumed)
-            states, used, more, counts = import_record(record, used, one.file, assumed)
-            notes += [f"{one.file}: {note}" for note in more]
-            steps += [] if counts is None else [counts]
-            if states is None:
-                kept.append(record)
-            else:
-                parts.append(states)
+    used = mapping
+    for record, file in records:
+        record, used = mapped_record(record, mapping, file, assumed)
+        states, used, further, counts = import_record(record, used, file, assumed)
+        notes += [Fact("note_of_file", file=file, note=note) for note in further]
+        steps += [] if counts is None else [counts]
+        if states is None:
+            kept.append(record)
+        else:
+            parts.append(states)
     counted = joined_counts(steps) if steps else None
     if counted is not None:
-        notes.append(f"{counted.words}.")
+        notes.append(counted.fact)
     if not parts:
         return Imported(None, tuple(kept), used, assumed, tuple(notes))
-    if told.level == "file" or (len(parts) > 1 and not told.level):
-        if not told.level:
-            assumed["level"] = Assumption(
-                "one level a record, in the order in which they were named"
-            )
+    if mapping.level == "file" or (len(parts) > 1 and not mapping.level):
+        if not mapping.level:
+            assumed.add("level", Fact("level_a_record"))
         used = used._replace(level="file")
         parts = [
-            dataclasses.replace(one, level=jnp.full(one.n_states, k + 1))
-            for k, one in enumerate(parts)
+            dataclasses.replace(states, level=jnp.full(states.n_states, k))
+            for k, states in enumerate(parts, 1)
         ]
     elif len(parts) > 1:
         parts = list(with_levels_apart(parts))
-    return Imported(_joined(parts), (), used, assumed, tuple(notes), counted)
+    return Imported(join_steady_states(parts), (), used, assumed, tuple(notes), counted)
 
 
 def _phasors(
-    chosen: Sequence[_Dataset], told: ImportMap, assumed: Assumptions, notes: list[str]
+    parts: Sequence[MeasuredPart],
+    used: ImportMap,
+    force: Force,
+    file: str,
+    level: str,
+    assumed: Assumptions,
+    notes: Sequence[Fact],
 ) -> Imported:
-    """Tables and frequency responses."""
-    parts: list[MeasuredPart] = []
-    used, force = told, Force(1.0, False, "N")
-    for one in chosen:
-        if isinstance(one.content, NumberTable):
-            part, used, force, more = import_table(one.content, told, one.file, assumed)
-        elif isinstance(one.content, TimeRecording):
-            continue
-        else:
-            part, used, force, more = import_responses(one.content, one.z, told, one.file, assumed)
-        parts.append(part)
-        notes += more
-    level, rule = numbered_levels(parts, told.level or _rule(used, parts), assumed)
-    every = np.concatenate([one.force for one in parts])
-    velocity = np.concatenate([one.velocity for one in parts])
-    missing = np.full(len(every), np.nan)
+    """Steady states of tables and frequency responses."""
+    velocity = np.concatenate([part.velocity for part in parts])
+    if not np.any(np.abs(velocity) > 0):
+        raise ValueError(f"{file} has nothing but zero responses.")
+    keyed = all(part.key is not None for part in parts)
+    number, rule = numbered_levels(parts, level or (used.level if keyed else ""), assumed)
+    size = np.concatenate([part.force for part in parts])
+    missing = np.full(len(size), np.nan)
     states = steady_states(
-        level,
-        np.concatenate([one.frequency for one in parts]),
-        missing if force.is_voltage else every,
+        number,
+        np.concatenate([part.frequency for part in parts]),
+        missing if force.is_voltage else size,
         np.where(np.isfinite(velocity), velocity, 0.0),
         measured=np.isfinite(velocity),
-        sensors=[one.sensor for one in used.responses],
-        drive=every if force.is_voltage else missing,
-        velocity_std=_stated([(one.velocity_std, one.velocity) for one in parts]),
-        phase_std=_stated([(one.phase_std, one.velocity) for one in parts]),
+        sensors=[response.sensor for response in used.responses],
+        drive=size if force.is_voltage else missing,
+        velocity_std=np.concatenate([part.velocity_std for part in parts]),
+        phase_std=np.concatenate([part.phase_std for part in parts]),
     )
-    if not np.any(np.abs(velocity) > 0):
-        raise ValueError(f"{chosen[0].file} has nothing but zero responses.")
-    used = _filled(used._replace(level=rule), assumed)
+    # Choices that were assumed go into the map, so that the next test is read alike.
+    keys = {"amplitude", "phase_sign", "phase_unit"}.intersection(assumed)
+    words: dict[str, Any] = {key: assumed[key].value for key in keys}
+    used = used._replace(level=rule, **words)
     return Imported(states, (), used, assumed, tuple(notes))
-
-
-def _stated(errors: Sequence[tuple[np.ndarray | None, np.ndarray]]) -> np.ndarray:
-    """Standard deviations of all parts; NaN where a part states none."""
-    return np.concatenate(
-        [np.full(like.shape, np.nan) if std is None else std for std, like in errors]
-    )
-
-
-def _filled(used: ImportMap, assumed: Assumptions) -> ImportMap:
-    """The map with choices that were assumed, so that the next test is read alike."""
-    keys = ("amplitude", "phase_sign", "phase_unit")
-    words: dict[str, Any] = {key: assumed[key].value for key in keys if key in assumed}
-    return used._replace(**words)
-
-
-def _rule(used: ImportMap, parts: Sequence[MeasuredPart]) -> str:
-    """The rule that a file's own column or order gives, if all parts have one."""
-    return used.level if all(one.key is not None for one in parts) else ""
-
-
-def _joined(parts: Sequence[SteadyStates]) -> SteadyStates:
-    return parts[0] if len(parts) == 1 else join_steady_states(list(parts))

@@ -6,28 +6,21 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
+from snrmjax.io.columns import is_ours
 from snrmjax.io.exchange.import_map import ImportMap
 from snrmjax.io.exchange.import_units import AMPLITUDE_FACTORS, force_meaning, motion_meaning
-from snrmjax.io.files import read_text
 from snrmjax.io.laboratory.contents import NumberTable
+from snrmjax.io.rows import header_of
 from snrmjax.io.tables import steady_states_of_fields
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.velocity_states import velocity_factors
 from snrmjax.measure.states import SteadyStates
-
-_OWN = ("frequency_hz", "velocity_re_m_s", "velocity_im_m_s")
-_OWN_FILES = ({"frequency_hz", "velocity_re_m_s"}, {"frequency_hz", "velocity_m_s", "level"})
-
-
-def is_own_table(table: NumberTable) -> bool:
-    """Whether a table has the columns of our CSV."""
-    return all(name in table.columns for name in _OWN)
+from snrmjax.numerics.facts import Fact
 
 
 def is_own_file(path: Path) -> bool:
     """Whether a CSV is meant as ours, by its header: its reader then says what is amiss."""
-    header = {word.strip().strip("\ufeff") for word in read_text(path).split("\n", 1)[0].split(",")}
-    return any(columns <= header for columns in _OWN_FILES)
+    return is_ours(header_of(path))
 
 
 def states_of_own_table(table: NumberTable, file: str) -> SteadyStates:
@@ -41,25 +34,25 @@ def states_of_own_table(table: NumberTable, file: str) -> SteadyStates:
     return steady_states_of_fields(fields, file)
 
 
-def restated(states: SteadyStates, told: ImportMap) -> SteadyStates:
+def restated(states: SteadyStates, mapping: ImportMap) -> SteadyStates:
     """Steady states of our table whose numbers are not what our columns say, in SI.
 
-    Arguments: `told.unit` of the velocity columns (of an acceleration, say), `told.force_unit` of
-    the force's (a voltage makes it a drive), `told.amplitude`, `told.phase_sign`.
+    Arguments: of `mapping` the `unit` of the velocity columns (of an acceleration, say), the
+    `force_unit` (a voltage makes it a drive), `amplitude` and `phase_sign`.
     Raises `ValueError` for units that are none of a motion or of a force.
     """
     orders = (1, *states.harmonic_order)
     factors = np.ones((states.n_states, len(orders)), dtype=complex)
-    if told.unit:
-        quantity, factor, _ = motion_meaning("", told.unit, "", "the velocity")
+    if mapping.unit:
+        quantity, factor, _ = motion_meaning("", mapping.unit, "", "the velocity")
         channel = Channel("", quantity)  # type: ignore[arg-type]
         factors = factor * velocity_factors([channel], orders, np.asarray(states.frequency))[:, 0]
-    factors = factors * AMPLITUDE_FACTORS[told.amplitude]
+    factors = factors * AMPLITUDE_FACTORS[mapping.amplitude]
     phasors = np.concatenate(
         [np.asarray(states.velocity)[:, :, None], np.asarray(states.harmonics)], axis=2
     )
     phasors = phasors * factors[:, None]
-    if told.phase_sign == "lag":
+    if mapping.phase_sign == "lag":
         phasors = phasors.conj()
     size = np.abs(factors[:, :1])
     # What is stated is the rms over the harmonics, whose noise is alike in the unit of the columns.
@@ -72,35 +65,32 @@ def restated(states: SteadyStates, told: ImportMap) -> SteadyStates:
         velocity_std=states.velocity_std * size,
         harmonic_std=states.harmonic_std * floor,
     )
-    return _with_force(changed, told)
+    return _with_force(changed, mapping)
 
 
-def _with_force(states: SteadyStates, told: ImportMap) -> SteadyStates:
-    """With the force, or the drive in its place, in the unit that is told."""
-    force = force_meaning(told, "N", "the force")
-    factor = force.factor * AMPLITUDE_FACTORS[told.amplitude]
+def _with_force(states: SteadyStates, mapping: ImportMap) -> SteadyStates:
+    """With the force, or the drive in its place, in the unit that is stated."""
+    force = force_meaning(mapping, "N", "the force")
+    factor = force.factor * AMPLITUDE_FACTORS[mapping.amplitude]
     missing = jnp.full(states.n_states, jnp.nan)
     known = jnp.isfinite(states.force)
-    if not told.force_unit:
-        drive, newtons = states.drive * AMPLITUDE_FACTORS[told.amplitude], states.force * factor
+    if not mapping.force_unit:
+        drive, newtons = states.drive * AMPLITUDE_FACTORS[mapping.amplitude], states.force * factor
     else:
-        every = factor * jnp.where(known, states.force, states.drive)
-        drive, newtons = (every, missing) if force.is_voltage else (missing, every)
+        loads = factor * jnp.where(known, states.force, states.drive)
+        drive, newtons = (loads, missing) if force.is_voltage else (missing, loads)
     std = missing if force.is_voltage else states.force_std * factor
     return dataclasses.replace(states, force=newtons, drive=drive, force_std=std)
 
 
-def restated_in_words(told: ImportMap) -> str:
-    """What of our table is told to be otherwise; empty where nothing is."""
-    return ", ".join(
-        words
-        for said, words in (
-            (told.unit, f"velocity columns in {told.unit}"),
-            (told.force_unit, f"forces in {told.force_unit}"),
-            (told.amplitude not in ("", "peak"), f"amplitudes {told.amplitude}"),
-            (told.phase_sign == "lag", "phasors conjugated"),
-        )
-        if said
+def restated_how(mapping: ImportMap) -> Fact:
+    """What of our table is said to be otherwise."""
+    return Fact(
+        "our_own_table",
+        unit=mapping.unit,
+        force_unit=mapping.force_unit,
+        amplitude="" if mapping.amplitude == "peak" else mapping.amplitude,
+        conjugated=mapping.phase_sign == "lag",
     )
 
 

@@ -1,129 +1,120 @@
 """Steady states, or records of a decay, of a laboratory's time records."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 
-from snrmjax.io.exchange.import_map import Assumption, Assumptions, ImportMap, ResponseMap
+from snrmjax.io.exchange.import_map import Assumptions, ImportMap, ResponseMap
 from snrmjax.io.exchange.import_units import force_meaning, motion_meaning
+from snrmjax.io.exchange.table_import import sensor_of
 from snrmjax.measure.recordings.channels import Channel, channel_number
 from snrmjax.measure.recordings.step_counts import StepCounts
 from snrmjax.measure.recordings.stepped_sine import stepped_sine_states
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.recordings.velocity_states import Levels
-from snrmjax.measure.states import UNNAMED_SENSOR, SteadyStates
+from snrmjax.measure.states import SteadyStates
 from snrmjax.measure.sweeps.slow_sweep import sweep_states
+from snrmjax.numerics.facts import Fact
 
 _DIRECT: dict[str, Levels] = {"force": "force", "drive": "drive", "runs": "runs"}
 
 
-def told_record(
-    record: TimeRecording, told: ImportMap, file: str, assumed: Assumptions
+def mapped_record(
+    record: TimeRecording, mapping: ImportMap, file: str, assumed: Assumptions
 ) -> tuple[TimeRecording, ImportMap]:
     """The channels of a map with their quantities and units, and the map with what was found.
 
     Raises `ValueError` with a question that names the option for what cannot be told.
     """
-    if not told.responses:
+    if not mapping.responses:
         names = ", ".join(record.channel_names)
         raise ValueError(
             f"which channel of {file} is the response? --response CHANNEL:acceleration (or "
             f"velocity, displacement) names it, of {names}."
         )
     channels = list(record.channels)
-    if told.force:
-        k = _number(record, told.force, file, "--force")
+    if mapping.force:
+        k = _number(record, mapping.force, file, "--force")
         old = channels[k]
-        unit = told.force_unit or (old.unit if old.quantity in ("force", "voltage") else "")
-        if not told.force_unit and not unit and old.quantity in ("force", "voltage"):
+        unit = mapping.force_unit or (old.unit if old.quantity in ("force", "voltage") else "")
+        if not mapping.force_unit and not unit and old.quantity in ("force", "voltage"):
             unit = old.si_unit
-        force = force_meaning(told, unit, f"{told.force} of {file}")
+        force = force_meaning(mapping, unit, f"{mapping.force} of {file}")
         channels[k] = old._replace(
             quantity="voltage" if force.is_voltage else "force",
             unit=force.unit,
             calibration=force.factor,
         )
-        assumed.unit("force_unit", told.force_unit, unit)
+        assumed.unit("force_unit", mapping.force_unit, unit)
     filled = []
-    for number, one in enumerate(told.responses):
-        k = _number(record, one.channel, file, "--response")
+    for number, response in enumerate(mapping.responses):
+        k = _number(record, response.channel, file, "--response")
         old = channels[k]
-        if old.quantity == "voltage" and not one.unit:
+        if old.quantity == "voltage" and not response.unit:
             old = old._replace(unit="")
-        assumed.unit(f"response {number + 1}.unit", one.unit, old.unit)
-        quantity, factor, unit = motion_meaning(one.quantity, one.unit, old.unit, one.channel)
+        assumed.unit(f"response {number + 1}.unit", response.unit, old.unit)
+        quantity, factor, unit = motion_meaning(
+            response.quantity, response.unit, old.unit, response.channel
+        )
         channels[k] = old._replace(quantity=quantity, unit=unit, calibration=factor)  # type: ignore[arg-type]
-        sensor = one.sensor or (UNNAMED_SENSOR[0] if len(told.responses) == 1 else one.channel)
-        if not one.sensor:
-            assumed[f"response {number + 1}.sensor"] = Assumption("not stated; --sensor names it")
-        filled.append(ResponseMap(one.channel, quantity, one.unit, sensor))
-    if told.drive:
-        k = _number(record, told.drive, file, "--drive")
+        sensor = sensor_of(response, mapping, number + 1, assumed)
+        filled.append(ResponseMap(response.channel, quantity, response.unit, sensor))
+    if mapping.drive:
+        k = _number(record, mapping.drive, file, "--drive")
         if channels[k].quantity == "unknown":
             channels[k] = channels[k]._replace(quantity="voltage", unit="V", calibration=1.0)
     return (
         dataclasses.replace(record, channels=tuple(channels)),
-        told._replace(responses=tuple(filled)),
+        mapping._replace(responses=tuple(filled)),
     )
 
 
 def import_record(
-    record: TimeRecording, told: ImportMap, file: str, assumed: Assumptions
-) -> tuple[SteadyStates | None, ImportMap, tuple[str, ...], StepCounts | None]:
+    record: TimeRecording, mapping: ImportMap, file: str, assumed: Assumptions
+) -> tuple[SteadyStates | None, ImportMap, tuple[Fact | str, ...], StepCounts | None]:
     """Steady states of a record of steps or of sweeps, or None for one that stays a record.
 
     Returns them, the map with what was found, notes, and how many of the steps were used.
     Raises `ValueError` with a question that names the option for what cannot be told.
     """
-    if told.record in ("decay", "broadband"):
-        return None, told, (), None
-    if not told.force:
+    if mapping.record in ("decay", "broadband"):
+        return None, mapping, (), None
+    if not mapping.force:
         raise ValueError(
             f"which channel of {file} is the force? --force CHANNEL names it, of "
             f"{', '.join(record.channel_names)}; --record decay says that there is none."
         )
-    if told.level and told.level not in (*_DIRECT, "auto", "file"):
+    if mapping.level and mapping.level not in (*_DIRECT, "auto", "file"):
         raise ValueError(
             f"--level must be one of force, drive, runs or file for time records, but is "
-            f"{told.level!r}."
+            f"{mapping.level!r}."
         )
-    responses = [one.channel for one in told.responses]
-    level = _DIRECT.get(told.level, "auto")
-    sensors = [one.sensor for one in told.responses]
-    drive = told.drive or None
+    level = _DIRECT.get(mapping.level, "auto")
+    said: dict[str, Any] = {
+        "level": level,
+        "sensors": [response.sensor for response in mapping.responses],
+        "drive": mapping.drive or None,
+    }
+    read = record, mapping.force, [response.channel for response in mapping.responses]
     failed = []
-    counts: StepCounts | None
-    for kind in (told.record,) if told.record else ("steps", "sweep"):
+    for kind in (mapping.record,) if mapping.record else ("steps", "sweep"):
         try:
             if kind == "steps":
-                found = stepped_sine_states(
-                    record,
-                    told.force,
-                    responses,
-                    level=level,
-                    sensors=sensors,
-                    drive=drive,
-                )
-                states, notes, counts = found.states, found.notes, found.counts
+                steps = stepped_sine_states(*read, **said)
+                states, notes, counts = steps.states, steps.notes, steps.counts
             else:
-                swept = sweep_states(
-                    record,
-                    told.force,
-                    responses,
-                    level=level,
-                    sensors=sensors,
-                    drive=drive,
-                )
-                states, notes, counts = swept.states, swept.remarks, None
+                swept = sweep_states(*read, **said)
+                states, notes, counts = swept.states, swept.notes, None
         except ValueError as error:
             failed.append(f"{kind}: {error}")
             continue
-        if not told.record:
-            assumed["record"] = Assumption("recognised in the record", kind)
-        if not told.level:
-            assumed["level"] = Assumption(f"{len(np.unique(states.level))} found")
-        return states, told._replace(record=kind, level=told.level or level), notes, counts
-    if told.record:
+        if not mapping.record:
+            assumed.add("record", Fact("record_recognised"), kind)
+        if not mapping.level:
+            assumed.add("level", Fact("levels_found", n=len(np.unique(states.level))))
+        return states, mapping._replace(record=kind, level=mapping.level or level), notes, counts
+    if mapping.record:
         raise ValueError(f"{file} does not read as {failed[0]}")
     raise ValueError(
         f"what is the record of {file}: --record steps, sweep, decay or broadband? It was read "
@@ -131,21 +122,18 @@ def import_record(
     )
 
 
-def record_columns(record: TimeRecording, told: ImportMap) -> dict[str, Channel]:
+def record_columns(record: TimeRecording, mapping: ImportMap) -> dict[str, Channel]:
     """Names of the columns of a record's table, with the channels that they hold, in SI."""
     columns: dict[str, Channel] = {}
-    by_name = {one.name: one for one in record.channels}
-    if told.force:
-        force = by_name[told.force]
+    by_name = {response.name: response for response in record.channels}
+    if mapping.force:
+        force = by_name[mapping.force]
         columns["drive_v" if force.quantity == "voltage" else "force_n"] = force
-    endings = {
-        "velocity": "velocity_m_s",
-        "acceleration": "acceleration_m_s2",
-        "displacement": "displacement_m",
-    }
-    for one in told.responses:
-        lead = "" if len(told.responses) == 1 else f"{one.sensor}."
-        columns[f"{lead}{endings[by_name[one.channel].quantity]}"] = by_name[one.channel]
+    endings = {"velocity": "m_s", "acceleration": "m_s2", "displacement": "m"}
+    for response in mapping.responses:
+        lead = "" if len(mapping.responses) == 1 else f"{response.sensor}."
+        quantity = by_name[response.channel].quantity
+        columns[f"{lead}{quantity}_{endings[quantity]}"] = by_name[response.channel]
     return columns
 
 

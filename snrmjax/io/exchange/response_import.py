@@ -1,90 +1,169 @@
 """Steady states of frequency responses and spectra (UFF 58 and its relatives)."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from snrmjax.io.exchange.import_levels import MeasuredPart
-from snrmjax.io.exchange.import_map import Assumption, Assumptions, ImportMap
+from snrmjax.io.exchange.import_map import Assumptions, ImportMap
 from snrmjax.io.exchange.import_units import Force, force_meaning, require_name
 from snrmjax.io.exchange.table_import import import_table
 from snrmjax.io.laboratory.contents import NumberTable
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
+from snrmjax.numerics.facts import Fact
 
 _FREQUENCY, _FORCE, _SET = "frequency of the lines", "force behind the responses", "set"
 _RULES = ("force", "runs", "file")
 
 
+class _Sets(NamedTuple):
+    """Frequency responses of a file, one set a level, and what a map says of them."""
+
+    sets: Sequence[FrequencyResponses]
+    z: Sequence[float]
+    mapping: ImportMap
+    file: str
+
+    @property
+    def has_force(self) -> bool:
+        """Whether the force is among the responses: they are spectra, or over a generator."""
+        named = [self.mapping.force in _names(each.responses) for each in self.sets]
+        return bool(self.mapping.force) and all(named)
+
+    def references(self) -> list[int]:
+        """Which reference of each set the responses are over."""
+        force, file, places = self.mapping.force, self.file, []
+        for each in self.sets:
+            names = _names(each.references)
+            if force and not self.has_force:
+                what = f"responses {', '.join(_names(each.responses))}, and over the references"
+                require_name("--force", force, names, what, file)
+                places.append(names.index(force))
+            elif len(names) > 1:
+                listed = ", ".join(names)
+                raise ValueError(
+                    f"which reference of {file} is the force? --force names it, of {listed}."
+                )
+            else:
+                places.append(0)
+        return places
+
+    def column(self, name: str, unit: str, option: str) -> tuple[np.ndarray, Channel]:
+        """All lines of a response, in SI or, where its unit is stated, as the file has them."""
+        parts = []
+        for each, reference in zip(self.sets, self.references(), strict=True):
+            require_name(option, name, _names(each.responses), "responses", self.file)
+            row = _names(each.responses).index(name)
+            channel = each.responses[row]
+            values = each.values[row, reference]
+            parts.append(values / channel.calibration if unit else values)
+        return np.concatenate(parts), channel
+
+    def amplitudes(self) -> np.ndarray:
+        """The stated amplitude of the force of each set."""
+        stated, file, n = self.mapping.force_amplitude, self.file, len(self.sets)
+        has_z = bool(np.isfinite(self.z).all())
+        if not stated:
+            levels = ", ".join(f"{value:g}" for value in self.z)
+            way = f"z if they are the z axis' ({levels}), else N" if has_z else "N, one for all or"
+            raise ValueError(
+                f"which amplitude had the force of {file}, whose responses are over it? "
+                f"--force-amplitude {way} one a set ({n}); `snrmjax modes` takes frequency "
+                "responses as they are."
+            )
+        if stated == ("z",) and not (has_z and np.all(np.asarray(self.z) > 0)):
+            raise ValueError(
+                f"--force-amplitude z needs positive values on the z axis, which {file} lacks: "
+                "state N."
+            )
+        values = np.asarray(self.z if stated == ("z",) else [float(word) for word in stated])
+        if values.size not in (1, n):
+            raise ValueError(
+                f"--force-amplitude must be one for all or one for each of the {n} sets of "
+                f"{file}, but {values.size} are stated."
+            )
+        return np.broadcast_to(values, (n,))
+
+    def force_behind(self) -> tuple[Force, bool]:
+        """What the responses are over, and whether the file says in which unit."""
+        mapping, file = self.mapping, self.file
+        pairs = zip(self.sets, self.references(), strict=True)
+        for channel in [each.references[reference] for each, reference in pairs]:
+            if mapping.force_unit and channel.si_unit not in ("", mapping.force_unit):
+                raise ValueError(
+                    f"--force-unit says {mapping.force_unit}, but the responses of {file} are over "
+                    f"{channel.name} in {channel.si_unit}, in which --force-amplitude is stated "
+                    "too: leave --force-unit out."
+                )
+        force = force_meaning(mapping, channel.si_unit or "N", f"{channel.name} of {file}")
+        return force, bool(channel.si_unit)
+
+
 def import_responses(
     sets: Sequence[FrequencyResponses],
     z: Sequence[float],
-    told: ImportMap,
+    mapping: ImportMap,
     file: str,
     assumed: Assumptions,
-) -> tuple[MeasuredPart, ImportMap, Force, list[str]]:
+) -> tuple[MeasuredPart, ImportMap, Force, list[Fact]]:
     """States of sets of frequency responses, one set a level.
 
     The force is a channel among the responses (spectra, or responses over a generator), or the
     reference, whose amplitude the map states: one for all, one a set, or the z axis.
     Raises `ValueError` with a question that names the option for what cannot be told.
     """
-    if not told.responses:
-        named = ", ".join(dict.fromkeys(c.name for one in sets for c in one.responses))
+    if not mapping.responses:
+        named = ", ".join(dict.fromkeys(name for each in sets for name in _names(each.responses)))
         raise ValueError(
             f"which channel of {file} is the response? --response CHANNEL names it, of {named}."
         )
-    if told.level not in ("", "z", "order", *_RULES):
-        raise ValueError(f"--level must be order, z, force or file of {file}, not {told.level!r}.")
-    if told.level == "z" and not np.isfinite(z).all():
+    if mapping.level not in ("", "z", "order", *_RULES):
+        raise ValueError(
+            f"--level must be order, z, force or file of {file}, not {mapping.level!r}."
+        )
+    if mapping.level == "z" and not np.isfinite(z).all():
         raise ValueError(f"--level z: {file} states no value on the z axis: --level order.")
-    spectra = bool(told.force) and all(_has(one, told.force) for one in sets)
-    keys = z if told.level == "z" else np.arange(1.0, len(sets) + 1)
-    columns = {_FREQUENCY: _joined([_or_nothing(one.frequency) for one in sets])}
-    columns[_SET] = np.repeat(keys, [one.frequency.size for one in sets])
+    source = _Sets(sets, z, mapping, file)
+    sizes = [each.frequency.size for each in sets]
+    numbers = z if mapping.level == "z" else np.arange(1.0, len(sets) + 1)
+    columns = {
+        _FREQUENCY: _or_nothing(np.concatenate([each.frequency for each in sets])),
+        _SET: np.repeat(numbers, sizes),
+    }
     units = {_FREQUENCY: "rad/s"}
-    rule = told.level if told.level in _RULES else _SET
-    as_table = told._replace(frequency=_FREQUENCY, frequency_unit="", level=rule)
-    if not spectra:
-        amplitude = _amplitudes(sets, z, told, file)
-        pairs = zip(amplitude, sets, strict=True)
-        columns[_FORCE] = _joined([np.full(one.frequency.size, size) for size, one in pairs])
-        units[_FORCE] = "V" if _reference_force(sets, told, file).is_voltage else "N"
+    rule = mapping.level if mapping.level in _RULES else _SET
+    as_table = mapping._replace(frequency=_FREQUENCY, frequency_unit="", level=rule)
+    if source.has_force:
+        name, unit = mapping.force, mapping.force_unit
+        values, channel = source.column(name, unit, "--force")
+        columns[name] = _or_nothing(values)
+        units[name] = channel.unit if unit else channel.si_unit
+        assumed.add("force_amplitude", Fact("spectra_of_one_reference"))
+    else:
+        force, is_stated = source.force_behind()
+        columns[_FORCE] = np.repeat(source.amplitudes(), sizes)
+        units[_FORCE] = "V" if force.is_voltage else "N"
         as_table = as_table._replace(
             force=_FORCE, force_unit="", force_amplitude=(), over_force=True
         )
-    asked = [(one.channel, one.unit, "--response") for one in told.responses]
-    for name, unit, option in [*asked, *([(told.force, told.force_unit, "--force")] * spectra)]:
-        parts = []
-        for one in sets:
-            row = _row(one, name, file, option)
-            channel = one.responses[row]
-            # A known channel's values are in SI already: its own unit, or the one that is stated.
-            values = one.values[row, _reference(one, told, file, spectra=spectra)]
-            parts.append(values / channel.calibration if unit else values)
-        columns[name] = _joined(parts) if option == "--response" else _or_nothing(_joined(parts))
-        if channel.quantity not in ("unknown", "voltage") or option == "--force":
-            units[name] = channel.unit if unit else _si(channel)
+    for response in mapping.responses:
+        name = response.channel
+        columns[name], channel = source.column(name, response.unit, "--response")
+        if channel.quantity not in ("unknown", "voltage"):
+            units[name] = channel.unit if response.unit else channel.si_unit
     table = NumberTable(file, columns, {name: unit for name, unit in units.items() if unit})
-    part, found, force, notes = import_table(table, as_table, file, assumed)
+    part, used, force, notes = import_table(table, as_table, file, assumed)
     del assumed["frequency_unit"]
-    if spectra:
-        assumed["force_amplitude"] = Assumption(
-            "spectra or responses over one reference, of amplitude 1"
-        )
-    else:
+    if not source.has_force:
         del assumed["force_unit"]
-        reference = sets[0].references[_reference(sets[0], told, file, spectra=False)]
-        if not _si(reference) and not told.force_unit:
-            assumed["force_unit"] = Assumption("the file states none of the reference", "N")
-    if not told.level:
-        assumed["level"] = Assumption("one level a set of responses, in the file's order")
-    told = told._replace(responses=found.responses, level=told.level or "order")
-    return part, told, force, notes
-
-
-def _joined(parts: Sequence[np.ndarray]) -> np.ndarray:
-    return np.concatenate(parts)
+        if not (is_stated or mapping.force_unit):
+            assumed.add("force_unit", Fact("reference_without_unit"), "N")
+    if not mapping.level:
+        assumed.add("level", Fact("level_a_set"))
+    mapping = mapping._replace(responses=used.responses, level=mapping.level or "order")
+    return part, mapping, force, notes
 
 
 def _or_nothing(values: np.ndarray) -> np.ndarray:
@@ -92,77 +171,5 @@ def _or_nothing(values: np.ndarray) -> np.ndarray:
     return np.where(values == 0, np.nan, values)
 
 
-def _reference_force(sets: Sequence[FrequencyResponses], told: ImportMap, file: str) -> Force:
-    """What the responses are over."""
-    for one in sets:
-        channel = one.references[_reference(one, told, file, spectra=False)]
-        if told.force_unit and _si(channel) not in ("", told.force_unit):
-            raise ValueError(
-                f"--force-unit says {told.force_unit}, but the responses of {file} are over "
-                f"{channel.name} in {_si(channel)}, in which --force-amplitude is stated too: "
-                "leave --force-unit out."
-            )
-    return force_meaning(told, _si(channel) or "N", f"{channel.name} of {file}")
-
-
-def _amplitudes(
-    sets: Sequence[FrequencyResponses], z: Sequence[float], told: ImportMap, file: str
-) -> np.ndarray:
-    stated = told.force_amplitude
-    if not stated:
-        levels = ", ".join(f"{value:g}" for value in z)
-        has_z = bool(np.isfinite(z).all())
-        way = f"z if they are the z axis' ({levels}), else N" if has_z else "N, one for all or"
-        raise ValueError(
-            f"which amplitude had the force of {file}, whose responses are over it? "
-            f"--force-amplitude {way} one a set ({len(sets)}); `snrmjax modes` takes frequency "
-            "responses as they are."
-        )
-    if stated == ("z",):
-        if not (np.isfinite(z).all() and np.all(np.asarray(z) > 0)):
-            raise ValueError(
-                f"--force-amplitude z needs positive values on the z axis, which {file} lacks: "
-                "state N."
-            )
-        values = np.asarray(z, dtype=float)
-    else:
-        values = np.asarray([float(one) for one in stated])
-    if values.size not in (1, len(sets)):
-        raise ValueError(
-            f"--force-amplitude must be one for all or one for each of the {len(sets)} sets of "
-            f"{file}, but {values.size} are stated."
-        )
-    return np.broadcast_to(values, (len(sets),))
-
-
-def _si(channel: Channel) -> str:
-    return channel.si_unit if channel.quantity != "unknown" else ""
-
-
-def _has(one: FrequencyResponses, name: str) -> bool:
-    return name in [channel.name for channel in one.responses]
-
-
-def _row(one: FrequencyResponses, name: str, file: str, option: str) -> int:
-    names = [channel.name for channel in one.responses]
-    require_name(option, name, names, "responses", file)
-    return names.index(name)
-
-
-def _reference(one: FrequencyResponses, told: ImportMap, file: str, *, spectra: bool) -> int:
-    names = [channel.name for channel in one.references]
-    if told.force and not spectra:
-        outputs = [channel.name for channel in one.responses]
-        require_name(
-            "--force",
-            told.force,
-            names,
-            f"responses {', '.join(outputs)}, and over the references",
-            file,
-        )
-        return names.index(told.force)
-    if len(names) > 1:
-        raise ValueError(
-            f"which reference of {file} is the force? --force names it, of {', '.join(names)}."
-        )
-    return 0
+def _names(channels: Sequence[Channel]) -> list[str]:
+    return [channel.name for channel in channels]

@@ -1,13 +1,13 @@
 """Steady states of a table of a laboratory: amplitude and phase, real and imaginary part."""
 
 import re
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float
 
-from snrmjax.io.exchange.import_errors import response_errors, with_errors_by_name
 from snrmjax.io.exchange.import_levels import MeasuredPart
-from snrmjax.io.exchange.import_map import Assumption, Assumptions, ImportMap, ResponseMap
+from snrmjax.io.exchange.import_map import Assumptions, ImportMap, ResponseMap
 from snrmjax.io.exchange.import_units import (
     Force,
     amplitude_factor,
@@ -23,207 +23,239 @@ from snrmjax.io.laboratory.names import role_of
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.velocity_states import velocity_factors
 from snrmjax.measure.states import UNNAMED_SENSOR
+from snrmjax.numerics.facts import Fact
+
+_DEVIATION = re.compile(r"stdev|stddev|std|sigma|deviation|dev")
 
 
-def columns_by_role(table: NumberTable, *roles: str) -> list[str]:
-    """Columns whose names say that they have one of these roles."""
-    return [name for name in table.columns if role_of(name) in roles]
+class _Source(NamedTuple):
+    """A table, what the map says of it, and what is assumed."""
+
+    table: NumberTable
+    mapping: ImportMap
+    file: str
+    assumed: Assumptions
+
+    def unit(self, name: str) -> str:
+        """The file's word for a column's unit."""
+        return self.table.units.get(name, "")
+
+    def column(self, name: str, option: str) -> np.ndarray:
+        """The column that an option names."""
+        require_name(option, name, self.table.columns, "columns", self.file)
+        return np.asarray(self.table.columns[name])
+
+    def real(self, name: str, option: str) -> Float[np.ndarray, " row"]:
+        """Likewise, of real numbers."""
+        values = self.column(name, option)
+        if np.iscomplexobj(values):
+            raise ValueError(f"{option} must name a column of real numbers, but {name} is complex.")
+        return values.astype(float)
+
+    def phasors(self, values: np.ndarray) -> np.ndarray:
+        """Phasors as e^(+iwt), conjugated where the sign of their phases is said to be another."""
+        if np.iscomplexobj(values) and not self.mapping.phase_sign:
+            self.assumed.add("phase_sign", Fact("phasors_turn_forward"), "lead")
+        phasors = values.astype(complex)
+        return phasors.conj() if self.mapping.phase_sign == "lag" else phasors
+
+    def phase(self, name: str, option: str) -> Float[np.ndarray, " row"]:
+        """A column of phases in rad, positive where the response leads."""
+        values = self.real(name, option)
+        return phase_in_rad(values, name, self.mapping, self.unit(name), self.assumed)
+
+    def with_role(self, *roles: str) -> list[str]:
+        """Columns whose names say that they have one of these roles."""
+        return [name for name in self.table.columns if role_of(name) in roles]
+
+    @property
+    def listed(self) -> str:
+        """The columns, as messages name them."""
+        return ", ".join(self.table.columns)
 
 
 def import_table(
-    table: NumberTable, told: ImportMap, file: str, assumed: Assumptions
-) -> tuple[MeasuredPart, ImportMap, Force, list[str]]:
+    table: NumberTable, mapping: ImportMap, file: str, assumed: Assumptions
+) -> tuple[MeasuredPart, ImportMap, Force, list[Fact]]:
     """States of a table, the map with what was found, the force's unit, and notes.
 
     Raises `ValueError` with a question that names the option for what cannot be told.
     """
-    frequency_name = told.frequency or _only(
-        table, ("frequency",), file, "frequency", "--frequency", assumed
-    )
-    told = told._replace(frequency=frequency_name)
+    source = _Source(table, mapping, file, assumed)
+    mapping = mapping._replace(frequency=mapping.frequency or _frequency_column(source))
+    source = source._replace(mapping=mapping)
     omega = frequency_in_rad(
-        _real(table, frequency_name, file, "--frequency"),
-        told,
-        table.units.get(frequency_name, ""),
+        source.real(mapping.frequency, "--frequency"),
+        mapping,
+        source.unit(mapping.frequency),
         assumed,
     )
-    if not told.responses:
-        raise ValueError(_ask_response(table, file))
-    force_name = told.force
-    force = Force(1.0, False, "N")
-    if force_name:
-        assumed.unit("force_unit", told.force_unit, table.units.get(force_name, ""))
-        force = force_meaning(told, table.units.get(force_name, ""), f"{force_name} of {file}")
-        raw = _column(table, force_name, file, "--force")
-        if not np.iscomplexobj(raw) and np.nanmin(raw, initial=1.0) < 0:
-            raise ValueError(
-                f"{force_name} of {file} has negative amplitudes: --force names another column."
-            )
-        size = _complex(raw, told, assumed) * force.factor
-        if told.force_phase:
-            angle = _phase(table, told.force_phase, told, file, assumed, "--force-phase")
-            size = size * np.exp(1j * angle)
-    elif len(told.force_amplitude) == 1 and told.force_amplitude[0] != "z":
-        size = np.full(table.n_rows, float(told.force_amplitude[0]), dtype=complex)
-    else:
-        raise ValueError(_ask_force(table, file))
-    units = {} if told.over_force else _response_units(table, told)
-    if force_name:
-        units[force_name] = force.unit
-    peak = amplitude_factor(told, units, assumed) if units else 1.0
-    if force_name:
-        size = size * peak
+    if not mapping.responses:
+        raise ValueError(
+            f"which column of {file} is the response? --response COLUMN:velocity (or acceleration, "
+            f"displacement) names it, of {source.listed}."
+        )
+    size, force = _force(source)
+    units = {
+        response.channel: response.unit or source.unit(response.channel)
+        for response in mapping.responses
+    }
+    units = {} if mapping.over_force else units
+    units |= {mapping.force: force.unit} if mapping.force else {}
+    peak = amplitude_factor(mapping, units, assumed) if units else 1.0
+    size = size * peak if mapping.force else size
     # Over the force only its amplitude counts; else phases are of one clock with the force's own.
-    turn = np.abs(size) if told.over_force else peak * np.exp(-1j * np.angle(size))
+    turn = np.abs(size) if mapping.over_force else peak * np.exp(-1j * np.angle(size))
     velocity, responses, errors = [], [], []
-    for k, one in enumerate(told.responses):
-        one = with_errors_by_name(table, one, assumed, k + 1)
-        row, filled, scale = _response(table, one, told, omega, file, assumed, k + 1)
+    for k, response in enumerate(mapping.responses):
+        response = _with_errors_by_name(source, response, k + 1)
+        row, filled, scale = _response(source, response, omega, k + 1)
         velocity.append(row * turn)
         responses.append(filled)
-        errors.append(response_errors(table, filled, told, file, np.abs(scale * turn)))
+        errors.append(_errors(source, filled, np.abs(scale * turn)))
     phasors = np.stack(velocity, axis=1)
     amplitude_std, phase_std = np.moveaxis(np.array(errors), (0, 1, 2), (2, 0, 1))
-    level, key = _level(table, told, file, assumed)
-    told = told._replace(responses=tuple(responses), level=level)
+    level, key = _level(source)
+    mapping = mapping._replace(responses=tuple(responses), level=level)
     good = np.isfinite(omega) & np.isfinite(size) & np.isfinite(phasors).any(axis=1)
-    notes = []
-    if not good.all():
-        notes.append(
-            f"{int(np.sum(~good))} of {len(good)} rows of {file} are incomplete, left out."
-        )
     _check(omega[good], np.abs(size[good]), file)
     part = MeasuredPart(
         *(omega[good], np.abs(size[good]), phasors[good], None if key is None else key[good]),
         *(amplitude_std[good], phase_std[good]),
     )
-    return part, told, force, notes
+    left_out = int(np.sum(~good))
+    notes = [Fact("rows_incomplete", n=left_out, of=len(good), file=file)] if left_out else []
+    return part, mapping, force, notes
 
 
-def _response_units(table: NumberTable, told: ImportMap) -> dict[str, str]:
-    """The unit of each response, stated or of the file."""
-    return {one.channel: one.unit or table.units.get(one.channel, "") for one in told.responses}
+def _frequency_column(source: _Source) -> str:
+    """The only column that is a frequency by its name."""
+    columns = source.with_role("frequency")
+    if len(columns) != 1:
+        raise ValueError(
+            f"which column of {source.file} is the frequency? --frequency names it, of "
+            f"{', '.join(columns) or source.listed}."
+        )
+    source.assumed.add("frequency", Fact("column_by_name"))
+    return columns[0]
+
+
+def _force(source: _Source) -> tuple[Complex[np.ndarray, " row"], Force]:
+    """The force of every row, of a column or as stated."""
+    mapping, file, name = source.mapping, source.file, source.mapping.force
+    if not name:
+        if len(mapping.force_amplitude) != 1 or mapping.force_amplitude[0] == "z":
+            raise ValueError(
+                f"which column of {file} is the force? --force COLUMN names it, of "
+                f"{source.listed}; --force-amplitude N states one that no column has."
+            )
+        stated = float(mapping.force_amplitude[0])
+        return np.full(source.table.n_rows, stated, dtype=complex), Force(1.0, False, "N")
+    source.assumed.unit("force_unit", mapping.force_unit, source.unit(name))
+    force = force_meaning(mapping, source.unit(name), f"{name} of {file}")
+    raw = source.column(name, "--force")
+    if not np.iscomplexobj(raw) and np.nanmin(raw, initial=1.0) < 0:
+        raise ValueError(f"{name} of {file} has negative amplitudes: --force names another column.")
+    size = source.phasors(raw) * force.factor
+    if mapping.force_phase:
+        size = size * np.exp(1j * source.phase(mapping.force_phase, "--force-phase"))
+    return size, force
 
 
 def _response(
-    table: NumberTable,
-    one: ResponseMap,
-    told: ImportMap,
-    omega: Float[np.ndarray, " row"],
-    file: str,
-    assumed: Assumptions,
-    number: int,
+    source: _Source, response: ResponseMap, omega: Float[np.ndarray, " row"], number: int
 ) -> tuple[Complex[np.ndarray, " row"], ResponseMap, Complex[np.ndarray, " row"]]:
     """The velocity phasors of one response (over the force where the table has it so).
 
     And the map with what was found, and what a number of the response is multiplied with.
     """
-    values = _column(table, one.channel, file, "--response")
+    mapping, file, assumed, name = source.mapping, source.file, source.assumed, response.channel
+    values = source.column(name, "--response")
     quantity, factor, unit = motion_meaning(
-        one.quantity,
-        one.unit,
-        table.units.get(one.channel, ""),
-        one.channel,
-        is_ratio=told.over_force,
+        response.quantity, response.unit, source.unit(name), name, is_ratio=mapping.over_force
     )
-    assumed.unit(f"response {number}.unit", one.unit, table.units.get(one.channel, ""))
-    if not one.quantity:
-        assumed[f"response {number}.quantity"] = Assumption(f"the unit {unit} says so")
-    role = role_of(one.channel)
-    imaginary, phase = one.imaginary, one.phase
+    assumed.unit(f"response {number}.unit", response.unit, source.unit(name))
+    if not response.quantity:
+        assumed.add(f"response {number}.quantity", Fact("quantity_by_unit", unit=unit))
+    imaginary, phase = response.imaginary, response.phase
+    if not (np.iscomplexobj(values) or imaginary or phase):
+        imaginary, phase = _partner(source, name)
+        if not (imaginary or phase):
+            raise ValueError(
+                f"where is the phase of {name} of {file}? --phase COLUMN names it, or "
+                f"--imaginary COLUMN where {name} is a real part; there are {source.listed}."
+            )
+        key = "imaginary" if imaginary else "phase"
+        assumed.add(f"response {number}.{key}", Fact("by_names_of_columns"))
     if np.iscomplexobj(values):
-        phasor = _complex(values, told, assumed)
+        phasor = source.phasors(values)
+    elif imaginary:
+        phasor = np.empty(len(values), dtype=complex)
+        phasor.real, phasor.imag = values, source.real(imaginary, "--imaginary")
+        phasor = phasor.conj() if mapping.phase_sign == "lag" else phasor
+        if not mapping.phase_sign:
+            assumed.add("phase_sign", Fact("imaginary_ahead_of_the_force"), "lead")
     else:
-        if not imaginary and not phase:
-            imaginary, phase = _partner(table, one.channel, role, told)
-            found = imaginary or phase
-            if not found:
-                raise ValueError(
-                    f"where is the phase of {one.channel} of {file}? --phase COLUMN names it, or "
-                    f"--imaginary COLUMN where {one.channel} is a real part; there are "
-                    f"{', '.join(table.columns)}."
-                )
-            key = "imaginary" if imaginary else "phase"
-            assumed[f"response {number}.{key}"] = Assumption("by the names of the columns")
-        if imaginary:
-            phasor = np.empty(len(values), dtype=complex)
-            phasor.real, phasor.imag = values, _real(table, imaginary, file, "--imaginary")
-            if told.phase_sign == "lag":
-                phasor = phasor.conj()
-            elif not told.phase_sign:
-                assumed["phase_sign"] = Assumption(
-                    "a positive imaginary part is ahead of the force", "lead"
-                )
-        else:
-            if np.nanmin(values, initial=0.0) < 0:
-                raise ValueError(
-                    f"{one.channel} of {file} has negative amplitudes: is it a real part? "
-                    "--imaginary COLUMN names the other one."
-                )
-            phasor = values * np.exp(1j * _phase(table, phase, told, file, assumed, "--phase"))
-    sensor = one.sensor or (UNNAMED_SENSOR[0] if len(told.responses) == 1 else one.channel)
-    if not one.sensor:
-        assumed[f"response {number}.sensor"] = Assumption("not stated; --sensor names it")
-    turn = velocity_factors([Channel(one.channel, quantity)], [1], omega)[:, 0, 0]  # type: ignore[arg-type]
-    filled = one._replace(quantity=quantity, sensor=sensor, phase=phase, imaginary=imaginary)
+        if np.nanmin(values, initial=0.0) < 0:
+            raise ValueError(
+                f"{name} of {file} has negative amplitudes: is it a real part? "
+                "--imaginary COLUMN names the other one."
+            )
+        phasor = values * np.exp(1j * source.phase(phase, "--phase"))
+    sensor = sensor_of(response, mapping, number, assumed)
+    turn = velocity_factors([Channel(name, quantity)], [1], omega)[:, 0, 0]  # type: ignore[arg-type]
+    filled = response._replace(quantity=quantity, sensor=sensor, phase=phase, imaginary=imaginary)
     return phasor * factor * turn, filled, factor * turn
 
 
-def _complex(values: np.ndarray, told: ImportMap, assumed: Assumptions) -> np.ndarray:
-    """Phasors as e^(+iwt), conjugated where the sign of their phases is said to be the other."""
-    if np.iscomplexobj(values) and not told.phase_sign:
-        assumed["phase_sign"] = Assumption("phasors are e^(+iwt)", "lead")
-    phasors = values.astype(complex)
-    return phasors.conj() if told.phase_sign == "lag" else phasors
+def sensor_of(response: ResponseMap, mapping: ImportMap, number: int, assumed: Assumptions) -> str:
+    """The sensor of a response: stated, the only one, or named like its channel."""
+    if not response.sensor:
+        assumed.add(f"response {number}.sensor", Fact("sensor_not_stated"))
+    return response.sensor or (
+        UNNAMED_SENSOR[0] if len(mapping.responses) == 1 else response.channel
+    )
 
 
-def _partner(table: NumberTable, channel: str, role: str, told: ImportMap) -> tuple[str, str]:
+def _partner(source: _Source, channel: str) -> tuple[str, str]:
     """The column of the imaginary part, or of the phase, by names: nothing unless it is one."""
-    if role == "real":
+    if role_of(channel) == "real":
         swapped = _swap(channel)
-        if swapped in table.columns:
+        if swapped in source.table.columns:
             return swapped, ""
-        others = columns_by_role(table, "imaginary")
+        others = source.with_role("imaginary")
         return (others[0] if len(others) == 1 else ""), ""
-    phases = [name for name in columns_by_role(table, "phase") if name != told.force_phase]
-    return "", (phases[0] if len(phases) == 1 and len(told.responses) == 1 else "")
+    phases = [name for name in source.with_role("phase") if name != source.mapping.force_phase]
+    return "", (phases[0] if len(phases) == 1 and len(source.mapping.responses) == 1 else "")
 
 
 def _swap(name: str) -> str:
     """The name of an imaginary part beside that of a real part."""
     for old, new in (("real", "imag"), ("Real", "Imag"), ("re", "im"), ("Re", "Im")):
-        found = re.sub(rf"(?<![A-Za-z]){old}(?![A-Za-z])|(?<=_){old}(?=_|$)", new, name)
-        if found != name:
-            return found
-    return {"X": "Y", "x": "y"}.get(name[-1:], "") and name[:-1] + {"X": "Y", "x": "y"}[name[-1]]
+        swapped = re.sub(rf"(?<![A-Za-z]){old}(?![A-Za-z])|(?<=_){old}(?=_|$)", new, name)
+        if swapped != name:
+            return swapped
+    last = {"X": "Y", "x": "y"}.get(name[-1:], "")
+    return last and name[:-1] + last
 
 
-def _phase(
-    table: NumberTable, column: str, told: ImportMap, file: str, assumed: Assumptions, option: str
-) -> Float[np.ndarray, " row"]:
-    values = _real(table, column, file, option)
-    return phase_in_rad(values, column, told, table.units.get(column, ""), assumed)
-
-
-def _level(
-    table: NumberTable, told: ImportMap, file: str, assumed: Assumptions
-) -> tuple[str, np.ndarray | None]:
+def _level(source: _Source) -> tuple[str, np.ndarray | None]:
     """The rule for levels, and the numbers of a column where one has them."""
-    if told.level in ("force", "runs", "file"):
-        return told.level, None
-    if told.level in table.columns:
-        return told.level, _real(table, told.level, file, "--level")
-    if told.level:
-        near = near_miss(told.level, table.columns)
+    rule, columns = source.mapping.level, source.table.columns
+    if rule in ("force", "runs", "file"):
+        return rule, None
+    if rule in columns:
+        return rule, source.real(rule, "--level")
+    if rule:
+        near = near_miss(rule, columns)
         raise ValueError(
-            f"--level must be force, runs, file or a column of {file} "
-            f"({', '.join(table.columns)}), but is {told.level!r}"
-            f"{f' (did you mean {near}?)' if near else ''}."
+            f"--level must be force, runs, file or a column of {source.file} "
+            f"({source.listed}), but is {rule!r}{f' (did you mean {near}?)' if near else ''}."
         )
-    columns = columns_by_role(table, "level")
-    if len(columns) == 1 and np.isfinite(_real(table, columns[0], file, "--level")).all():
-        assumed["level"] = Assumption("the column's name says so")
-        return columns[0], _real(table, columns[0], file, "--level")
+    named = source.with_role("level")
+    if len(named) == 1 and np.isfinite(keys := source.real(named[0], "--level")).all():
+        source.assumed.add("level", Fact("column_by_name"))
+        return named[0], keys
     return "", None
 
 
@@ -239,44 +271,69 @@ def _check(omega: Float[np.ndarray, " row"], force: Float[np.ndarray, " row"], f
             )
 
 
-def _column(table: NumberTable, name: str, file: str, option: str) -> np.ndarray:
-    require_name(option, name, table.columns, "columns", file)
-    return np.asarray(table.columns[name])
+# Standard deviations, as lock-in amplifiers list them.
 
 
-def _real(table: NumberTable, name: str, file: str, option: str) -> np.ndarray:
-    values = _column(table, name, file, option)
-    if np.iscomplexobj(values):
-        raise ValueError(f"{option} must name a column of real numbers, but {name} is complex.")
-    return values.astype(float)
+def _with_errors_by_name(source: _Source, response: ResponseMap, number: int) -> ResponseMap:
+    """A response with the columns of its errors: those that are named after it and its phase."""
+    phases = source.with_role("phase")
+    phase = response.phase or (phases[0] if len(phases) == 1 else "")
+    named_columns: dict[str, Any] = {}
+    for key, of in {"amplitude_std": response.channel, "phase_std": phase}.items():
+        named = [name for name in source.with_role("deviation") if _bare(name) == _bare(of)]
+        if of and not getattr(response, key) and len(named) == 1:
+            named_columns[key] = named[0]
+            source.assumed.add(f"response {number}.{key}", Fact("deviation_of_one_row"))
+    return response._replace(**named_columns)
 
 
-def _only(
-    table: NumberTable,
-    roles: tuple[str, ...],
-    file: str,
-    what: str,
-    option: str,
-    assumed: Assumptions,
-) -> str:
-    """The only column with a role. Raises `ValueError` with a question otherwise."""
-    found = columns_by_role(table, *roles)
-    if len(found) != 1:
-        listed = ", ".join(found or table.columns)
-        raise ValueError(f"which column of {file} is the {what}? {option} names it, of {listed}.")
-    assumed[what] = Assumption("the column's name says so")
-    return found[0]
+def _errors(
+    source: _Source, response: ResponseMap, scale: Float[np.ndarray, " row"]
+) -> Float[np.ndarray, "2 row"]:
+    """1σ of the velocity (m/s) and of the phase (rad) of every row; NaN where none is stated.
 
-
-def _ask_response(table: NumberTable, file: str) -> str:
-    return (
-        f"which column of {file} is the response? --response COLUMN:velocity (or acceleration, "
-        f"displacement) names it, of {', '.join(table.columns)}."
+    Arguments: `scale` is what an amplitude of the table is multiplied with; phases' errors have
+    the unit of the phases.
+    """
+    turn = 1.0 if _in_radians(source, response) else np.pi / 180
+    stated = (
+        (response.amplitude_std, "--amplitude-std", scale),
+        (response.phase_std, "--phase-std", np.asarray(turn)),
+    )
+    missing = np.full(source.table.n_rows, np.nan)
+    return np.stack(
+        [_deviations(source, *each) * by if each[0] else missing for *each, by in stated]
     )
 
 
-def _ask_force(table: NumberTable, file: str) -> str:
-    return (
-        f"which column of {file} is the force? --force COLUMN names it, of "
-        f"{', '.join(table.columns)}; --force-amplitude N states one that no column has."
-    )
+def _in_radians(source: _Source, response: ResponseMap) -> bool:
+    """Whether an error of the phase is in radians: as its name, its unit or the phase's says."""
+    for name in (response.phase_std, response.phase):
+        unit = source.unit(name).lower()
+        if unit.startswith("rad") or re.search(r"rad(?![a-z])", name.lower()):
+            return True
+        if unit.startswith(("deg", "°")) or "deg" in name.lower():
+            return False
+    return source.mapping.phase_unit == "rad"
+
+
+def _bare(name: str) -> str:
+    """A name in small letters without its unit and without a word for a deviation.
+
+    >>> _bare("R"), _bare("R_std"), _bare("Theta [deg]"), _bare("ThetaDev"), _bare("phase_std_deg")
+    ('r', 'r', 'theta', 'theta', 'phase')
+    """
+    plain = re.sub(r"[\[(].*[\])]\s*$", "", name.strip()).lower()
+    letters = re.sub(r"[\s_.\-]", "", _DEVIATION.sub("", plain))
+    return re.sub(r"(deg|rad)$", "", letters)
+
+
+def _deviations(source: _Source, name: str, option: str) -> Float[np.ndarray, " row"]:
+    values = np.real(source.column(name, option)).astype(float)
+    bad = np.flatnonzero(values < 0)
+    if bad.size:
+        raise ValueError(
+            f"{name} of {source.file} must be standard deviations, not negative, but row "
+            f"{bad[0] + 1} has {values[bad[0]]:g}: {option} names another column."
+        )
+    return values

@@ -1,15 +1,4 @@
-from .contents import (
-    LaboratoryFile,
-    NumberTable,
-    TextFormat,
-    number_table,
-)
+from .contents import TextFormat
 from .reading import read_laboratory_file
 
-__all__ = [
-    "LaboratoryFile",
-    "NumberTable",
-    "TextFormat",
-    "number_table",
-    "read_laboratory_file",
-]
+__all__ = ["TextFormat", "read_laboratory_file"]

@@ -8,18 +8,18 @@ from snrmjax.io.laboratory.reading import read_laboratory_file
 from snrmjax.measure.recordings.time_recording import TimeRecording
 
 
-def write_checkup(path: FilePath, found: Checkup) -> None:
+def write_checkup(path: FilePath, checkup: Checkup) -> None:
     """Write findings as a JSON list of kind, severity, where, evidence and mend.
 
     The list is empty where nothing was found. Raises `ValueError` when the file cannot be written.
     """
-    findings = [one.as_dict() for one in found.findings]
+    findings = [finding.as_dict() for finding in checkup.findings]
     write_atomically(path, json.dumps(findings, indent=1, ensure_ascii=False) + "\n")
 
 
 def read_recordings(path: FilePath) -> tuple[TimeRecording, ...]:
     """The time records of a laboratory's file. Raises `ValueError` where it holds none."""
-    found = read_laboratory_file(path).recordings
-    if not found:
+    recordings = read_laboratory_file(path).recordings
+    if not recordings:
         raise ValueError(f"{file_name(path)} holds no time record.")
-    return tuple(found)
+    return tuple(recordings)

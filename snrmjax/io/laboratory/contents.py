@@ -8,6 +8,7 @@ from jaxtyping import Num
 
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
 from snrmjax.measure.recordings.time_recording import TimeRecording
+from snrmjax.numerics.facts import Fact
 
 Kind = Literal["uff", "matlab", "hdf5", "netcdf", "tdms", "csv"]
 
@@ -24,7 +25,6 @@ class NumberTable(NamedTuple):
     name: str
     columns: Mapping[str, Num[np.ndarray, " row"]]
     units: Mapping[str, str] = {}
-    notes: tuple[str, ...] = ()
     words: Mapping[str, tuple[str, ...]] = {}
 
     @property
@@ -57,7 +57,7 @@ class LaboratoryFile(NamedTuple):
     recordings: tuple[TimeRecording, ...] = ()
     responses: tuple[FrequencyResponses, ...] = ()
     tables: tuple[NumberTable, ...] = ()
-    notes: tuple[str, ...] = ()
+    notes: tuple[Fact, ...] = ()
     levels: tuple[float, ...] = ()
 
     @property
@@ -70,7 +70,6 @@ def number_table(
     name: str,
     columns: Mapping[str, Num[np.ndarray, " row"]],
     units: Mapping[str, str] | None = None,
-    notes: Sequence[str] = (),
     words: Mapping[str, Sequence[str]] | None = None,
 ) -> NumberTable:
     """A table of numbers, checked.
@@ -103,4 +102,4 @@ def number_table(
     for key, column in texts.items():
         if len(column) != n_rows or key in held:
             raise ValueError(f"column {key} of table {name} must have {n_rows} texts of its own.")
-    return NumberTable(name, held, known, tuple(notes), texts)
+    return NumberTable(name, held, known, texts)

@@ -1,49 +1,81 @@
 """Units as laboratories write them, and what they mean in SI."""
 
+import ast
 import functools
+import importlib
 import math
 import re
 from decimal import Decimal
 from typing import Any, NamedTuple, get_args
 
 from snrmjax.io.files import shown
-from snrmjax.io.laboratory.libraries import library
 from snrmjax.measure.recordings.channels import Quantity
 
 _LONGEST = 40
 _ALLOWED = re.compile(r"[A-Za-zµμΩ°%/*^·.()0-9 _+\-⁻¹²³]*")
 _NUMBER = re.compile(r"\s*([+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?)\s*(?=\D|$)")
-_SUPERSCRIPTS = str.maketrans({"⁻": "-", "¹": "1", "²": "2", "³": "3"})
+_AS_PYTHON = str.maketrans(
+    {"⁻": "-", "¹": "1", "²": "2", "³": "3", "·": "*", ".": "*", "µ": "u", "μ": "u"}
+    | {"°": " deg ", "%": " percent "}
+)
 _NOTHING = {"", "-", "--", "1", "eu", "none", "unknown", "n/a", "na", "a.u."}
-_WORDS = {
-    "g": "standard_gravity",  # in vibration tests g is gravity, never gram
-    "G": "standard_gravity",
-    "gn": "standard_gravity",
-    "g_n": "standard_gravity",
-    "gs": "standard_gravity",
-    "ips": "(inch/second)",
-    "mil": "thou",
-    "mils": "thou",
-    "lb": "lbf",
-    "lbs": "lbf",
-    "kp": "kgf",
-    "°": "degree",
-}
 _ODD = re.compile(r"[0-9.]{2,}|\^\s*[^-1-9(]|\*\*|\^.*\^.*\^")
 _SIZE = {
-    "rms": "rms",
-    "eff": "rms",
-    "pk": "peak",
-    "peak": "peak",
-    "pp": "peak_to_peak",
-    "pk-pk": "peak_to_peak",
-    "p-p": "peak_to_peak",
-    "pkpk": "peak_to_peak",
+    **{"rms": "rms", "eff": "rms", "pk": "peak", "peak": "peak"},
+    **dict.fromkeys(("pp", "pk-pk", "p-p", "pkpk"), "peak_to_peak"),
 }
 _SIZED = re.compile(
     r"(?<![A-Za-z])(?:\(|\[)?(pk-pk|p-p|pkpk|peak|rms|eff|pk|pp)(?:\)|\])?\s*$|(?<=V)(rms|pp|pk)$",
     re.IGNORECASE,
 )
+
+_Powers = tuple[int, int, int, int, int]  # of metre, kilogram, second, ampere and radian
+_VOLT: _Powers = (2, 1, -3, -1, 0)
+_DIMENSIONS: dict[str, _Powers] = {
+    "force": (1, 1, -2, 0, 0),
+    "displacement": (1, 0, 0, 0, 0),
+    "velocity": (1, 0, -1, 0, 0),
+    "acceleration": (1, 0, -2, 0, 0),
+    "voltage": _VOLT,
+    "frequency": (0, 0, -1, 0, 0),
+    "angle": (0, 0, 0, 0, 1),
+    "time": (0, 0, 1, 0, 0),
+    "mass": (0, 1, 0, 0, 0),
+}
+_PI = "3.141592653589793238462643383279502884"
+# Spellings, size in SI, powers. In vibration tests g is gravity, never gram, and lb a force.
+_KNOWN: tuple[tuple[str, Decimal, _Powers], ...] = (
+    ("m meter metre", Decimal(1), _DIMENSIONS["displacement"]),
+    ("in inch", Decimal("0.0254"), _DIMENSIONS["displacement"]),
+    ("ft foot feet", Decimal("0.3048"), _DIMENSIONS["displacement"]),
+    ("mil mils thou", Decimal("0.0000254"), _DIMENSIONS["displacement"]),
+    ("micron", Decimal("1e-6"), _DIMENSIONS["displacement"]),
+    ("ips", Decimal("0.0254"), _DIMENSIONS["velocity"]),
+    ("g G gn g_n gs", Decimal("9.80665"), _DIMENSIONS["acceleration"]),
+    ("N newton", Decimal(1), _DIMENSIONS["force"]),
+    ("lbf lb lbs", Decimal("4.4482216152605"), _DIMENSIONS["force"]),
+    ("kgf kp", Decimal("9.80665"), _DIMENSIONS["force"]),
+    ("V volt", Decimal(1), _VOLT),
+    ("A ampere", Decimal(1), (0, 0, 0, 1, 0)),
+    ("s sec second", Decimal(1), _DIMENSIONS["time"]),
+    ("min minute", Decimal(60), _DIMENSIONS["time"]),
+    ("h hour", Decimal(3600), _DIMENSIONS["time"]),
+    ("kg", Decimal(1), _DIMENSIONS["mass"]),
+    ("Hz hertz", Decimal(1), _DIMENSIONS["frequency"]),
+    ("rpm", Decimal(_PI) / 30, (0, 0, -1, 0, 1)),
+    ("rad radian", Decimal(1), _DIMENSIONS["angle"]),
+    ("deg degree", Decimal(_PI) / 180, _DIMENSIONS["angle"]),
+    ("Pa pascal", Decimal(1), (-1, 1, -2, 0, 0)),
+    ("1", Decimal(1), (0, 0, 0, 0, 0)),
+)
+_UNITS = {name: (size, powers) for names, size, powers in _KNOWN for name in names.split()}
+_ALONE = {"1", "G", "gs", "ips", "mils", "lb", "lbs", "h", "min"}  # without a prefix
+_GRAM = (Decimal("0.001"), _DIMENSIONS["mass"])
+_PREFIXES = {
+    **{"n": -9, "u": -6, "m": -3, "c": -2, "d": -1, "h": 2, "k": 3, "M": 6, "G": 9},
+    **{"nano": -9, "micro": -6, "milli": -3, "centi": -2, "kilo": 3, "mega": 6},
+}
+_WITH_VOLTS = ("force", "displacement", "velocity", "acceleration")
 
 
 class UnitMeaning(NamedTuple):
@@ -64,14 +96,15 @@ class UnitMeaning(NamedTuple):
     def quantity(self) -> Quantity:
         """The quantity of a channel in that unit."""
         known: tuple[Quantity, ...] = get_args(Quantity)
-        return next((one for one in known if one == self.dimension), "unknown")
+        return next((quantity for quantity in known if quantity == self.dimension), "unknown")
 
 
 @functools.lru_cache(maxsize=1024)
 def unit_meaning(text: str) -> UnitMeaning:
     """What a unit means: "N", "m/s²", "g" (gravity), "in/s", "lbf", "10.2 mV/g", "mm/s rms".
 
-    An empty text, "EU" and "-" are of unknown dimension with the factor 1.
+    An empty text, "EU" and "-" are of unknown dimension with the factor 1. Units beyond those of
+    the table in this module are Pint's, where it is installed.
     Raises `ValueError` for what is no unit.
 
     >>> unit_meaning("g").factor, unit_meaning("mm/s").dimension
@@ -81,7 +114,7 @@ def unit_meaning(text: str) -> UnitMeaning:
     if plain.lower() in _NOTHING:
         return UnitMeaning("unknown", 1.0)
     if len(plain) > _LONGEST or not _ALLOWED.fullmatch(plain):
-        raise ValueError(f"{shown(text)} is not understood as a unit.")
+        raise _not_understood(text)
     size = ""
     match = _SIZED.search(plain)
     if match is not None:
@@ -92,12 +125,19 @@ def unit_meaning(text: str) -> UnitMeaning:
     if number:
         plain = plain[number.end() :].strip()
     if value <= 0 or not math.isfinite(value) or not plain:
-        raise ValueError(f"{shown(text)} is not understood as a unit.")
-    dimension, factor = _parsed(plain, text)
-    if dimension.startswith("volt per "):
-        return UnitMeaning(dimension.removeprefix("volt per "), 1 / (value * factor), size, True)
-    if dimension.endswith(" per volt"):
-        return UnitMeaning(dimension.removesuffix(" per volt"), value * factor, size, True)
+        raise _not_understood(text)
+    factor, powers = _parsed(plain, text)
+    for dimension in _WITH_VOLTS:
+        if powers[:4] == _product(_VOLT, _DIMENSIONS[dimension], -1)[:4]:
+            return UnitMeaning(dimension, 1 / (value * factor), size, True)
+        if powers[:4] == _product(_DIMENSIONS[dimension], _VOLT, -1)[:4]:
+            return UnitMeaning(dimension, value * factor, size, True)
+    alike = (name for name, of in _DIMENSIONS.items() if powers[:4] == of[:4])
+    dimension = next(alike, "other")
+    if dimension == "frequency" and not powers[4]:
+        factor *= 2 * math.pi
+    if dimension == "angle" and not powers[4]:
+        dimension = "other"
     return UnitMeaning(dimension, value * factor, size)
 
 
@@ -112,60 +152,75 @@ def channel_meaning(text: str) -> tuple[Quantity, float]:
     return meaning.quantity, meaning.factor
 
 
-def _parsed(plain: str, text: str) -> tuple[str, float]:
-    """Dimension and factor of a unit without number and suffix."""
-    words = plain.translate(_SUPERSCRIPTS).replace("·", "*").replace("μ", "µ")
+def _not_understood(text: str, why: str = "") -> ValueError:
+    return ValueError(f"{shown(text)} is not understood as a unit{why}.")
+
+
+def _product(first_powers: _Powers, other: _Powers, power: int) -> _Powers:
+    """The powers of `one` times `other` to a power."""
+    first, second, third, fourth, fifth = (
+        a + power * b for a, b in zip(first_powers, other, strict=True)
+    )
+    return first, second, third, fourth, fifth
+
+
+def _parsed(plain: str, text: str) -> tuple[float, _Powers]:
+    """Size in SI and powers of a unit without number and suffix."""
+    words = plain.translate(_AS_PYTHON)
     words = re.sub(r"(?<=[A-Za-z])\^?(-?[1-9])(?![0-9])", r"^\1", words)
     # pC/N has the dimension of m/V: a charge needs its amplifier's gain, and is no voltage.
-    if re.search(r"(?<![A-Za-z])[a-zµ]?C(?![A-Za-z])", words) or _ODD.search(words):
-        raise ValueError(f"{shown(text)} is not understood as a unit.")
-    words = re.sub(r"[A-Za-z_µ°]+", lambda found: _WORDS.get(found[0], found[0]), words)
-    registry = _registry()
+    if re.search(r"(?<![A-Za-z])[a-z]?C(?![A-Za-z])", words) or _ODD.search(words):
+        raise _not_understood(text)
+    times = re.sub(r"(?<=[\w)])\s+(?=[\w(])", "*", words.strip())
+    named = re.sub(r"[^\W\d]+", r"u_\g<0>", times).replace("^", "**")  # "in" is Python's own word
     try:
-        base = registry.Quantity(Decimal(1), registry.parse_units(words)).to_base_units()
-        factor = float(base.magnitude)
+        size, powers = _evaluated(ast.parse(named, mode="eval").body)
+    except ImportError as error:
+        needed = " without the package pint (pip install 'snrmjax[lab]')"
+        raise _not_understood(text, needed) from error
     except Exception as error:  # Pint has many, AssertionError and tokenize's among them
-        raise ValueError(f"{shown(text)} is not understood as a unit.") from error
+        raise _not_understood(text) from error
+    factor = float(size)
     if not (math.isfinite(factor) and factor > 0):
-        raise ValueError(f"{shown(text)} is not understood as a unit.")
-    alike = [name for name, like in _likes().items() if base.dimensionality == like]
-    if not alike:
-        return "other", factor
-    name = alike[0]
-    if name == "frequency":
-        return name, factor if "radian" in str(base.units) else 2 * math.pi * factor
-    if name == "angle" and "radian" not in str(base.units):
-        return "other", factor
-    return name, factor
+        raise _not_understood(text)
+    return factor, powers
+
+
+def _evaluated(node: ast.expr) -> tuple[Decimal, _Powers]:
+    """A product, quotient or power of units."""
+    match node:
+        case ast.Name(id=name):
+            return _unit(name.removeprefix("u_"))
+        case ast.Constant(value=1):
+            return Decimal(1), (0, 0, 0, 0, 0)
+        case ast.BinOp(op=ast.Mult() | ast.Div() as op, left=left, right=right):
+            (size, powers), (other, others) = _evaluated(left), _evaluated(right)
+            sign = 1 if isinstance(op, ast.Mult) else -1
+            return size * other**sign, _product(powers, others, sign)
+        case ast.BinOp(op=ast.Pow(), left=left, right=right):
+            size, powers = _evaluated(left)
+            exponent = ast.literal_eval(right)
+            return size**exponent, _product((0, 0, 0, 0, 0), powers, exponent)
+    raise ValueError("neither a product nor a power of units")
+
+
+def _unit(name: str) -> tuple[Decimal, _Powers]:
+    """A unit by name, with a prefix or in the plural; one that the table lacks by Pint."""
+    for word in (name, name[:-1] if len(name) > 3 and name[-1] == "s" else name):
+        if word in _UNITS:
+            return _UNITS[word]
+        for prefix, power in _PREFIXES.items():
+            rest = word.removeprefix(prefix)
+            if rest != word and rest in _UNITS and rest not in _ALONE:
+                size, powers = _GRAM if rest == "g" else _UNITS[rest]
+                return size.scaleb(power), powers
+    base = _registry().Quantity(Decimal(1), _registry().parse_units(name)).to_base_units()
+    of = {str(key).strip("[]"): int(power) for key, power in base.dimensionality.items()}
+    length, mass, time, current = (of.pop(key, 0) for key in ("length", "mass", "time", "current"))
+    turns = int("radian" in str(base.units))
+    return base.magnitude, (0, 0, 0, 0, 0) if of else (length, mass, time, current, turns)
 
 
 @functools.cache
 def _registry() -> Any:
-    """Pint's registry, in exact decimals."""
-    return library("pint", "reading units").UnitRegistry(non_int_type=Decimal, cache_folder=None)
-
-
-@functools.cache
-def _likes() -> dict[str, Any]:
-    """The dimensionality of each dimension by name."""
-    units = {
-        "force": "newton",
-        "displacement": "meter",
-        "velocity": "meter/second",
-        "acceleration": "meter/second^2",
-        "voltage": "volt",
-        "frequency": "hertz",
-        "angle": "radian",
-        "time": "second",
-        "mass": "kilogram",
-        "volt per force": "volt/newton",
-        "volt per displacement": "volt/meter",
-        "volt per velocity": "volt*second/meter",
-        "volt per acceleration": "volt*second^2/meter",
-        "force per volt": "newton/volt",
-        "displacement per volt": "meter/volt",
-        "velocity per volt": "meter/second/volt",
-        "acceleration per volt": "meter/second^2/volt",
-    }
-    registry = _registry()
-    return {name: registry.parse_units(unit).dimensionality for name, unit in units.items()}
+    return importlib.import_module("pint").UnitRegistry(non_int_type=Decimal, cache_folder=None)

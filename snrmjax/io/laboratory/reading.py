@@ -1,19 +1,17 @@
 """One reader for every file of a laboratory: its content decides, then its extension."""
 
 import importlib
-import os
 from pathlib import Path
 
-from snrmjax.io.files import FilePath, file_name
+from snrmjax.io.files import FilePath, file_name, read_bytes
 from snrmjax.io.laboratory.arrays.matlab_files import is_old_matlab
 from snrmjax.io.laboratory.contents import Kind, LaboratoryFile, TextFormat
 
 _ROOM = "snrmjax.io.laboratory"
 _READERS: dict[Kind, tuple[str, str]] = {
-    "uff": ("uff.reading", "read_uff"),
+    "uff": ("uff.functions", "read_uff"),
     "matlab": ("arrays.matlab_files", "read_matlab"),
-    "hdf5": ("arrays.tree_contents", "read_hdf5"),
-    "netcdf": ("arrays.tree_contents", "read_netcdf"),
+    "hdf5": ("arrays.hdf5_tree", "read_hdf5"),
     "tdms": ("tdms_files", "read_tdms"),
     "csv": ("separated_text", "read_separated_text"),
 }
@@ -37,31 +35,21 @@ def read_laboratory_file(path: FilePath, text_format: TextFormat | None = None) 
     module, function = _READERS[kind]
     read = getattr(importlib.import_module(f"{_ROOM}.{module}"), function)
     options = (text_format,) if kind == "csv" else ()
-    found: LaboratoryFile = read(Path(path), *options)
-    if found.is_empty:
-        why = f": {' '.join(found.notes[:_MOST_REASONS])}" if found.notes else "."
-        raise ValueError(f"{found.name} holds nothing that could be read{why}")
-    return found
+    held: LaboratoryFile = read(Path(path), *options)
+    if held.is_empty:
+        why = f": {' '.join(map(str, held.notes[:_MOST_REASONS]))}" if held.notes else "."
+        raise ValueError(f"{held.name} holds nothing that could be read{why}")
+    return held
 
 
 def _kind(path: FilePath) -> Kind:
     """The format of a file."""
-    name = file_name(path)
-    try:
-        with open(path, "rb") as file:
-            head = file.read(_HEAD)
-    except FileNotFoundError as error:
-        raise ValueError(f"{os.fspath(path)} does not exist.") from error
-    except IsADirectoryError as error:
-        raise ValueError(f"{os.fspath(path)} is a folder, but a file is expected.") from error
-    except OSError as error:
-        raise ValueError(f"{os.fspath(path)} cannot be read: {error.strerror}.") from error
+    name, head = file_name(path), read_bytes(path, _HEAD)
     if not head:
         raise ValueError(f"{name} is empty.")
     if any(head[at : at + 8] == _HDF5 for at in (0, 512, 1024, 2048)):  # behind a user block
         matlab = head.startswith(b"MATLAB 7.3") or Path(path).suffix.lower() == ".mat"
-        netcdf = Path(path).suffix.lower() in (".nc", ".nc4", ".cdf")
-        return "matlab" if matlab else "netcdf" if netcdf else "hdf5"
+        return "matlab" if matlab else "hdf5"
     if head.startswith(b"TDSm"):
         return "tdms"
     if is_old_matlab(head, Path(path).suffix):

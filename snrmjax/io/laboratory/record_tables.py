@@ -1,15 +1,15 @@
 """Time records as CSV: `time_s`, force or drive, and the motion of one sensor or several."""
 
-import csv
 import dataclasses
-import io
 
 import numpy as np
 from jaxtyping import Float
 
-from snrmjax.io.files import FilePath, file_name, read_text, shown, suggestion
+from snrmjax.io.files import FilePath, suggestion
+from snrmjax.io.rows import header_of, read_cells
 from snrmjax.measure.recordings.channels import Channel, Quantity
 from snrmjax.measure.recordings.time_recording import TimeRecording, time_recording
+from snrmjax.numerics.facts import Fact
 
 _COLUMNS: dict[str, Quantity] = {
     "force_n": "force",
@@ -26,8 +26,7 @@ _MOST_DIGITS = 9
 
 def is_record_table(path: FilePath) -> bool:
     """Whether a CSV's header names `time_s`: a time record, no table of steady states."""
-    first = read_text(path).lstrip().split("\n", 1)[0]
-    return "time_s" in {field.strip().strip('"') for field in first.split(",")}
+    return "time_s" in header_of(path)
 
 
 def read_record_table(path: FilePath) -> TimeRecording:
@@ -38,31 +37,22 @@ def read_record_table(path: FilePath) -> TimeRecording:
     behind the sensor's name and a point: `tip.velocity_m_s`. Other columns are left out with a
     note.
     Returns a `TimeRecording` whose channels have the names of the columns and the sensor as their
-    `point`. Raises `ValueError` that names file, row and column for what is no table of finite
-    numbers, for times that do not rise evenly, for doubled columns, two motions of one sensor and
-    none at all, and for fewer than 16 samples.
+    `point`. Raises `ValueError` as `read_cells` does, for times that do not rise evenly, two
+    motions of one sensor and none at all, and for fewer than 16 samples.
     """
-    text, file = read_text(path).strip(), file_name(path)
-    if not text:
-        raise ValueError(f"{file} is empty.")
-    lines = text.splitlines()
-    names = [field.strip() for field in next(csv.reader(lines[:1], skipinitialspace=True))]
-    channels, notes = _channels(names, file)
-    values = _numbers(lines, names, file)
-    if len(values) < _FEWEST:
+    cells = read_cells(path)
+    file = cells.file
+    channels, notes = _channels(cells.names, file)
+    cells.require_rows()
+    time = cells.numbers("time_s")
+    values = np.stack([cells.numbers(channel.name) for channel in channels])
+    if len(time) < _FEWEST:
         raise ValueError(
-            f"a time record needs {_FEWEST} samples at least, but {file} has {len(values)}."
+            f"a time record needs {_FEWEST} samples at least, but {file} has {len(time)}."
         )
-    rate = _sampling_rate(values[:, names.index("time_s")], file)
-    rows = [names.index(one.name) for one in channels]
-    return time_recording(
-        np.ascontiguousarray(values[:, rows].T),
-        channels,
-        rate,
-        start_time=float(values[0, names.index("time_s")]),
-        name=file,
-        notes=notes,
-    )
+    start = float(time[0])
+    rate = _sampling_rate(time, file)
+    return time_recording(values, channels, rate, start_time=start, name=file, notes=notes)
 
 
 def with_named_channels(recording: TimeRecording, file: str) -> TimeRecording:
@@ -73,7 +63,7 @@ def with_named_channels(recording: TimeRecording, file: str) -> TimeRecording:
     """
     return dataclasses.replace(
         recording,
-        channels=tuple(_named(one) for one in recording.channels),
+        channels=tuple(_named(channel) for channel in recording.channels),
         name=f"{recording.name} of {file}" if recording.name else file,
     )
 
@@ -90,13 +80,10 @@ def _named(channel: Channel) -> Channel:
     return channel
 
 
-def _channels(names: list[str], file: str) -> tuple[list[Channel], list[str]]:
+def _channels(names: list[str], file: str) -> tuple[list[Channel], list[Fact]]:
     """Channels of the columns that are understood, and notes on the others."""
     if "time_s" not in names:
         raise ValueError(f"{file} is no time record: it has no column `time_s`.")
-    doubled = [name for name in names if names.count(name) > 1]
-    if doubled:
-        raise ValueError(f"`{doubled[0]}` stands more than once in the header of {file}.")
     channels, others = [], []
     for name in names:
         sensor, _, column = name.rpartition(".")
@@ -107,7 +94,7 @@ def _channels(names: list[str], file: str) -> tuple[list[Channel], list[str]]:
             continue
         quantity = _COLUMNS[column]
         channels.append(Channel(name, quantity, column.split("_", 1)[1], 1.0, sensor))
-    places = [one.point for one in channels if one.quantity not in ("force", "voltage")]
+    places = [channel.point for channel in channels if channel.quantity not in ("force", "voltage")]
     if not places:
         near = "".join(suggestion(name, _MOTIONS) for name in others[:1])
         raise ValueError(
@@ -121,51 +108,7 @@ def _channels(names: list[str], file: str) -> tuple[list[Channel], list[str]]:
                 f"{file} has two motions of {whose}: keep one, or name sensors as in "
                 "`tip.velocity_m_s`."
             )
-    return channels, [f"column `{name}` of {file} is not used." for name in others]
-
-
-def _numbers(lines: list[str], names: list[str], file: str) -> Float[np.ndarray, "row column"]:
-    """All columns as finite numbers."""
-    body = lines[1:]
-    if not body:
-        raise ValueError(f"{file} has a header, but no rows below it.")
-    try:
-        values = np.loadtxt(
-            io.StringIO("\n".join(body)), delimiter=",", ndmin=2, comments=None, dtype=float
-        )
-    except ValueError as error:
-        raise ValueError(_where(body, names, file)) from error
-    if values.shape[1] != len(names):
-        raise ValueError(
-            f"each row must have {len(names)} fields as the header has, but row 2 of {file} has "
-            f"{values.shape[1]}."
-        )
-    bad = np.argwhere(~np.isfinite(values))
-    if bad.size:
-        row, column = bad[0]
-        raise ValueError(
-            f"`{names[column]}` must be a finite number, but row {row + 2} of {file} has "
-            f"{values[row, column]}."
-        )
-    return values
-
-
-def _where(body: list[str], names: list[str], file: str) -> str:
-    """What is wrong with the first row that is none of numbers."""
-    for k, line in enumerate(body):
-        fields = [field.strip() for field in line.split(",")]
-        if len(fields) != len(names):
-            return (
-                f"each row must have {len(names)} fields as the header has, but row {k + 2} of "
-                f"{file} has {len(fields)}."
-            )
-        for name, field in zip(names, fields, strict=True):
-            try:
-                float(field)
-            except ValueError:
-                what = shown(field) if field else "an empty field"
-                return f"`{name}` must be a number, but row {k + 2} of {file} has {what}."
-    return f"{file} is no table of numbers."
+    return channels, [Fact("column_not_used", name=name, file=file, near="") for name in others]
 
 
 def _sampling_rate(time: Float[np.ndarray, " row"], file: str) -> float:

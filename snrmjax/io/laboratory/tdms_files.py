@@ -20,6 +20,7 @@ from snrmjax.measure.recordings.time_recording import (
     TimeRecording,
     time_recording,
 )
+from snrmjax.numerics.facts import Fact
 
 _UNITS = ("unit_string", "NI_UnitDescription", "Unit", "unit", "Units")
 _MOST_CHANNELS = 4096
@@ -57,48 +58,52 @@ def read_tdms(path: Path) -> LaboratoryFile:
     size = path.stat().st_size
     recordings: list[TimeRecording] = []
     tables: list[NumberTable] = []
-    notes: list[str] = []
+    notes: list[Fact] = []
     with damaged_if_it_fails(path.name, "a TDMS file"), open(path, "rb") as file:
         source = _contents(file)
         groups = [(group.name, list(group.channels())) for group in source.groups()]
         counted = [
-            (one, len(one), dict(one.properties)) for _, channels in groups for one in channels
+            (channel, len(channel), dict(channel.properties))
+            for _, channels in groups
+            for channel in channels
         ]
     _check_sizes(counted, size, path.name)
     for name, channels in groups:
         waves: dict[tuple[float, float, int], list[Any]] = {}
         loose: dict[str, Node] = {}
-        for one in channels:
-            if not len(one) or one.dtype.kind not in "biufc":
-                notes.append(f"channel {one.name} {_why_not(one)} and is not read.")
+        for channel in channels:
+            if not len(channel) or channel.dtype.kind not in "biufc":
+                notes.append(
+                    Fact("not_read", name=f"channel {channel.name}", why=_why_not(channel))
+                )
                 continue
-            step = _number(one, "wf_increment")
-            start = _number(one, "wf_start_offset") or 0.0
-            if step is not None and step > 0 and len(one) > 1 and _is_spectrum(one):
-                lines = start + step * np.arange(len(one))
+            step = _number(channel, "wf_increment")
+            start = _number(channel, "wf_start_offset") or 0.0
+            if step is not None and step > 0 and len(channel) > 1 and _is_spectrum(channel):
+                lines = start + step * np.arange(len(channel))
                 alike = loose.get("frequency")
                 other = isinstance(alike, Numbers) and alike.length != len(lines)
-                axis = f"frequency of {one.name}" if other else "frequency"
+                axis = f"frequency of {channel.name}" if other else "frequency"
                 loose.setdefault(axis, held(lines, {"unit": "Hz"}))
-                loose[one.name] = _numbers(path, name, one)
-            elif step is not None and step > 0 and len(one) > 1 and one.dtype.kind != "c":
+                loose[channel.name] = _numbers(path, name, channel)
+            elif step is not None and step > 0 and len(channel) > 1 and channel.dtype.kind != "c":
                 key = next(
                     (
                         key
                         for key in waves
-                        if abs(key[0] / step - 1) < _ALIKE and key[1:] == (start, len(one))
+                        if abs(key[0] / step - 1) < _ALIKE and key[1:] == (start, len(channel))
                     ),
-                    (step, start, len(one)),
+                    (step, start, len(channel)),
                 )
-                waves.setdefault(key, []).append(one)
+                waves.setdefault(key, []).append(channel)
             else:
-                loose[one.name] = _numbers(path, name, one)
+                loose[channel.name] = _numbers(path, name, channel)
         for (step, start, length), alike in waves.items():
             recordings.append(_recording(path, name, alike, step, start, length))
-        found = read_struct(name, loose)
-        recordings.extend(found.recordings)
-        tables.extend(table._replace(name=name) for table in found.numbered())
-        notes.extend(found.notes)
+        contents = read_struct(name, loose)
+        recordings.extend(contents.recordings)
+        tables.extend(table._replace(name=name) for table in contents.numbered())
+        notes.extend(contents.notes)
     return LaboratoryFile(
         path.name, "tdms", tuple(recordings), (), tuple(tables), tuple(dict.fromkeys(notes))
     )
@@ -117,7 +122,9 @@ def _check_sizes(counted: Sequence[tuple[Any, int, dict]], size: int, file: str)
     if len(counted) > _MOST_CHANNELS:
         raise ValueError(f"{file} has {len(counted)} channels, more than {_MOST_CHANNELS}.")
     total = sum(
-        length * one.dtype.itemsize for one, length, _ in counted if one.dtype.kind in "biufc"
+        length * channel.dtype.itemsize
+        for channel, length, _ in counted
+        if channel.dtype.kind in "biufc"
     )
     if total > 8 * size:  # scaled channels give doubles for bytes
         raise ValueError(f"{file} states {total} bytes of samples, but has {size} bytes.")
@@ -130,58 +137,58 @@ def _recording(
     with ExitStack() as kept, damaged_if_it_fails(path.name, "a TDMS file"):
         file = kept.enter_context(open(path, "rb"))
         group = _contents(file)[name]
-        opened = [group[one.name] for one in channels]
+        opened = [group[channel.name] for channel in channels]
         kept.pop_all()  # it stays open until the samples are forgotten
     samples = TdmsSamples(file, opened, length, path.name)
     listed = []
-    for one in channels:
-        unit = _unit(one)
+    for channel in channels:
+        unit = _unit(channel)
         quantity, calibration = channel_meaning(unit)
-        listed.append(Channel(one.name, quantity, unit, calibration))
+        listed.append(Channel(channel.name, quantity, unit, calibration))
     rate = 1 / step
     whole = round(rate)
     rate = float(whole) if whole and abs(rate / whole - 1) < 4e-16 else rate
     return time_recording(samples, listed, rate, start_time=start, name=name)
 
 
-def _numbers(path: Path, group: str, one: Any) -> Numbers:
+def _numbers(path: Path, group: str, channel: Any) -> Numbers:
     """A channel without a rate as numbers that are read when asked."""
-    name, unit = one.name, _unit(one)
+    name, unit = channel.name, _unit(channel)
 
     def read(at: Selection) -> np.ndarray:
         with damaged_if_it_fails(path.name, "a TDMS file"), open(path, "rb") as file:
             channel = _contents(file)[group][name]
             return channel.read_data(at[0].start, at[0].stop - at[0].start)
 
-    return Numbers((len(one),), read, one.dtype.kind == "c", {"unit": unit} if unit else {})
+    return Numbers((len(channel),), read, channel.dtype.kind == "c", {"unit": unit} if unit else {})
 
 
-def _is_spectrum(one: Any) -> bool:
+def _is_spectrum(channel: Any) -> bool:
     """Whether the even abscissa of a channel is a frequency: its steps are no sampling interval."""
-    unit = str(one.properties.get("wf_xunit_string", "")).strip().lower()
-    name = str(one.properties.get("wf_xname", "")).strip().lower()
+    unit = str(channel.properties.get("wf_xunit_string", "")).strip().lower()
+    name = str(channel.properties.get("wf_xname", "")).strip().lower()
     return unit in ("hz", "hertz") or (not unit and name in ("frequency", "frequenz"))
 
 
-def _why_not(one: Any) -> str:
+def _why_not(channel: Any) -> str:
     """What a channel holds that is not read."""
-    if not len(one):
-        return "is empty"
-    return "holds times of day" if one.dtype.kind in "MV" else "holds no numbers"
+    if not len(channel):
+        return "empty"
+    return "times_of_day" if channel.dtype.kind in "MV" else "type"
 
 
-def _unit(one: Any) -> str:
+def _unit(channel: Any) -> str:
     """The unit that a property states."""
     for key in _UNITS:
-        value = one.properties.get(key)
+        value = channel.properties.get(key)
         if isinstance(value, str) and value.strip():
             return value.strip()
     return ""
 
 
-def _number(one: Any, key: str) -> float | None:
+def _number(channel: Any, key: str) -> float | None:
     """A finite number among the properties."""
-    value = one.properties.get(key)
+    value = channel.properties.get(key)
     if isinstance(value, bool) or not isinstance(value, int | float | np.number):
         return None
     return float(value) if np.isfinite(value) else None

@@ -106,21 +106,27 @@ def read_beam_description(path: FilePath) -> BeamDescription:
     if missing is not None:
         raise ValueError(f"{supports.place} leave a mechanism: {missing}.")
     masses_at = []
-    for k, one in enumerate(top.tables(_POINT_MASS, file), 1):
-        one.check_keys(("at", "mass_kg"), ("inertia_kg_m2",))
-        masses_at.append(one.number("at", FRACTION))
-        numbers[f"point_mass_{k}.mass_kg"] = one.number("mass_kg", NOT_NEGATIVE)
-        inertia = one.number("inertia_kg_m2", NOT_NEGATIVE, default=0.0)
+    for k, mass in enumerate(top.tables(_POINT_MASS, file), 1):
+        mass.check_keys(("at", "mass_kg"), ("inertia_kg_m2",))
+        masses_at.append(mass.number("at", FRACTION))
+        numbers[f"point_mass_{k}.mass_kg"] = mass.number("mass_kg", NOT_NEGATIVE)
+        inertia = mass.number("inertia_kg_m2", NOT_NEGATIVE, default=0.0)
         numbers[f"point_mass_{k}.inertia_kg_m2"] = inertia
     elements = geometry.whole("elements", 2)
     if elements > MOST_ELEMENTS:
         raise geometry.refusal("elements", f"at most {MOST_ELEMENTS}", elements)
-    modes = _modes(of_modes, elements)
+    modes = of_modes.mode_numbers("modes")
+    if len(modes) > 8:
+        raise of_modes.refusal("modes", "at most 8 modes", list(modes))
+    if max(modes) > elements:
+        expected = f"mode numbers that {elements} elements can show (at most {elements})"
+        raise of_modes.refusal("modes", expected, max(modes))
     degree = of_modes.whole("degree", 2, 3)
     if degree > 7:
         raise of_modes.refusal("degree", "from 2 to 7", degree)
     scaled = "load_scale" in of_modes.entries
     places = tuple((name, sensors.number(name, FRACTION)) for name in sensors.entries)
+    damping = of_modes.numbers_of_modes("damping_ratio", len(modes), BELOW_ONE)
     return BeamDescription(
         name=top.text("name", file.removesuffix(".toml")),
         numbers=tuple(numbers.items()),
@@ -128,7 +134,7 @@ def read_beam_description(path: FilePath) -> BeamDescription:
         modes=modes,
         load_scale=of_modes.number("load_scale", POSITIVE) if scaled else None,
         degree=degree,
-        damping_ratio=_damping(of_modes, len(modes)),
+        damping_ratio=None if damping is None else tuple(damping),
         sensors=places or (("midspan", 0.5),),
         force_at=_force(force),
         masses_at=tuple(masses_at),
@@ -178,24 +184,6 @@ def _geometry(geometry: TomlTable, section: TomlTable) -> dict[str, float]:
     return {**known, RADIUS: radius}
 
 
-def _modes(table: TomlTable, elements: int) -> tuple[int, ...]:
-    values = table.entries["modes"]
-    if not isinstance(values, list) or not values:
-        raise table.refusal("modes", "a list of mode numbers, at least one", values)
-    numbers = []
-    for k, one in enumerate(values):
-        entry = TomlTable({"modes": one}, f"{table.place}, entry {k + 1},")
-        numbers.append(entry.whole("modes", 1))
-    if len(set(numbers)) < len(numbers):
-        raise table.refusal("modes", "different mode numbers", values)
-    if len(numbers) > 8:
-        raise table.refusal("modes", "at most 8 modes", values)
-    if max(numbers) > elements:
-        expected = f"mode numbers that {elements} elements can show (at most {elements})"
-        raise table.refusal("modes", expected, max(numbers))
-    return tuple(numbers)
-
-
 def _support(table: TomlTable, side: str) -> tuple[float, ...]:
     """Stiffnesses along the chord, across it and in rotation; infinite is held, zero free."""
     value = table.entries[side]
@@ -214,17 +202,6 @@ def _stiffness(springs: TomlTable, key: str) -> float:
     if springs.entries.get(key) == np.inf:
         return np.inf
     return springs.number(key, NOT_NEGATIVE, default=0.0)
-
-
-def _damping(table: TomlTable, n: int) -> tuple[float, ...] | None:
-    if "damping_ratio" not in table.entries:
-        return None
-    if not isinstance(table.entries["damping_ratio"], list):
-        return (table.number("damping_ratio", BELOW_ONE),) * n
-    values = table.numbers("damping_ratio", BELOW_ONE, each="mode")
-    if len(values) != n:
-        raise table.refusal("damping_ratio", f"{n} numbers, one a mode", values)
-    return tuple(values)
 
 
 def _force(table: TomlTable) -> float | None:

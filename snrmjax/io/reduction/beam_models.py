@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from snrmjax.condense.condensation import condense
+from snrmjax.condense.condensation import reduced_model
 from snrmjax.io.files import FilePath, file_name
 from snrmjax.io.reduction.beam_file import THICKNESS, BeamDescription, read_beam_description
 from snrmjax.io.reduction.beam_parameters import (
@@ -57,13 +57,13 @@ class BeamModels(eqx.Module):
         coefficients are NaN where a load case has no solution. Raises `ValueError` for a name
         that neither has, for numbers that no beam has, and where the load cases determine no model.
         """
-        own = {name: value for name, value in values.items() if name in self.parameters}
-        rest = [name for name in values if name not in own and name != _FORCE]
-        if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(own)):
-            model = _traced_model(self, own)
+        varied = {name: value for name, value in values.items() if name in self.parameters}
+        rest = [name for name in values if name not in varied and name != _FORCE]
+        if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(varied)):
+            model = _traced_model(self, varied)
         else:
-            require_beam(with_beam_parameters(self.stated, own))
-            model = _model(self, own)
+            require_beam(with_beam_parameters(self.stated, varied))
+            model = _model(self, varied)
         if not rest:
             return model
         for name in rest:
@@ -76,7 +76,7 @@ def _model(models: BeamModels, values: Mapping[str, Any]) -> Structure:
     source = beam_source(beam, models.file)
     thickness = dict(beam.numbers)[THICKNESS]
     _, cases = run_load_cases(source, thickness * np.asarray(models.displacement))
-    return source.structure(condense(source.basis, cases, degree=source.degree))
+    return source.structure(reduced_model(source.basis, cases, degree=source.degree))
 
 
 # One program: step by step, derivatives would compile each step.

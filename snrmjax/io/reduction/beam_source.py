@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from snrmjax.condense.elements.beam import Beam, PointMass, Support
-from snrmjax.condense.elements.beam_cases import static_cases
 from snrmjax.condense.elements.beam_modes import beam_modes, participation, shape_at
+from snrmjax.condense.elements.statics import static_cases
 from snrmjax.condense.load_cases import ReductionBasis, StaticCases
 from snrmjax.condense.load_set import StaticSolver
 from snrmjax.io.files import FilePath, file_name
@@ -24,6 +24,7 @@ from snrmjax.io.reduction.beam_file import (
 from snrmjax.io.reduction.beam_parameters import rise_of
 from snrmjax.io.reduction.source import ASSUMED_DAMPING, ReductionSource, ShapeLines
 from snrmjax.model.modes import have_values
+from snrmjax.numerics.facts import Fact
 
 _BLOCK = 8  # load cases at once
 _NOWHERE = 1e-9  # of the largest shape: a sensor that no mode moves
@@ -63,7 +64,6 @@ def beam_source(stated: BeamDescription, file: str) -> ReductionSource:
         return _in_blocks(lambda rows: static_cases(beam, basis, rows), force)
 
     damping = stated.damping_ratio
-    note = f"no damping is stated: {ASSUMED_DAMPING:g} is taken for every mode"
     return ReductionSource(
         name=stated.name,
         basis=basis,
@@ -76,7 +76,7 @@ def beam_source(stated: BeamDescription, file: str) -> ReductionSource:
         degree=stated.degree,
         # Rows of the shapes are x, y and rotation of each node.
         lines=ShapeLines(seen.position, basis.shapes[1::3], "Position along the chord (m)"),
-        notes=() if damping is not None else (note,),
+        notes=() if damping else (Fact("damping_assumed", ratio=ASSUMED_DAMPING),),
     )
 
 
@@ -141,5 +141,5 @@ def _in_blocks(solve: StaticSolver, force: Float[np.ndarray, "case mode"]) -> St
     count = len(force)
     rows = np.resize(np.arange(count), -(-count // _BLOCK) * _BLOCK)
     blocks = [solve(np.asarray(force)[part]) for part in rows.reshape(-1, _BLOCK)]
-    found: StaticCases = jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *blocks)
-    return found
+    joined: StaticCases = jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *blocks)
+    return joined

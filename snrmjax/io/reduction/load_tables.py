@@ -31,10 +31,11 @@ degrees of freedom, such as
 Modal coordinates are q = ΦᵀM u where a mass matrix is given, else the least-squares fit q = Φ⁺u at
 the freedoms that were written. That is exact where what the load cases add to the modes is
 orthogonal to the shapes there, as the stretching of a flat structure is; else state a mass matrix,
-or write `q_1 …`. From arrays in Python, `snrmjax.condense.condense` starts at once.
+or write `q_1 …`. From arrays in Python, `snrmjax.condense.reduced_model` starts at once.
 """
 
 import os
+import re
 from pathlib import Path
 from typing import NamedTuple
 
@@ -42,14 +43,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from snrmjax.condense.load_cases import ReductionBasis, StaticCases
-from snrmjax.io.files import FilePath, read_text
-from snrmjax.io.reduction.number_tables import read_number_table
+from snrmjax.io.files import FilePath, read_text, shown, suggestion
 from snrmjax.io.reduction.source import ASSUMED_DAMPING, ReductionSource
+from snrmjax.io.rows import Cells, read_cells
 from snrmjax.io.toml_table import TomlTable, parsed_toml
 from snrmjax.io.units import HERTZ
-from snrmjax.numerics.rules import BELOW_ONE, IN_RANGE_HZ, NOT_ZERO, POSITIVE, Rule
+from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import BELOW_ONE, IN_RANGE_HZ, NOT_ZERO, POSITIVE
 
 _KEYS = ("name", "numbers", "damping_ratio", "shapes", "mass", "participation", "sensors")
+_NUMBERED = re.compile(r"([a-z]+)_([1-9][0-9]{0,5})")
 _ORTHOGONAL = 1e-3  # of ΦᵀMΦ − I: files have few digits
 
 
@@ -84,23 +87,25 @@ def read_load_tables(folder: FilePath) -> ReductionSource:
         raise ValueError(
             f"{shapes.file} has {shapes.values.shape[1]} shapes for the {n} modes of modes.toml."
         )
-    basis = _basis(frequency, _mode_numbers(top, n), shapes, mass)
+    stated = "numbers" in top.entries
+    numbers = top.mode_numbers("numbers") if stated else tuple(range(1, n + 1))
+    if len(numbers) != n:
+        raise top.refusal("numbers", f"{n} numbers, one a mode", list(numbers))
+    basis = _basis(frequency, numbers, shapes, mass)
     sensors, notes = _sensors(top, n, None if shapes is None else shapes.values)
-    first = next(iter(sensors.values()))
-    participation = _of_modes(top, "participation", n, NOT_ZERO)
+    name, first = next(iter(sensors.items()))
+    participation = top.numbers_of_modes("participation", n, NOT_ZERO)
     if participation is None:
-        participation = first
-        notes.append(f"no participation is stated: a point force at {next(iter(sensors))} is taken")
-    damping = _of_modes(top, "damping_ratio", n, BELOW_ONE)
+        notes.append(Fact("point_force_assumed", sensor=name))
+    damping = top.numbers_of_modes("damping_ratio", n, BELOW_ONE)
     if damping is None:
-        damping = np.full(n, ASSUMED_DAMPING)
-        notes.append(f"no damping is stated: {ASSUMED_DAMPING:g} is taken for every mode")
+        notes.append(Fact("damping_assumed", ratio=ASSUMED_DAMPING))
     return ReductionSource(
         name=top.text("name", place.resolve().name),
         basis=basis,
-        damping_ratio=damping,
+        damping_ratio=np.array(damping or [ASSUMED_DAMPING] * n),
         sensors=sensors,
-        participation=participation,
+        participation=np.array(participation or first),
         cases=_read_cases(place / "cases.csv", basis, shapes),
         notes=tuple(notes),
     )
@@ -108,7 +113,7 @@ def read_load_tables(folder: FilePath) -> ReductionSource:
 
 def _read_cases(path: Path, basis: ReductionBasis, shapes: _Matrix | None) -> StaticCases:
     n = len(basis.numbers)
-    table = read_number_table(path, ("f", "q", "u"), ("case", "energy"))
+    table = _read_table(path, ("f", "q", "u"), ("case", "energy"))
     for needed in (("f",), ("q", "u")):
         if not any(stem in table.groups for stem in needed):
             named = " or ".join(f"`{stem}_1 …`" for stem in needed)
@@ -118,7 +123,7 @@ def _read_cases(path: Path, basis: ReductionBasis, shapes: _Matrix | None) -> St
             raise ValueError(
                 f"{path.name} has {table.groups[stem]} modes in `{stem}_1 …`, but modes.toml {n}."
             )
-    names = tuple(table.cells.texts("case")) if table.has("case") else ()
+    names = tuple(table.cells.texts("case")) if table.cells.has("case") else ()
     for k, name in enumerate(names):
         if name in names[:k]:
             raise ValueError(f"{path.name} has the case {name!r} twice.")
@@ -137,7 +142,9 @@ def _read_cases(path: Path, basis: ReductionBasis, shapes: _Matrix | None) -> St
         moved = table.group("q", empty_allowed=True)
     else:
         moved = np.asarray(displacement) @ np.asarray(basis.filter).T
-    energy = table.cells.numbers("energy", empty_allowed=True) if table.has("energy") else None
+    energy = (
+        table.cells.numbers("energy", empty_allowed=True) if table.cells.has("energy") else None
+    )
     if energy is not None and np.isnan(energy).all():
         energy = None
     return StaticCases(
@@ -155,8 +162,8 @@ def _matrix(top: TomlTable, place: Path, key: str, stem: str) -> _Matrix | None:
     if key not in top.entries:
         return None
     file = top.text(key)
-    table = read_number_table(place / file, (stem,), ("dof", *(("mass",) * (key == "mass"))))
-    if key == "mass" and table.has("mass"):
+    table = _read_table(place / file, (stem,), ("dof", *(("mass",) * (key == "mass"))))
+    if key == "mass" and table.cells.has("mass"):
         return _Matrix(table.cells.numbers("mass"), file)
     if stem not in table.groups:
         raise ValueError(f"{file} lacks the column `{stem}_1`.")
@@ -212,43 +219,53 @@ def _check_identity(product: np.ndarray, numbers: tuple[int, ...], files: str) -
     )
 
 
-def _mode_numbers(top: TomlTable, n: int) -> tuple[int, ...]:
-    if "numbers" not in top.entries:
-        return tuple(range(1, n + 1))
-    values = top.entries["numbers"]
-    found = [k for k in values if isinstance(k, int)] if isinstance(values, list) else []
-    good = isinstance(values, list) and len(values) == n == len(set(found))
-    if not good or any(isinstance(k, bool) or k < 1 for k in found):
-        raise top.refusal("numbers", f"{n} different whole numbers from 1 on", values)
-    return tuple(found)
-
-
-def _of_modes(top: TomlTable, key: str, n: int, *rules: Rule) -> np.ndarray | None:
-    """A number for each mode, or one for all; None where it is not stated."""
-    if key not in top.entries:
-        return None
-    if not isinstance(top.entries[key], list):
-        return np.full(n, top.number(key, *rules))
-    values = top.numbers(key, *rules, each="mode")
-    if len(values) != n:
-        raise top.refusal(key, f"{n} numbers, one a mode", top.entries[key])
-    return np.array(values)
-
-
 def _sensors(
     top: TomlTable, n: int, shapes: np.ndarray | None
-) -> tuple[dict[str, np.ndarray], list[str]]:
+) -> tuple[dict[str, np.ndarray], list[Fact]]:
     table = top.table("sensors", "[sensors] of modes.toml")
     if table.entries:
-        found = {}
-        for name in table.entries:
-            values = table.numbers(name, each="mode")
-            if len(values) != n:
-                raise table.refusal(name, f"{n} numbers, one a mode", table.entries[name])
-            found[name] = np.array(values)
-        return found, []
+        named = {name: table.numbers(name, each="mode", count=n) for name in table.entries}
+        return {name: np.array(shape) for name, shape in named.items()}, []
     if shapes is None:
         raise ValueError("modes.toml has neither [sensors] nor `shapes`: state one of them.")
     row = int(np.argmax(np.abs(shapes[:, 0])))
     name = f"dof {row + 1}"
-    return {name: shapes[row]}, [f"no sensor is stated: {name}, where mode 1 is largest, is taken"]
+    return {name: shapes[row]}, [Fact("sensor_assumed", name=name)]
+
+
+class _Table(NamedTuple):
+    """The rows of a CSV by column; `groups` are the numbered columns, by their stem."""
+
+    cells: Cells
+    groups: dict[str, int]  # number of columns stem_1 … stem_n
+
+    def group(self, stem: str, *, empty_allowed: bool = False) -> np.ndarray:
+        """The numbered columns of one stem, (row, column)."""
+        columns = [f"{stem}_{k + 1}" for k in range(self.groups[stem])]
+        return np.stack(
+            [self.cells.numbers(name, empty_allowed=empty_allowed) for name in columns], axis=1
+        )
+
+
+def _read_table(path: FilePath, stems: tuple[str, ...], single: tuple[str, ...] = ()) -> _Table:
+    """Read a CSV whose columns are `stem_1 … stem_n` for some stems, and some single ones.
+
+    Raises `ValueError` that names file, row or column for an unknown or missing column of a group,
+    and as `read_cells` does.
+    """
+    cells = read_cells(path)
+    groups: dict[str, int] = {}
+    for name in cells.names:
+        numbered = _NUMBERED.fullmatch(name)
+        if numbered and numbered[1] in stems:
+            groups[numbered[1]] = max(groups.get(numbered[1], 0), int(numbered[2]))
+        elif name not in single:
+            known = (*single, *(f"{stem}_1" for stem in stems))
+            near = suggestion(name, known)
+            raise ValueError(f"{cells.file} has the unknown column {shown(name)}{near}.")
+    for stem, count in groups.items():
+        for k in range(count):
+            if not cells.has(f"{stem}_{k + 1}"):
+                raise ValueError(f"{cells.file} lacks the column `{stem}_{k + 1}`.")
+    cells.require_rows()
+    return _Table(cells, groups)

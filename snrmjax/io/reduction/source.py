@@ -16,6 +16,7 @@ from snrmjax.condense.scale_study import SCALES
 from snrmjax.io.files import FilePath
 from snrmjax.io.tables import write_table
 from snrmjax.model.structures import Structure
+from snrmjax.numerics.facts import Fact
 
 ASSUMED_DAMPING = 0.01
 """Damping ratio of a mode of which nobody stated one: no finite-element model has it."""
@@ -49,9 +50,9 @@ class ReductionSource(NamedTuple):
     degree: int = 3
     scales: tuple[float, ...] = SCALES  # of the study over load scale
     lines: ShapeLines | None = None
-    notes: tuple[str, ...] = ()
+    notes: tuple[Fact, ...] = ()
 
-    def structure(self, found: Condensation) -> Structure:
+    def structure(self, condensation: Condensation) -> Structure:
         """The reduced model as a structure that a model file can hold."""
         traced = isinstance(self.participation, jax.core.Tracer)
         xp: Any = jnp if traced else np
@@ -59,7 +60,7 @@ class ReductionSource(NamedTuple):
         # A file has no zeros here; a mode that the force does not drive gets next to nothing.
         least = _TINY * xp.where(size.max() > 0, size.max(), 1.0)
         driven = xp.where(size > 0, self.participation, least)
-        return found.structure(
+        return condensation.structure(
             self.damping_ratio, sensors=self.sensors, participation=driven, name=self.name
         )
 

@@ -74,7 +74,7 @@ def block_phasors(
     inverse = np.linalg.inv(design @ design.T)
     solver = inverse @ design
     at_once = max(1, _MOST_SAMPLES // (length * len(names)))
-    found, noise = [], []
+    fits, noise = [], []
     largest, flat = np.zeros(len(names)), np.zeros(len(names), dtype=int)
     for first in range(0, count, at_once):
         last = min(count, first + at_once)
@@ -84,9 +84,9 @@ def block_phasors(
         coefficients = rows @ solver.T
         rest = rows - coefficients @ design
         shape = (len(names), last - first)
-        found.append(coefficients.reshape(*shape, -1))
+        fits.append(coefficients.reshape(*shape, -1))
         noise.append(np.einsum("bl,bl->b", rest, rest).reshape(shape) / (length - len(design)))
-    coefficient = np.concatenate(found, axis=1)
+    coefficient = np.concatenate(fits, axis=1)
     middle = start + length * np.arange(count) + (length - 1) / 2
     order = np.arange(1, highest + 1)
     reference = (start + stop) / 2

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Literal, NamedTuple, get_args
 
-import numpy as np
+from snrmjax.numerics.rules import NOT_ZERO, require
 
 Quantity = Literal["force", "displacement", "velocity", "acceleration", "voltage", "unknown"]
 
@@ -16,6 +16,9 @@ SI_UNIT: dict[Quantity, str] = {
     "unknown": "",
 }
 """The unit of each quantity in which all of the package computes."""
+
+DERIVATIVE: dict[Quantity, int] = {"displacement": 0, "velocity": 1, "acceleration": 2}
+"""Which derivative of the displacement a quantity of motion is."""
 
 
 class Channel(NamedTuple):
@@ -51,29 +54,25 @@ def checked_channels(channels: Sequence[Channel]) -> tuple[Channel, ...]:
     Raises `ValueError` for none, for a doubled or empty name, an unknown quantity, and a
     calibration that is zero or not finite.
     """
-    found = tuple(channels)
-    if not found:
+    listed = tuple(channels)
+    if not listed:
         raise ValueError("a recording needs at least one channel.")
-    names = [one.name for one in found]
-    for one in found:
-        if not one.name or names.count(one.name) > 1:
+    names = [channel.name for channel in listed]
+    for channel in listed:
+        if not channel.name or names.count(channel.name) > 1:
             raise ValueError(f"channels need names of their own, but are {', '.join(names)}.")
-        if one.quantity not in get_args(Quantity):
+        if channel.quantity not in get_args(Quantity):
             raise ValueError(
-                f"the quantity of channel {one.name} must be one of {', '.join(SI_UNIT)}, but is "
-                f"{one.quantity!r}."
+                f"the quantity of channel {channel.name} must be one of {', '.join(SI_UNIT)}, but "
+                f"is {channel.quantity!r}."
             )
-        if not np.isfinite(one.calibration) or one.calibration == 0:
-            raise ValueError(
-                f"the calibration of channel {one.name} must be finite and not zero, but is "
-                f"{one.calibration:g}."
-            )
-    return found
+        require(f"the calibration of channel {channel.name}", channel.calibration, NOT_ZERO)
+    return listed
 
 
 def channel_number(channels: Sequence[Channel], name: str) -> int:
     """Where the channel of a name stands. Raises `ValueError` that lists the names there are."""
-    names = [one.name for one in channels]
+    names = [channel.name for channel in channels]
     if name not in names:
         raise ValueError(f"there is no channel {name!r}; there are {', '.join(names)}.")
     return names.index(name)

@@ -7,10 +7,10 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float
 
-from snrmjax.measure.recordings.channels import Channel, checked_channels
-from snrmjax.numerics.result import AbstractResult, Variable
-
-_HERTZ = 2 * np.pi
+from snrmjax.measure.recordings.channels import DERIVATIVE, Channel, checked_channels
+from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
+from snrmjax.numerics.units import HERTZ
 
 
 class FrequencyResponses(AbstractResult):
@@ -22,14 +22,20 @@ class FrequencyResponses(AbstractResult):
 
     coordinates: ClassVar[tuple[str, ...]] = ("response", "reference", "frequency_hz")
 
-    frequency: Float[np.ndarray, " frequency"]  # rad/s, rising
-    values: Complex[np.ndarray, "response reference frequency"]
-    coherence: Float[np.ndarray, "response reference frequency"]  # NaN where not stated
     responses: tuple[Channel, ...] = eqx.field(static=True)
     references: tuple[Channel, ...] = eqx.field(static=True)
+    # Rising.
+    frequency: Float[np.ndarray, " frequency"] = quantity("frequency_hz", "Hz", "frequency")
+    values: Complex[np.ndarray, "response reference frequency"] = quantity(
+        "response reference frequency_hz", "SI", "response", name="value"
+    )
+    # NaN where not stated.
+    coherence: Float[np.ndarray, "response reference frequency"] = quantity(
+        "response reference frequency_hz", "1", "coherence"
+    )
     averages: int | None = eqx.field(static=True, default=None)
     name: str = eqx.field(static=True, default="")
-    notes: tuple[str, ...] = eqx.field(static=True, default=())
+    notes: tuple[Fact | str, ...] = setting(default=())
 
     def receptance(self) -> Complex[np.ndarray, "response reference frequency"]:
         """Displacement over reference: velocities over iΩ, accelerations over −Ω².
@@ -37,43 +43,40 @@ class FrequencyResponses(AbstractResult):
         Raises `ValueError` for a response of another quantity.
         """
         turned = []
-        for one, row in zip(self.responses, self.values, strict=True):
-            if one.quantity not in _POWER:
+        for channel, row in zip(self.responses, self.values, strict=True):
+            if channel.quantity not in DERIVATIVE:
                 raise ValueError(
-                    f"channel {one.name} must be a displacement, velocity or acceleration, but is "
-                    f"{one.quantity}."
+                    f"channel {channel.name} must be a displacement, velocity or acceleration, but "
+                    f"is {channel.quantity}."
                 )
-            turned.append(row / (1j * self.frequency) ** _POWER[one.quantity])
+            turned.append(row / (1j * self.frequency) ** DERIVATIVE[channel.quantity])
         return np.stack(turned)
 
     def summary(self) -> tuple[str, ...]:
-        """See `AbstractResult`."""
-        hertz = self.frequency / _HERTZ
+        """Channels and band."""
+        hertz = self.frequency / HERTZ
         return (
             f"FrequencyResponses{': ' + self.name if self.name else ''}, {len(self.responses)} "
             f"responses over {len(self.references)} references at {len(hertz)} frequencies, "
             f"{hertz[0]:.6g} to {hertz[-1]:.6g} Hz",
-            *(f"response {one}" for one in self.responses),
-            *(f"reference {one}" for one in self.references),
+            *(f"response {channel}" for channel in self.responses),
+            *(f"reference {channel}" for channel in self.references),
             *(f"note: {note}" for note in self.notes),
         )
 
     def variables(self) -> dict[str, Variable]:
-        """See `AbstractResult`."""
-        at = ("response", "reference", "frequency_hz")
-        names = np.array([one.name for one in self.responses], dtype=str)
-        driven = np.array([one.name for one in self.references], dtype=str)
+        """By channels and frequency."""
         return {
-            "response": Variable(at[:1], names, "", "response channel"),
-            "reference": Variable(at[1:2], driven, "", "reference channel"),
-            "frequency_hz": Variable(at[2:], self.frequency / _HERTZ, "Hz", "frequency"),
-            "value_re": Variable(at, self.values.real, "SI", "real part of the response"),
-            "value_im": Variable(at, self.values.imag, "SI", "imaginary part of the response"),
-            "coherence": Variable(at, self.coherence, "1", "coherence"),
+            "response": channel_variable("response", self.responses),
+            "reference": channel_variable("reference", self.references),
+            **super().variables(),
         }
 
 
-_POWER = {"displacement": 0, "velocity": 1, "acceleration": 2}
+def channel_variable(dimension: str, channels: Sequence[Channel]) -> Variable:
+    """The names of channels along a dimension of a data set."""
+    names = np.array([channel.name for channel in channels], dtype=str)
+    return Variable((dimension,), names, "", f"{dimension} channel")
 
 
 def frequency_responses(
@@ -85,7 +88,7 @@ def frequency_responses(
     coherence: Float[np.ndarray, "response reference frequency"] | None = None,
     averages: int | None = None,
     name: str = "",
-    notes: Sequence[str] = (),
+    notes: Sequence[Fact | str] = (),
 ) -> FrequencyResponses:
     """Frequency responses, checked.
 
@@ -94,13 +97,13 @@ def frequency_responses(
     Raises `ValueError` for sizes that disagree, frequencies that do not rise from zero or above,
     channels as in `checked_channels`, infinite values and no value at all.
     """
-    omega, every = np.asarray(frequency, dtype=float), np.asarray(values, dtype=complex)
+    omega, numbers = np.asarray(frequency, dtype=float), np.asarray(values, dtype=complex)
     outputs, inputs = checked_channels(responses), checked_channels(references)
     wanted = (len(outputs), len(inputs), omega.size)
-    if omega.ndim != 1 or every.shape != wanted:
+    if omega.ndim != 1 or numbers.shape != wanted:
         raise ValueError(
             f"`values` must have shape {wanted} (responses, references, frequencies), but has "
-            f"{every.shape}."
+            f"{numbers.shape}."
         )
     if (
         not omega.size
@@ -109,20 +112,16 @@ def frequency_responses(
         or np.any(np.diff(omega) <= 0)
     ):
         raise ValueError("`frequency` must be finite and rise from zero or above.")
-    if np.isinf(every).any() or np.isnan(every).all():
+    if np.isinf(numbers).any() or np.isnan(numbers).all():
         raise ValueError("`values` must be finite where they were measured, and not all missing.")
     known = np.full(wanted, np.nan) if coherence is None else np.asarray(coherence, dtype=float)
     if known.shape != wanted:
         raise ValueError(f"`coherence` must have shape {wanted}, but has {known.shape}.")
-    scale = np.array([one.calibration for one in outputs])[:, None] / np.array(
-        [one.calibration for one in inputs]
+    scale = np.array([channel.calibration for channel in outputs])[:, None] / np.array(
+        [channel.calibration for channel in inputs]
     )
     return FrequencyResponses(
-        omega,
-        every * scale[:, :, None],
-        known,
-        outputs,
-        inputs,
+        *(outputs, inputs, omega, numbers * scale[:, :, None], known),
         averages,
         name,
         tuple(notes),

@@ -11,16 +11,15 @@ Reference: R. Pintelon & J. Schoukens, System Identification: A Frequency Domain
 from collections.abc import Sequence
 from typing import ClassVar, NamedTuple
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 
 from snrmjax.measure.recordings.channels import Channel, channel_number
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses, frequency_responses
 from snrmjax.measure.recordings.time_recording import TimeRecording
-from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
+from snrmjax.numerics.units import HERTZ
 
-_HERTZ = 2 * np.pi
 _EXCITED = 0.03  # of the largest line of the force, that an excited line has at least
 _SURE = 25.0  # and so many variances of its mean above noise
 _MOST_SAMPLES = 2**21  # from whose start a period is sought
@@ -40,20 +39,29 @@ class MultisineResponses(AbstractResult):
     coordinates: ClassVar[tuple[str, ...]] = ("frequency_hz", "line_hz", "response")
 
     responses: FrequencyResponses
-    noise_std: Float[np.ndarray, "response frequency"]
-    total_std: Float[np.ndarray, "response frequency"]
     output: Float[np.ndarray, "response frequency"]  # amplitudes at the excited lines
-    line: Float[np.ndarray, " line"]  # rad/s, detection lines
-    odd: Bool[np.ndarray, " line"]  # whether a detection line is an odd multiple of 1/period
-    distortion: Float[np.ndarray, "response line"]
-    distortion_noise: Float[np.ndarray, "response line"]  # 1σ of noise there
-    period: float = eqx.field(static=True)  # s
-    periods: int = eqx.field(static=True)  # used of each realisation
-    realisations: int = eqx.field(static=True)
+    # Whether a detection line is an odd multiple of 1/period.
+    odd: Bool[np.ndarray, " line"]
+    noise_std: Float[np.ndarray, "response frequency"] = quantity(
+        "response frequency_hz", "SI", "error by noise"
+    )
+    total_std: Float[np.ndarray, "response frequency"] = quantity(
+        "response frequency_hz", "SI", "error by noise and nonlinearity"
+    )
+    line: Float[np.ndarray, " line"] = quantity("line_hz", "Hz", "detection line")
+    distortion: Float[np.ndarray, "response line"] = quantity(
+        "response line_hz", "SI", "amplitude at the line"
+    )
+    distortion_noise: Float[np.ndarray, "response line"] = quantity(
+        "response line_hz", "SI", "1σ of noise at the line"
+    )
+    period: float = setting()  # s
+    periods: int = setting()  # used of each realisation
+    realisations: int = setting()
 
     def summary(self) -> tuple[str, ...]:
-        """See `AbstractResult`."""
-        hertz = self.responses.frequency / _HERTZ
+        """Lines, noise and distortion."""
+        hertz = self.responses.frequency / HERTZ
         size = np.sqrt(np.mean(self.output**2))
         lines = [
             f"MultisineResponses: {len(hertz)} lines, {hertz[0]:.6g} to {hertz[-1]:.6g} Hz, "
@@ -66,8 +74,8 @@ class MultisineResponses(AbstractResult):
         for name, chosen in (("odd", self.odd), ("even", ~self.odd)):
             if chosen.any():
                 level, noise = (
-                    20 * np.log10(max(np.sqrt(np.mean(one[:, chosen] ** 2)) / size, 1e-16))
-                    for one in (self.distortion, self.distortion_noise)
+                    20 * np.log10(max(np.sqrt(np.mean(part[:, chosen] ** 2)) / size, 1e-16))
+                    for part in (self.distortion, self.distortion_noise)
                 )
                 lines.append(
                     f"{name} distortion {level:.1f} dB of the output, noise {noise:.1f} dB"
@@ -75,22 +83,18 @@ class MultisineResponses(AbstractResult):
         return tuple(lines)
 
     def variables(self) -> dict[str, Variable]:
-        """See `AbstractResult`."""
-        at, seen = ("response", "frequency_hz"), ("response", "line_hz")
-        names = np.array([one.name for one in self.responses.responses], dtype=str)
-        hertz = self.responses.frequency / _HERTZ
-        values = self.responses.values[:, 0]
+        """By response and line, with the linear approximation."""
+        at, linear = ("response", "frequency_hz"), self.responses.variables()
+        values = {
+            name: linear[name]._replace(dimensions=at, values=linear[name].values[:, 0])
+            for name in ("value_re", "value_im")
+        }
         return {
-            "response": Variable(at[:1], names, "", "response channel"),
-            "frequency_hz": Variable(at[1:], hertz, "Hz", "excited line"),
-            "line_hz": Variable(seen[1:], self.line / _HERTZ, "Hz", "detection line"),
-            "value_re": Variable(at, values.real, "SI", "real part of the response"),
-            "value_im": Variable(at, values.imag, "SI", "imaginary part of the response"),
-            "noise_std": Variable(at, self.noise_std, "SI", "error by noise"),
-            "total_std": Variable(at, self.total_std, "SI", "error by noise and nonlinearity"),
-            "odd": Variable(seen[1:], self.odd, "", "odd line"),
-            "distortion": Variable(seen, self.distortion, "SI", "amplitude at the line"),
-            "distortion_noise": Variable(seen, self.distortion_noise, "SI", "noise at the line"),
+            "response": linear["response"],
+            "frequency_hz": linear["frequency_hz"],
+            **values,
+            **super().variables(),
+            "odd": Variable(("line_hz",), self.odd, "", "odd line"),
         }
 
 
@@ -126,10 +130,10 @@ def multisine_responses(
     _check(records, names, skip)
     rate = records[0].sampling_rate
     samples = _found_period(records[0], force) if period is None else _stated(period, rate)
-    spectra = [_spectra(one, names, samples, skip) for one in records]
-    periods = min(one.periods for one in spectra)
+    spectra = [_spectra(record, names, samples, skip) for record in records]
+    periods = min(record.periods for record in spectra)
     excited = _lines(lines, spectra[0], rate, samples)
-    ratio, noise = zip(*(_response(one, excited) for one in spectra), strict=True)
+    ratio, noise = zip(*(_response(record, excited) for record in spectra), strict=True)
     mean = np.mean(ratio, axis=0)
     count = len(records)
     noise_std = np.sqrt(np.mean(noise, axis=0) / count)
@@ -139,8 +143,8 @@ def multisine_responses(
     )
     detection = np.setdiff1d(np.arange(excited[0], excited[-1] + 1), excited)
     level, floor = _distortion(spectra, mean, excited, detection)
-    turned = _HERTZ * rate / samples
-    found = frequency_responses(
+    turned = HERTZ * rate / samples
+    linear = frequency_responses(
         excited * turned,
         mean[:, None],
         [_in_si(records[0], name) for name in names[1:]],
@@ -148,18 +152,19 @@ def multisine_responses(
         averages=periods * count,
         name=records[0].name,
     )
+    output = [np.abs(record.mean[1:, excited]) ** 2 for record in spectra]
     return MultisineResponses(
-        found,
-        noise_std,
-        total,
-        np.sqrt(np.mean([np.abs(one.mean[1:, excited]) ** 2 for one in spectra], axis=0)),
-        detection * turned,
-        detection % 2 == 1,
-        level,
-        floor,
-        samples / rate,
-        periods,
-        count,
+        responses=linear,
+        output=np.sqrt(np.mean(output, axis=0)),
+        odd=detection % 2 == 1,
+        noise_std=noise_std,
+        total_std=total,
+        line=detection * turned,
+        distortion=level,
+        distortion_noise=floor,
+        period=samples / rate,
+        periods=periods,
+        realisations=count,
     )
 
 
@@ -177,13 +182,13 @@ def _check(records: tuple[TimeRecording, ...], names: tuple[str, ...], skip: int
         raise ValueError("`recordings` must hold one realisation at least, but is empty.")
     if len(names) < 2 or len(set(names)) != len(names):
         raise ValueError(f"name a force and other channels as responses, not {', '.join(names)}.")
-    for one in records:
+    for record in records:
         for name in names:
-            channel_number(one.channels, name)
-        if one.sampling_rate != records[0].sampling_rate:
+            channel_number(record.channels, name)
+        if record.sampling_rate != records[0].sampling_rate:
             raise ValueError(
                 "realisations must have one sampling rate, but have "
-                f"{records[0].sampling_rate:g} and {one.sampling_rate:g} Hz."
+                f"{records[0].sampling_rate:g} and {record.sampling_rate:g} Hz."
             )
     if skip < 0 or int(skip) != skip:
         raise ValueError(f"`skip` must be a whole number of periods from 0 on, but is {skip}.")
@@ -191,8 +196,8 @@ def _check(records: tuple[TimeRecording, ...], names: tuple[str, ...], skip: int
 
 def _in_si(recording: TimeRecording, name: str) -> Channel:
     """The channel as its values are read: in SI units already."""
-    own = recording.channels[channel_number(recording.channels, name)]
-    return own._replace(calibration=1.0)
+    channel = recording.channels[channel_number(recording.channels, name)]
+    return channel._replace(calibration=1.0)
 
 
 def _stated(period: float, rate: float) -> int:
@@ -280,7 +285,7 @@ def _lines(
     """Numbers of the excited lines."""
     highest = spectra.mean.shape[1] - 1
     if lines is not None:
-        place = np.asarray(lines, dtype=float) * samples / rate / _HERTZ
+        place = np.asarray(lines, dtype=float) * samples / rate / HERTZ
         number = np.unique(np.round(place).astype(int))
         if not place.size or np.any(np.abs(place - np.round(place)) > 1e-3):
             raise ValueError("`lines` must be multiples of 1/period (in rad/s: times 2π).")
@@ -290,10 +295,10 @@ def _lines(
     size = np.abs(spectra.mean[0])
     size[0] = 0.0
     noise = spectra.variance[0] / spectra.periods
-    found = np.flatnonzero((size > _EXCITED * size.max()) & (size**2 > _SURE * noise))
-    if not found.size or size.max() == 0:
+    excited = np.flatnonzero((size > _EXCITED * size.max()) & (size**2 > _SURE * noise))
+    if not excited.size or size.max() == 0:
         raise ValueError("no line of the force stands out of its noise: nothing is excited.")
-    return found
+    return excited
 
 
 def _response(spectra: _Spectra, lines: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -319,9 +324,9 @@ def _distortion(
         ]
     )
     squares, noise = [], []
-    for one in spectra:
-        left = one.mean[1:, detection] - linear * one.mean[0, detection]
+    for spectrum in spectra:
+        left = spectrum.mean[1:, detection] - linear * spectrum.mean[0, detection]
         squares.append(np.abs(left) ** 2)
-        noise.append(one.variance[1:, detection] / one.periods)
+        noise.append(spectrum.variance[1:, detection] / spectrum.periods)
     floor = np.mean(noise, axis=0)
     return np.sqrt(np.mean(squares, axis=0)), np.sqrt(floor)

@@ -7,6 +7,7 @@ from jaxtyping import Float
 
 from snrmjax.measure.recordings.channels import channel_number
 from snrmjax.measure.recordings.time_recording import TimeRecording
+from snrmjax.numerics.rules import BETWEEN_ZERO_AND_ONE, require
 
 _BLOCK = 2**18  # samples read at once
 _FRAME = 2  # cycles of the response over which the drive's largest value is taken
@@ -48,36 +49,35 @@ def find_ring_downs(
     """
     for name in (drive, response):
         channel_number(recording.channels, name)
-    if not 0 < quiet < 1:
-        raise ValueError(f"`quiet` must be between 0 and 1, but is {quiet:g}.")
+    require("`quiet`", quiet, BETWEEN_ZERO_AND_ONE)
     step = _strongest(recording, response)
     length = max(8, round(_FRAME * 2 * np.pi / step))
     offset, size = _envelope(recording, drive, length)
-    found = [
+    decays = [
         _at_sample(recording, drive, offset, length, rows, level, quiet, step)
         for rows, level in _stops(size, quiet, max(1, round(_FEWEST_CYCLES / _FRAME)))
     ]
-    if not found:
+    if not decays:
         raise ValueError(
             f"channel {drive} never stops for {_FEWEST_CYCLES} cycles: it does not fall to "
             f"{100 * quiet:g} % of what it was (noise above that? state a larger `quiet`)."
         )
-    return found
+    return decays
 
 
 def _strongest(recording: TimeRecording, name: str) -> float:
     """Frequency of the strongest line of the loudest block, rad a sample."""
-    loudest, found = 0.0, 0.0
+    loudest, frequency = 0.0, 0.0
     for block in recording.blocks(_BLOCK, [name]):
         values = np.where(np.isfinite(block.values[0]), block.values[0], 0.0)
         power = float(np.var(values))
         if power > loudest and len(values) > 16:
             spectrum = np.abs(np.fft.rfft((values - values.mean()) * np.hanning(len(values))))
             spectrum[:2] = 0.0
-            loudest, found = power, 2 * np.pi * float(np.argmax(spectrum)) / len(values)
-    if found == 0:
+            loudest, frequency = power, 2 * np.pi * float(np.argmax(spectrum)) / len(values)
+    if frequency == 0:
         raise ValueError(f"channel {name} does not move: there is nothing that rings down.")
-    return found
+    return frequency
 
 
 def _envelope(
@@ -101,7 +101,7 @@ def _stops(
     """Frames of silence, and how large the drive was before."""
     finite = size[np.isfinite(size)]
     least = _LOUD * float(finite.max(initial=0.0))
-    found, k, n = [], 1, len(size)
+    stops, k, n = [], 1, len(size)
     while k < n:
         level = float(size[max(0, k - _BEFORE) : k].max())
         if not (np.isfinite(level) and level > least and size[k] <= quiet * level):
@@ -110,9 +110,9 @@ def _stops(
         louder = np.flatnonzero(size[k:] > quiet * level)
         end = k + int(louder[0]) if louder.size else n
         if end - k >= fewest:
-            found.append((slice(k, end), level))
+            stops.append((slice(k, end), level))
         k = end + 1
-    return found
+    return stops
 
 
 def _at_sample(

@@ -188,19 +188,19 @@ class _Grid(NamedTuple):
     def around(self, best: int) -> "_Grid":
         """A finer grid about one of the points."""
         turns = np.linspace(-1, 1, 5)
-        every = np.meshgrid(
+        points = np.meshgrid(
             self.decay[best] * self.ratio**turns, self.beat[best] + self.step * turns
         )
-        return _Grid(every[0].ravel(), every[1].ravel(), self.ratio**0.5, self.step / 2)
+        return _Grid(points[0].ravel(), points[1].ravel(), self.ratio**0.5, self.step / 2)
 
 
 def _grid(span: float, count: int) -> _Grid:
     decay = span * np.geomspace(1 / min(count, 40), 1 / 1.5, _DECAYS)
     fastest = np.pi * (count - 1) / span
     beat = np.linspace(-1, 1, _BEATS) * min(fastest, 60 * np.pi / span)
-    every = np.meshgrid(decay, beat)
+    points = np.meshgrid(decay, beat)
     return _Grid(
-        every[0].ravel(), every[1].ravel(), float(decay[1] / decay[0]), float(beat[1] - beat[0])
+        points[0].ravel(), points[1].ravel(), float(decay[1] / decay[0]), float(beat[1] - beat[0])
     )
 
 

@@ -4,6 +4,8 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
+from snrmjax.numerics.facts import Fact
+
 
 class StepCounts(NamedTuple):
     """Steps that were used, and those left out by their reason."""
@@ -12,32 +14,20 @@ class StepCounts(NamedTuple):
     left_out: Mapping[str, int]
 
     @property
-    def steps(self) -> int:
-        """All steps."""
-        return self.used + sum(self.left_out.values())
+    def fact(self) -> Fact:
+        """The counts as a fact: 44 of 104 steps used; left out: 58 unsettled, 2 too short."""
+        return Fact("steps_used", used=self.used, left_out=self.reasons)
 
     @property
-    def words(self) -> str:
-        """The counts as part of a sentence.
-
-        >>> StepCounts(44, {"unsettled": 58, "too short": 2}).words
-        '44 of 104 steps used; left out: 58 unsettled, 2 too short'
-        """
-        reasons = self.reasons
-        return f"{self.used} of {self.steps} steps used" + (
-            f"; left out: {reasons}" if reasons else ""
-        )
-
-    @property
-    def reasons(self) -> str:
-        """How many were left out for each reason; empty where none was."""
-        return ", ".join(f"{count} {reason}" for reason, count in self.left_out.items() if count)
+    def reasons(self) -> tuple[tuple[str, int], ...]:
+        """Reasons for which any step was left out, with their numbers."""
+        return tuple((reason, count) for reason, count in self.left_out.items() if count)
 
 
 def joined_counts(counts: Iterable[StepCounts]) -> StepCounts:
     """The counts of several records together."""
-    every = list(counts)
+    records = list(counts)
     left: Counter[str] = Counter()
-    for one in every:
-        left.update(one.left_out)
-    return StepCounts(sum(one.used for one in every), dict(left))
+    for record in records:
+        left.update(record.left_out)
+    return StepCounts(sum(record.used for record in records), dict(left))

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from typing import ClassVar, NamedTuple
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -23,15 +22,16 @@ from snrmjax.measure.recordings.velocity_states import (
     ChosenChannels,
     Levels,
     PhasorTable,
-    checked_orders,
     choose_channels,
     states_of_phasors,
 )
+from snrmjax.measure.signals import require_fundamental
 from snrmjax.measure.states import SteadyStates
-from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.result import AbstractResult, quantity, setting
 from snrmjax.numerics.status import Status
+from snrmjax.numerics.units import HERTZ
 
-_HERTZ = 2 * np.pi
 _FEWEST_CYCLES = 10
 _HIGHEST = 3  # harmonics that are always fitted, so that they do not pass for noise
 _NEAR_TABLE = 0.5  # cycles over a step by which a table's frequency may be off
@@ -60,17 +60,25 @@ class SteppedSineStates(AbstractResult):
     coordinates: ClassVar[tuple[str, ...]] = ("step",)
 
     states: SteadyStates
-    start: Float[np.ndarray, " step"]  # s
-    stop: Float[np.ndarray, " step"]  # s
-    settled_from: Float[np.ndarray, " step"]  # s, NaN where it did not settle
-    frequency: Float[np.ndarray, " step"]  # rad/s
-    force: Float[np.ndarray, " step"]  # N or V
-    decay_time: Float[np.ndarray, " step"]  # s, of the transient, NaN where none was seen
-    moved: Float[np.ndarray, " step"]  # share by which a phasor moves over the part used
-    colour: Float[np.ndarray, " step"]  # largest scatter of blocks over that of white noise
-    state: Int[np.ndarray, " step"]  # row of `states`, −1 where there is none
-    status: Int[np.ndarray, " step"]  # a `StepStatus`
-    notes: tuple[str, ...] = eqx.field(static=True, default=())
+    start: Float[np.ndarray, " step"] = quantity("step", "s", "its start", name="start_s")
+    stop: Float[np.ndarray, " step"] = quantity("step", "s", "its end", name="stop_s")
+    # NaN where it did not settle.
+    settled_from: Float[np.ndarray, " step"] = quantity(
+        "step", "s", "from where on it was used", name="settled_from_s"
+    )
+    frequency: Float[np.ndarray, " step"] = quantity("step", "Hz", "frequency of the force")
+    force: Float[np.ndarray, " step"] = quantity("step", "N or V", "amplitude of the force")
+    # NaN where none was seen.
+    decay_time: Float[np.ndarray, " step"] = quantity(
+        "step", "s", "decay time of the transient", name="decay_time_s"
+    )
+    moved: Float[np.ndarray, " step"] = quantity("step", "1", "share that a phasor still moves")
+    noise_to_white_ratio: Float[np.ndarray, " step"] = quantity(
+        "step", "1", "scatter of blocks over white noise's"
+    )
+    state: Int[np.ndarray, " step"] = quantity("step", "1", "row of the steady states, -1: none")
+    status: Int[np.ndarray, " step"] = quantity("step", "", "whether it settled", of=StepStatus)
+    notes: tuple[Fact | str, ...] = setting(default=())
 
     @property
     def counts(self) -> StepCounts:
@@ -81,42 +89,6 @@ class SteppedSineStates(AbstractResult):
             if kind is not StepStatus.SETTLED and np.any(self.status == int(kind))
         }
         return StepCounts(self.states.n_states, left)
-
-    def summary(self) -> tuple[str, ...]:
-        """See `AbstractResult`."""
-        hertz = self.frequency / _HERTZ
-        failed = [
-            f"{np.sum(self.status == int(kind))} left out: {kind.message}"
-            for kind in StepStatus
-            if kind is not StepStatus.SETTLED and np.any(self.status == int(kind))
-        ]
-        return (
-            f"SteppedSineStates: {len(self.status)} steps, {self.states.n_states} settled",
-            f"frequency {hertz.min():.6g} to {hertz.max():.6g} Hz",
-            f"dwell {np.min(self.stop - self.start):.3g} to {np.max(self.stop - self.start):.3g} s",
-            *failed,
-            *(f"note: {note}" for note in self.notes),
-        )
-
-    def variables(self) -> dict[str, Variable]:
-        """See `AbstractResult`; the table of steps."""
-        at = ("step",)
-        names = np.array([StepStatus(int(k)).name.lower() for k in self.status], dtype=str)
-        reasons = np.array([StepStatus(int(k)).message for k in self.status], dtype=str)
-        return {
-            "step": Variable(at, np.arange(len(self.status)), "1", "step"),
-            "start_s": Variable(at, self.start, "s", "its start"),
-            "stop_s": Variable(at, self.stop, "s", "its end"),
-            "settled_from_s": Variable(at, self.settled_from, "s", "from where on it was used"),
-            "frequency_hz": Variable(at, self.frequency / _HERTZ, "Hz", "frequency of the force"),
-            "force": Variable(at, self.force, "N or V", "amplitude of the force"),
-            "decay_time_s": Variable(at, self.decay_time, "s", "decay time of the transient"),
-            "moved": Variable(at, self.moved, "1", "share that a phasor still moves"),
-            "colour": Variable(at, self.colour, "1", "scatter of blocks over white noise's"),
-            "state": Variable(at, self.state, "1", "row of the steady states, -1: none"),
-            "status": Variable(at, names, "", "whether it settled"),
-            "reason": Variable(at, reasons, "", "in words"),
-        }
 
 
 class _Measured(NamedTuple):
@@ -181,7 +153,7 @@ def stepped_sine_states(
     >>> found.states.force.round(3).tolist(), np.angle(found.states.velocity).round(3).tolist()
     ([2.0, 2.0], [[0.2], [0.2]])
     """
-    orders = checked_orders(harmonic_order)
+    orders = require_fundamental("harmonic_order", harmonic_order)
     chosen = choose_channels(recording, force, responses, sensors=sensors, drive=drive)
     if frequencies is None:
         steps = _recognised(recording, chosen, least_amplitude_step, least_frequency_step)
@@ -191,8 +163,8 @@ def stepped_sine_states(
         check_rate(recording, step.frequency, force)
     _check_highest(recording, steps, orders)
     measured = [
-        _measure(recording, chosen, one, orders, settle, tolerance, frequencies is not None)
-        for one in steps
+        _measure(recording, chosen, step, orders, settle, tolerance, frequencies is not None)
+        for step in steps
     ]
     measured = _without_pauses(measured)
     return _result(recording, chosen, measured, orders, level)
@@ -214,15 +186,15 @@ def _recognised(
         least_amplitude_step=amplitude_step,
         least_step=frequency_step,
     )
-    long = [one for one in steps if _cycles(recording, one) >= _FEWEST_CYCLES]
-    if sum(one.stop - one.start for one in long) < _COVERED * np.ptp(track.middle):
+    long = [step for step in steps if _cycles(recording, step) >= _FEWEST_CYCLES]
+    if sum(step.stop - step.start for step in long) < _COVERED * np.ptp(track.middle):
         raise ValueError(
             f"the record has no steps: the tone of channel {name} does not stay at one frequency "
             f"for {_FEWEST_CYCLES} cycles anywhere (a sweep? `sweep_states` reads it)."
         )
     if len(long) == 1:
         raise ValueError(
-            f"the record has one step only, of {long[0].frequency / _HERTZ:.6g} Hz from "
+            f"the record has one step only, of {long[0].frequency / HERTZ:.6g} Hz from "
             f"{long[0].start / recording.sampling_rate:.4g} s on: state `frequencies` where a "
             "single tone is meant."
         )
@@ -267,16 +239,16 @@ def _of_table(
 def _check_highest(
     recording: TimeRecording, steps: Sequence[Step], orders: tuple[int, ...]
 ) -> None:
-    highest = max(one.frequency for one in steps) * max(orders)
+    highest = max(step.frequency for step in steps) * max(orders)
     if highest >= np.pi * recording.sampling_rate:
         raise ValueError(
-            f"harmonic {max(orders)} of {highest / max(orders) / _HERTZ:.6g} Hz lies above half "
+            f"harmonic {max(orders)} of {highest / max(orders) / HERTZ:.6g} Hz lies above half "
             f"the sampling rate, {recording.sampling_rate / 2:.6g} Hz: ask for fewer harmonics."
         )
 
 
 def _cycles(recording: TimeRecording, step: Step) -> float:
-    return (step.stop - step.start) * step.frequency / _HERTZ / recording.sampling_rate
+    return (step.stop - step.start) * step.frequency / HERTZ / recording.sampling_rate
 
 
 def _measure(
@@ -305,7 +277,7 @@ def _measure(
         blocks = _within_step(blocks, guide)
     shift = steady_frequency(blocks, guide)
     dwell = (step.stop - step.start) / recording.sampling_rate
-    if of_table and abs(shift) * dwell > _HERTZ * _NEAR_TABLE:
+    if of_table and abs(shift) * dwell > HERTZ * _NEAR_TABLE:
         return _Measured(step, StepStatus.NOT_FOUND)
     blocks = blocks.turned(shift)
     step = step._replace(frequency=blocks.frequency)
@@ -318,7 +290,7 @@ def _measure(
         if moved == 0:
             break
     each = (blocks.time[-1] - blocks.time[0]) / max(len(blocks.time) - 1, 1)
-    if len(kept.time) * each * step.frequency < _HERTZ * _FEWEST_CYCLES / 2 or len(kept.time) < 3:
+    if len(kept.time) * each * step.frequency < HERTZ * _FEWEST_CYCLES / 2 or len(kept.time) < 3:
         return _Measured(step, StepStatus.TOO_SHORT)
     means = mean_phasors(kept)
     left = part.left[:, first]
@@ -360,14 +332,13 @@ def _rows(blocks: BlockPhasors, rows: slice) -> BlockPhasors:
 
 
 def _without_pauses(measured: list[_Measured]) -> list[_Measured]:
-    largest = max(
-        (one.step.amplitude for one in measured if np.isfinite(one.step.amplitude)), default=0.0
-    )
+    sizes = [fitted.step.amplitude for fitted in measured]
+    largest = max((size for size in sizes if np.isfinite(size)), default=0.0)
     return [
-        one._replace(status=StepStatus.NO_FORCE, settled_from=np.nan)
-        if one.means is not None and one.step.amplitude <= _QUIET * largest
-        else one
-        for one in measured
+        fitted._replace(status=StepStatus.NO_FORCE, settled_from=np.nan)
+        if fitted.means is not None and fitted.step.amplitude <= _QUIET * largest
+        else fitted
+        for fitted in measured
     ]
 
 
@@ -378,8 +349,8 @@ def _result(
     orders: tuple[int, ...],
     level: Levels | int,
 ) -> SteppedSineStates:
-    status = np.array([int(one.status) for one in measured])
-    good = [one for one in measured if one.status is StepStatus.SETTLED]
+    status = np.array([int(fitted.status) for fitted in measured])
+    good = [fitted for fitted in measured if fitted.status is StepStatus.SETTLED]
     if not good:
         reasons = "; ".join(
             f"{np.sum(status == int(kind))} because {kind.message}"
@@ -397,14 +368,16 @@ def _result(
     rate, begin = recording.sampling_rate, recording.start_time
     return SteppedSineStates(
         states,
-        begin + np.array([one.step.start for one in measured]) / rate,
-        begin + np.array([one.step.stop for one in measured]) / rate,
-        np.array([one.settled_from for one in measured]),
-        np.array([one.step.frequency for one in measured]),
-        np.array([one.step.amplitude for one in measured]),
-        np.array([one.decay_time for one in measured]),
-        np.array([one.moved for one in measured]),
-        np.array([np.nan if one.means is None else one.means.colour.max() for one in measured]),
+        begin + np.array([fitted.step.start for fitted in measured]) / rate,
+        begin + np.array([fitted.step.stop for fitted in measured]) / rate,
+        np.array([fitted.settled_from for fitted in measured]),
+        np.array([fitted.step.frequency for fitted in measured]),
+        np.array([fitted.step.amplitude for fitted in measured]),
+        np.array([fitted.decay_time for fitted in measured]),
+        np.array([fitted.moved for fitted in measured]),
+        np.array(
+            [np.nan if fitted.means is None else fitted.means.colour.max() for fitted in measured]
+        ),
         number,
         status,
         states.notes,
@@ -413,21 +386,21 @@ def _result(
 
 def _table(good: list[_Measured]) -> PhasorTable:
     """Phasors of the settled steps; what may be left of a transient is added to the errors."""
-    means = [one.means for one in good if one.means is not None]
-    left = np.array([one.left for one in good])
-    first = np.array([np.abs(one.phasors[:, 0]) for one in means])
-    amplitude_std = np.hypot([one.amplitude_std for one in means], left)
-    phase_std = np.hypot([one.phase_std for one in means], (left / first)[:, :])
-    drive = np.array([one.drive for one in good])
+    means = [fitted.means for fitted in good if fitted.means is not None]
+    left = np.array([fitted.left for fitted in good])
+    first = np.array([np.abs(fitted.phasors[:, 0]) for fitted in means])
+    amplitude_std = np.hypot([fitted.amplitude_std for fitted in means], left)
+    phase_std = np.hypot([fitted.phase_std for fitted in means], (left / first)[:, :])
+    drive = np.array([fitted.drive for fitted in good])
     return PhasorTable(
-        np.array([one.middle for one in good]),
-        np.array([one.step.frequency for one in good]),
+        np.array([fitted.middle for fitted in good]),
+        np.array([fitted.step.frequency for fitted in good]),
         first[:, 0],
         amplitude_std[:, 0],
-        np.array([one.phasors[1:] for one in means]),
-        np.array([one.mean[1:] for one in means]),
+        np.array([fitted.phasors[1:] for fitted in means]),
+        np.array([fitted.mean[1:] for fitted in means]),
         amplitude_std[:, 1:],
         phase_std[:, 1:],
-        np.array([one.harmonic_std[1:] for one in means]),
+        np.array([fitted.harmonic_std[1:] for fitted in means]),
         drive if np.isfinite(drive).all() else None,
     )

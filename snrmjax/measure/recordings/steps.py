@@ -96,13 +96,13 @@ def moves_within_steps(steps: Sequence[Step], track: ToneTrack, sampling_rate: f
     """
     phase = unwrapped_phase(track)
     moves = [0.0]
-    for one, after in itertools.pairwise(steps):
-        rows = slice(*np.searchsorted(track.middle, (one.start, one.stop)))
-        further = (after.frequency - one.frequency) / sampling_rate
+    for step, after in itertools.pairwise(steps):
+        rows = slice(*np.searchsorted(track.middle, (step.start, step.stop)))
+        further = (after.frequency - step.frequency) / sampling_rate
         if rows.stop - rows.start > 2 and further:
             away = track.middle[rows] - track.middle[rows].mean()
             bend = 2 * np.polyfit(away, phase[rows], 2)[0]
-            moves.append(bend * (after.start + after.stop - one.start - one.stop) / 2 / further)
+            moves.append(bend * (after.start + after.stop - step.start - step.stop) / 2 / further)
     return float(np.median(moves))
 
 
@@ -132,15 +132,15 @@ def _cuts(track: ToneTrack, phase: np.ndarray, level: np.ndarray) -> list[int]:
         while start < end:
             stop = min(start + _AT_ONCE, int(end))
             rows = slice(start, stop)
-            own = _partition(
+            starts = _partition(
                 track.middle[rows], phase[rows], level[rows], weight[rows], level_weight[rows]
             )
             if stop < end:
                 # The last piece may go on: the next round begins with it, or in its middle.
-                own = [k for k in own if k < stop - start]
-                late = own[-1] if own[-1] > 0 else (stop - start) // 2
-                own = [*own[:-1], late] if own[-1] > 0 else [0, late]
-            cuts += [start + k for k in own if start + k > cuts[-1]]
+                starts = [k for k in starts if k < stop - start]
+                late = starts[-1] if starts[-1] > 0 else (stop - start) // 2
+                starts = [*starts[:-1], late] if starts[-1] > 0 else [0, late]
+            cuts += [start + k for k in starts if start + k > cuts[-1]]
             start = cuts[-1] if stop < end else int(end)
     return cuts
 
@@ -222,7 +222,7 @@ def _one_step(
     difference = abs(longest.level - piece.level)
     if difference < least_amplitude_step:
         return True
-    flat = [abs(one.slope) * one.length < difference / 2 for one in (longest, piece)]
+    flat = [abs(part.slope) * part.length < difference / 2 for part in (longest, piece)]
     ends = _at_end(track, level, last, piece)
     return not all(flat) and ends < least_amplitude_step
 

@@ -9,7 +9,9 @@ import numpy as np
 from jaxtyping import Float, Num
 
 from snrmjax.measure.recordings.channels import Channel, channel_number, checked_channels
-from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.result import AbstractResult, Variable, setting
+from snrmjax.numerics.rules import POSITIVE, require
 
 _MOST_AT_ONCE = 2**25  # numbers of all channels together: 256 MiB of float64
 
@@ -37,14 +39,14 @@ class HeldSamples(AbstractSamples):
 
     @property
     def shape(self) -> tuple[int, int]:
-        """See `AbstractSamples.shape`."""
+        """Channels and samples."""
         channels, samples = self._values.shape
         return channels, samples
 
     def read(
         self, channels: Sequence[int], start: int, stop: int
     ) -> Num[np.ndarray, "channel sample"]:
-        """See `AbstractSamples.read`."""
+        """Samples `start` to `stop` (exclusive) of some channels."""
         return np.asarray(self._values[list(channels), start:stop])
 
 
@@ -70,7 +72,7 @@ class TimeRecording(AbstractResult):
     sampling_rate: float = eqx.field(static=True)  # Hz
     start_time: float = eqx.field(static=True, default=0.0)  # s, of the first sample
     name: str = eqx.field(static=True, default="")
-    notes: tuple[str, ...] = eqx.field(static=True, default=())
+    notes: tuple[Fact | str, ...] = setting(default=())
 
     @property
     def n_samples(self) -> int:
@@ -85,7 +87,7 @@ class TimeRecording(AbstractResult):
     @property
     def channel_names(self) -> tuple[str, ...]:
         """The channels' names in order."""
-        return tuple(one.name for one in self.channels)
+        return tuple(channel.name for channel in self.channels)
 
     def time(self, start: int = 0, stop: int | None = None) -> Float[np.ndarray, " sample"]:
         """Times of samples `start` to `stop` (exclusive; the end by default), s."""
@@ -129,20 +131,20 @@ class TimeRecording(AbstractResult):
             start = stop - overlap
 
     def summary(self) -> tuple[str, ...]:
-        """See `AbstractResult`."""
+        """Size and channels."""
         return (
             f"TimeRecording{': ' + self.name if self.name else ''}, {len(self.channels)} channels "
             f"of {self.n_samples} samples at {self.sampling_rate:.6g} Hz ({self.duration:.4g} s)",
-            *(str(one) for one in self.channels),
+            *(str(channel) for channel in self.channels),
             *(f"note: {note}" for note in self.notes),
         )
 
     def variables(self) -> dict[str, Variable]:
-        """See `AbstractResult`; every channel in SI units."""
+        """Every channel in SI units."""
         values = self.values()
         return {"time_s": Variable(("time_s",), self.time(), "s", "time")} | {
-            one.name: Variable(("time_s",), row, one.si_unit, str(one))
-            for one, row in zip(self.channels, values, strict=True)
+            channel.name: Variable(("time_s",), row, channel.si_unit, str(channel))
+            for channel, row in zip(self.channels, values, strict=True)
         }
 
 
@@ -153,7 +155,7 @@ def time_recording(
     *,
     start_time: float = 0.0,
     name: str = "",
-    notes: Sequence[str] = (),
+    notes: Sequence[Fact | str] = (),
 ) -> TimeRecording:
     """Channels sampled together, checked.
 
@@ -174,10 +176,8 @@ def time_recording(
         )
     if not held.shape[1]:
         raise ValueError("a recording needs samples, but has none.")
-    if not (np.isfinite(sampling_rate) and sampling_rate > 0):
-        raise ValueError(f"`sampling_rate` must be positive (Hz), but is {sampling_rate:g}.")
-    if not np.isfinite(start_time):
-        raise ValueError(f"`start_time` must be finite (s), but is {start_time:g}.")
+    require("`sampling_rate` (Hz)", sampling_rate, POSITIVE)
+    require("`start_time` (s)", start_time)
     return TimeRecording(listed, held, float(sampling_rate), float(start_time), name, tuple(notes))
 
 

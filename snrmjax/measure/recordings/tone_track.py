@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from snrmjax.measure.recordings.time_recording import TimeRecording
+from snrmjax.numerics.units import HERTZ
 
 _BLOCK = 2**18  # samples read at once
 _SHORTEST, _LONGEST = 4, 16  # powers of two of a frame
@@ -65,7 +66,7 @@ def check_rate(recording: TimeRecording, frequency: float, name: str) -> None:
     if samples < _FEWEST_SAMPLES * (1 - 1e-9):
         raise ValueError(
             f"a record needs {_FEWEST_SAMPLES} samples a cycle, but channel {name} has "
-            f"{samples:.3g} at {frequency / (2 * np.pi):.6g} Hz, sampled at "
+            f"{samples:.3g} at {frequency / HERTZ:.6g} Hz, sampled at "
             f"{recording.sampling_rate:.6g} Hz."
         )
 
@@ -78,24 +79,24 @@ def _blocks(recording: TimeRecording, name: str) -> Iterator[ToneTrack]:
         values = block.values[0]
         end = block.start + len(values) == recording.n_samples
         # Frames that begin in the overlap belong to the next block.
-        own = len(values) if end else len(values) - overlap
-        yield _of_block(values, block.start, own)
+        new = len(values) if end else len(values) - overlap
+        yield _of_block(values, block.start, new)
 
 
-def _of_block(values: np.ndarray, start: int, own: int) -> ToneTrack:
-    found = []
+def _of_block(values: np.ndarray, start: int, new: int) -> ToneTrack:
+    frames = []
     for power in _octaves(values):
         size = 2**power
         first = -start % (size // 2)
-        last = min(own, len(values) - size + 1)
+        last = min(new, len(values) - size + 1)
         if last <= first:
             continue
         windows = np.lib.stride_tricks.sliding_window_view(values, size)
-        found.append(_frames(windows[first : last : size // 2], start + first, size))
-    if not found:
+        frames.append(_frames(windows[first : last : size // 2], start + first, size))
+    if not frames:
         empty = np.empty(0)
         return ToneTrack(empty, np.empty(0, dtype=int), empty, empty, empty)
-    return _shortest_first(found)
+    return _shortest_first(frames)
 
 
 def _octaves(values: np.ndarray) -> list[int]:
@@ -124,9 +125,9 @@ def _frames(windows: np.ndarray, start: int, size: int) -> ToneTrack:
     basis = np.concatenate([weights.real, weights.imag[:, 1:]], axis=1)
     mean = windows.mean(axis=1, keepdims=True)
     centred = windows - mean
-    found = centred @ basis
-    bins = found[:, :_BINS].astype(complex)
-    bins[:, 1:] += 1j * found[:, _BINS:]
+    projected = centred @ basis
+    bins = projected[:, :_BINS].astype(complex)
+    bins[:, 1:] += 1j * projected[:, _BINS:]
     energy = np.einsum("fs,fs,s->f", centred, centred, window**2)
     sizes = np.abs(bins)
     largest = np.where(np.isfinite(sizes).all(axis=1), sizes.T, 0.0).T.argmax(axis=1)
@@ -151,10 +152,10 @@ def _frames(windows: np.ndarray, start: int, size: int) -> ToneTrack:
     )
 
 
-def _shortest_first(found: list[ToneTrack]) -> ToneTrack:
+def _shortest_first(tracks: list[ToneTrack]) -> ToneTrack:
     """Frames of all lengths by time; a longer frame that a shorter one covers is left out."""
-    kept = found[0]
-    for longer in found[1:]:
+    kept = tracks[0]
+    for longer in tracks[1:]:
         if kept.middle.size and longer.middle.size:
             place = np.searchsorted(kept.middle, longer.middle)
             before = np.abs(longer.middle - kept.middle[np.maximum(place - 1, 0)])

@@ -7,14 +7,13 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
-from snrmjax.measure.recordings.channels import Channel, channel_number
+from snrmjax.measure.recordings.channels import DERIVATIVE, Channel, channel_number
 from snrmjax.measure.recordings.time_recording import TimeRecording
-from snrmjax.measure.signals import require_orders
 from snrmjax.measure.states import SteadyStates, steady_states
+from snrmjax.numerics.facts import Fact
 
 Levels = Literal["auto", "force", "drive", "runs"]
 
-_MOTION = {"displacement": 1, "velocity": 0, "acceleration": -1}
 _GAP = 0.05  # of log amplitude between levels, at least
 _SPREAD = 0.4  # of log amplitude within a level, at most, where groups are to be believed
 
@@ -66,12 +65,12 @@ def choose_channels(
             f"channel {force} must be a force or the voltage that drives one, but its quantity is "
             f"{source.quantity}."
         )
-    motions = tuple(recording.channels[_number(recording, one, "response")] for one in wanted)
-    for one in motions:
-        if one.quantity not in _MOTION:
+    motions = tuple(recording.channels[_number(recording, name, "response")] for name in wanted)
+    for channel in motions:
+        if channel.quantity not in DERIVATIVE:
             raise ValueError(
-                f"channel {one.name} must be a displacement, velocity or acceleration, but its "
-                f"quantity is {one.quantity}."
+                f"channel {channel.name} must be a displacement, velocity or acceleration, but its "
+                f"quantity is {channel.quantity}."
             )
     names = (force, *wanted)
     if len(set(names)) != len(names):
@@ -94,19 +93,11 @@ def velocity_factors(
     """What turns phasors of each channel into velocities: (ikΩ) for displacements, 1/(ikΩ) for
     accelerations. The mean of an acceleration says nothing of the velocity: NaN.
     """
-    power = np.array([_MOTION[one.quantity] for one in channels])[:, None]
+    power = 1 - np.array([DERIVATIVE[channel.quantity] for channel in channels])[:, None]
     turn = 1j * np.asarray(orders) * np.asarray(frequency, dtype=float)[..., None, None]
     safe = np.where(turn == 0, 1.0, turn)
     at_rest = np.where(power == 0, 1.0, np.where(power > 0, 0.0, np.nan))
     return np.where(turn == 0, at_rest, safe**power)
-
-
-def checked_orders(harmonic_order: Sequence[int]) -> tuple[int, ...]:
-    """Harmonic orders with the fundamental. Raises `ValueError` otherwise."""
-    orders = require_orders("harmonic_order", tuple(harmonic_order))
-    if 1 not in orders:
-        raise ValueError(f"`harmonic_order` must contain the fundamental, 1, but is {orders}.")
-    return orders
 
 
 def states_of_phasors(
@@ -115,21 +106,21 @@ def states_of_phasors(
     table: PhasorTable,
     orders: tuple[int, ...],
     level: Levels | int,
-    notes: Sequence[str] = (),
+    notes: Sequence[Fact] = (),
 ) -> SteadyStates:
     """Steady states of phasors of any motion, in the order of the table."""
     higher = tuple(k for k in orders if k != 1)
-    every = np.concatenate([table.mean[:, :, None], table.phasors], axis=2)
+    phasors = np.concatenate([table.mean[:, :, None], table.phasors], axis=2)
     spread = np.concatenate([np.full_like(table.mean, np.nan)[:, :, None], table.harmonic_std], 2)
-    factors = velocity_factors(chosen.responses, range(every.shape[2]), table.frequency)
-    velocity = every * factors
+    factors = velocity_factors(chosen.responses, range(phasors.shape[2]), table.frequency)
+    velocity = phasors * factors
     noisy = [k for k in higher if k > 0]
     floor = None
     if noisy:
         floor = np.sqrt(np.mean((spread * np.abs(factors))[:, :, noisy] ** 2, axis=2))
     volts = chosen.force.quantity == "voltage"
     number, rule = number_levels(level, table.force, table.drive, table.frequency)
-    told = (*notes, *([f"levels {_LEVELS_BY[rule]}"] if rule else []))
+    numbered = (Fact("levels_numbered", by=rule),) if rule else ()
     unknown = np.full(len(table.force), np.nan)
     states = steady_states(
         number,
@@ -146,7 +137,7 @@ def states_of_phasors(
         harmonic_std=floor,
         harmonic_order=higher,
     )
-    return dataclasses.replace(states, notes=told)
+    return dataclasses.replace(states, notes=(*notes, *numbered))
 
 
 def number_levels(
@@ -178,23 +169,6 @@ def number_levels(
     return _runs(frequency), "runs"
 
 
-_LEVELS_BY = {
-    "drive": "by amplitude of the drive",
-    "force": "by amplitude of the force",
-    "runs": "by runs of frequency: the force of a run is not constant",
-}
-
-
-def counted_levels(number: Int[np.ndarray, " state"], rule: str) -> str:
-    """How many levels were found by a rule of `number_levels`.
-
-    >>> counted_levels(np.array([1, 1]), "force")
-    '1 level by amplitude of the force'
-    """
-    n = len(np.unique(np.asarray(number)))
-    return f"{n} level{'s' if n > 1 else ''} {_LEVELS_BY[rule]}"
-
-
 def _number(recording: TimeRecording, name: str, what: str) -> int:
     try:
         return channel_number(recording.channels, name)
@@ -220,7 +194,7 @@ def _runs(frequency: np.ndarray) -> np.ndarray:
     """A new level where the frequency jumps back against its direction by several steps."""
     steps = np.diff(frequency)
     typical = np.median(np.abs(steps)) if len(steps) else 0.0
-    number, direction, found = 1, 0.0, [1]
+    number, direction, numbers = 1, 0.0, [1]
     for step in steps:
         turns = direction != 0 and np.sign(step) != direction and step != 0
         leaps = abs(step) > 3 * typical
@@ -228,5 +202,5 @@ def _runs(frequency: np.ndarray) -> np.ndarray:
             number, direction = number + 1, 0.0
         elif step != 0:
             direction = float(np.sign(step))
-        found.append(number)
-    return np.array(found)
+        numbers.append(number)
+    return np.array(numbers)

@@ -17,10 +17,10 @@ from snrmjax.measure.recordings.tone_track import (
 from snrmjax.measure.recordings.velocity_states import (
     ChosenChannels,
     Levels,
-    checked_orders,
     choose_channels,
     states_of_phasors,
 )
+from snrmjax.measure.signals import require_fundamental
 from snrmjax.measure.states import SteadyStates
 from snrmjax.measure.sweeps.sweep_bias import SweepBias, sweep_bias_where_slow
 from snrmjax.measure.sweeps.sweep_correction import ModalBalance, modal_balance
@@ -28,18 +28,18 @@ from snrmjax.measure.sweeps.sweep_runs import LEAST_RANGE, Sweep, sweep_runs, tr
 from snrmjax.measure.sweeps.swept_phasors import SweptPhasors, swept_phasors
 from snrmjax.measure.sweeps.swept_table import (
     Moment,
-    averaged_table,
     held_force,
-    pairs_of,
     reference_response,
     swept_moment,
     swept_motion,
     table_of,
 )
-from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
+from snrmjax.numerics.rules import POSITIVE, require
 from snrmjax.numerics.status import Status
+from snrmjax.numerics.units import HERTZ
 
-_HERTZ = 2 * np.pi
 _START = 60  # states a sweep before the grid is made finer where the response changes
 _CHORD = 0.08  # of the largest response between neighbouring states
 _ROUNDS = 3
@@ -62,68 +62,24 @@ class SweptStates(AbstractResult):
     coordinates: ClassVar[tuple[str, ...]] = ("state",)
 
     states: SteadyStates
-    sweep: Int[np.ndarray, " state"]  # which sweep each state is from, −1: both directions
-    time: Float[np.ndarray, " state"]  # s
-    moving: Complex[np.ndarray, " state"]  # share of the force that moved the phasor, taken out
     sweeps: tuple[Sweep, ...] = eqx.field(static=True)
     bias: tuple[SweepBias | None, ...] = eqx.field(static=True)  # at resonance, uncorrected
     balance: ModalBalance
-    left_out: tuple[int, ...] = eqx.field(static=True)  # moments, by `SweepStatus`
-    corrected: bool = eqx.field(static=True)
-
-    def summary(self) -> tuple[str, ...]:
-        """See `AbstractResult`."""
-        lines = [f"SweptStates: {self.states.n_states} states of {len(self.sweeps)} sweeps"]
-        for sweep, bias in zip(self.sweeps, self.bias, strict=True):
-            says = (
-                ""
-                if bias is None
-                else (
-                    f": by itself it shifts the peak by {bias.frequency_shift / _HERTZ:.2g} Hz and "
-                    f"lowers it to {100 * bias.peak_ratio:.4g} % (normalised rate "
-                    f"{bias.normalised_rate:.2g})"
-                )
-            )
-            lines.append(
-                f"{sweep.first / _HERTZ:.5g} to {sweep.last / _HERTZ:.5g} Hz in "
-                f"{sweep.stop - sweep.start:.4g} s{says}"
-            )
-        share = np.abs(self.moving)
-        if self.corrected:
-            lines.append(f"taken out: up to {100 * share.max():.2g} % of the force")
-        notes = (f"note: {note}" for note in self.states.notes)
-        return (*lines, *self._left_out_in_words(), *notes)
-
-    def _left_out_in_words(self) -> tuple[str, ...]:
-        return tuple(
-            f"{count} left out: {kind.message}"
-            for kind, count in zip(SweepStatus, self.left_out, strict=True)
-            if count and kind is not SweepStatus.FOUND
-        )
-
-    @property
-    def remarks(self) -> tuple[str, ...]:
-        """What a reader of the states should know: the bias of all sweeps, and what is missing."""
-        bias = [one for one in self.bias if one is not None]
-        shift = max((abs(one.frequency_shift) for one in bias), default=0.0) / _HERTZ
-        lowest = min((one.peak_ratio for one in bias), default=1.0)
-        told = (
-            f"each of {len(self.sweeps)} sweeps by itself shifts the peak by up to {shift:.2g} Hz "
-            f"and lowers it to {100 * lowest:.4g} %: {'' if self.corrected else 'not '}taken out"
-        )
-        return (*((told,) if bias else ()), *self._left_out_in_words(), *self.states.notes)
+    sweep: Int[np.ndarray, " state"] = quantity("state", "1", "sweep from which it is")
+    time: Float[np.ndarray, " state"] = quantity("state", "s", "when it was passed", name="time_s")
+    # That moved the phasor instead of holding it, and was taken out.
+    sweep_inertia_fraction: Complex[np.ndarray, " state"] = quantity(
+        "state", "1", "share of the force taken out"
+    )
+    corrected: bool = setting()
+    notes: tuple[Fact | str, ...] = setting()  # the bias of all sweeps, and what is missing
 
     def variables(self) -> dict[str, Variable]:
-        """See `AbstractResult`."""
-        at = ("state",)
-        hertz = np.asarray(self.states.frequency) / _HERTZ
+        """By state, with its frequency."""
+        hertz = np.asarray(self.states.frequency) / HERTZ
         return {
-            "state": Variable(at, np.arange(len(self.time)), "1", "steady state"),
-            "frequency_hz": Variable(at, hertz, "Hz", "frequency"),
-            "time_s": Variable(at, self.time, "s", "when it was passed"),
-            "sweep": Variable(at, self.sweep, "1", "sweep, -1: both directions"),
-            "moving_re": Variable(at, self.moving.real, "1", "share of the force taken out"),
-            "moving_im": Variable(at, self.moving.imag, "1", "its imaginary part"),
+            **super().variables(),
+            "frequency_hz": Variable(("state",), hertz, "Hz", "frequency"),
         }
 
 
@@ -139,7 +95,6 @@ def sweep_states(
     drive: str | None = None,
     cycles: float = 16.0,
     correct: bool = True,
-    average: bool = False,
 ) -> SweptStates:
     """Steady states from the time record of slow linear or logarithmic sweeps.
 
@@ -150,9 +105,7 @@ def sweep_states(
     Arguments: `force`, `responses`, `harmonic_order`, `level`, `sensors` and `drive` as in
     `stepped_sine_states`; `frequencies` in rad/s at which states are wanted (by default a grid
     that is finer where the response changes); `cycles` is the width of the window; `correct` takes
-    the bias of the sweep out (without it, and where it cannot be told, 1σ holds the bias);
-    `average` makes one state of those that an upward and a downward sweep have at one of the
-    `frequencies`, unless they differ by more than a fifth.
+    the bias of the sweep out (without it, and where it cannot be told, 1σ holds the bias).
     Returns `SweptStates` with the bias that each sweep has at resonance without correction.
     Raises `ValueError` for channels that do not fit, a record in which no sweep is found, windows
     of fewer than six cycles, fewer than four samples a cycle, frequencies outside every sweep and
@@ -174,7 +127,7 @@ def sweep_states(
     >>> found.states.force.round(4).tolist(), np.angle(found.states.velocity).round(4).tolist()
     ([2.0, 2.0], [[0.2], [0.2]])
     """
-    orders = checked_orders(harmonic_order)
+    orders = require_fundamental("harmonic_order", harmonic_order)
     chosen = choose_channels(recording, force, responses, sensors=sensors, drive=drive)
     if not cycles >= 6:
         raise ValueError(f"`cycles` must be 6 at least, but is {cycles:g}.")
@@ -191,11 +144,9 @@ def sweep_states(
     check_rate(recording, fastest * recording.sampling_rate * max(orders) / 2, guide)
     reader = _Reader(recording, chosen, track, phase, cycles, max(*orders, 3))
     wanted = None if frequencies is None else _wanted(frequencies, reader, runs)
-    if average and wanted is None:
-        wanted = reader.grid(runs[0])
     grids = [reader.along(rows, None) for rows in runs] if correct or wanted is None else []
     passed = grids if wanted is None else [reader.along(rows, wanted) for rows in runs]
-    return _result(reader, runs, passed, grids, orders, level, correct, average)
+    return _result(reader, runs, passed, grids, orders, level, correct)
 
 
 class _Reader(NamedTuple):
@@ -218,15 +169,11 @@ class _Reader(NamedTuple):
         if not ordered[0] <= goal <= ordered[-1]:
             return None
         place = float(np.interp(goal, ordered, part.middle))
-        names = (self.chosen.force.name, *(one.name for one in self.chosen.responses))
+        names = (self.chosen.force.name, *(channel.name for channel in self.chosen.responses))
         return swept_phasors(
             *(self.recording, names, part, self.phase[rows]),
             *(omega, place, self.cycles, self.highest),
         )
-
-    def grid(self, rows: slice) -> np.ndarray:
-        """Frequencies along a sweep, closer where the response changes."""
-        return np.array([omega for omega, _ in self.along(rows, None)])
 
     def along(
         self, rows: slice, wanted: np.ndarray | None
@@ -237,21 +184,21 @@ class _Reader(NamedTuple):
             inside = (wanted >= speed.min()) & (wanted <= speed.max())
             return [(float(omega), self.at(rows, float(omega))) for omega in wanted[inside]]
         middle = self.track.middle[rows] / self.recording.sampling_rate
-        edge = _HERTZ * self.cycles / speed.min()
+        edge = HERTZ * self.cycles / speed.min()
         rate = np.ptp(speed) / np.ptp(middle)
         grid = np.linspace(speed[0], speed[-1], _START + 2)[1:-1]
-        found = {float(omega): self.at(rows, float(omega)) for omega in grid}
+        passed = {float(omega): self.at(rows, float(omega)) for omega in grid}
         for _ in range(_ROUNDS):
-            known = sorted((omega, one) for omega, one in found.items() if one is not None)
+            known = sorted((omega, at) for omega, at in passed.items() if at is not None)
             if len(known) < 2:
                 break
-            answer = np.array([one.series[1:, 0] / one.series[0, 0] for _, one in known])
+            answer = np.array([at.series[1:, 0] / at.series[0, 0] for _, at in known])
             change = np.abs(np.diff(answer, axis=0)) / np.abs(answer).max(axis=0)
             omegas = np.array([omega for omega, _ in known])
             coarse = (change.max(axis=1) > _CHORD) & (np.diff(omegas) > rate * edge / 2)
             for omega in (omegas[1:] + omegas[:-1])[coarse] / 2:
-                found[float(omega)] = self.at(rows, float(omega))
-        return sorted(found.items(), reverse=bool(speed[-1] < speed[0]))
+                passed[float(omega)] = self.at(rows, float(omega))
+        return sorted(passed.items(), reverse=bool(speed[-1] < speed[0]))
 
 
 def _wanted(
@@ -260,16 +207,17 @@ def _wanted(
     runs: list[slice],
 ) -> Float[np.ndarray, " frequency"]:
     wanted = np.asarray(frequencies, dtype=float)
-    if wanted.ndim != 1 or not wanted.size or not (np.isfinite(wanted) & (wanted > 0)).all():
-        raise ValueError("`frequencies` must be positive numbers in a vector (rad/s).")
+    if wanted.ndim != 1 or not wanted.size:
+        raise ValueError("`frequencies` must be a vector with one frequency at least.")
+    require("`frequencies` (rad/s)", wanted, POSITIVE)
     speed = track_speed(reader.track, reader.phase) * reader.recording.sampling_rate
     low = min(float(speed[rows].min()) for rows in runs)
     high = max(float(speed[rows].max()) for rows in runs)
     outside = wanted[(wanted < low) | (wanted > high)]
     if outside.size:
         raise ValueError(
-            f"`frequencies` must lie within the sweeps, {low / _HERTZ:.6g} to "
-            f"{high / _HERTZ:.6g} Hz, but one is {outside[0] / _HERTZ:.6g} Hz."
+            f"`frequencies` must lie within the sweeps, {low / HERTZ:.6g} to "
+            f"{high / HERTZ:.6g} Hz, but one is {outside[0] / HERTZ:.6g} Hz."
         )
     return wanted
 
@@ -282,17 +230,16 @@ def _result(
     orders: tuple[int, ...],
     level: Levels | int,
     correct: bool,
-    average: bool,
 ) -> SweptStates:
     moments, status = _moments(reader.chosen, passed)
     left_out = [status.count(kind) for kind in SweepStatus]
     if moments:
-        every = _moments(reader.chosen, grids)[0] or moments
-        reference = reference_response(every)
-        balance = modal_balance(swept_motion(every, reference))
+        along = _moments(reader.chosen, grids)[0] or moments
+        reference = reference_response(along)
+        balance = modal_balance(swept_motion(along, reference))
         corrected = correct and bool(np.isfinite(balance.constant))
         held, held_std = held_force(moments, reference, balance, corrected)
-        share = 1 - held / np.array([one.found.series[0, 0] for one in moments])
+        share = 1 - held / np.array([moment.phasors.series[0, 0] for moment in moments])
         slow = np.abs(share) <= _MUCH
         left_out[int(SweepStatus.TOO_FAST)] += int(np.sum(~slow))
     if not moments or not slow.any():
@@ -303,22 +250,11 @@ def _result(
         )
         nothing = "none passes the wanted frequencies, or samples are missing there"
         raise ValueError(f"no state can be told from the sweeps: {reasons or nothing}.")
-    kept = [one for one, good in zip(moments, slow, strict=True) if good]
+    kept = [moment for moment, good in zip(moments, slow, strict=True) if good]
     table = table_of(kept, reader.chosen, held[slow], held_std[slow])
-    number = np.array([one.sweep for one in kept])
+    number = np.array([moment.sweep for moment in kept])
     share = share[slow]
-    if average:
-        rising = np.array([_rises(reader, rows) for rows in runs])[number]
-        pairs = pairs_of(np.array([one.wanted for one in kept]), rising, table)
-        table = averaged_table(table, pairs)
-        number = np.array([number[a] if a == b else -1 for a, b in pairs])
-        share = np.array([(share[a] + share[b]) / 2 for a, b in pairs])
-    notes = []
-    if correct and not corrected:
-        notes.append(
-            "too few states near resonance: the bias of the sweep is not taken out, but is within "
-            "the stated errors"
-        )
+    notes = [Fact("sweep_bias_unknown")] if correct and not corrected else []
     states = states_of_phasors(reader.recording, reader.chosen, table, orders, level, notes)
     rate, begin = reader.recording.sampling_rate, reader.recording.start_time
     speed = track_speed(reader.track, reader.phase) * rate
@@ -329,11 +265,32 @@ def _result(
         )
         for rows in runs
     )
-    bias = tuple(_bias(balance, every, k) for k in range(len(runs)))
-    left_out[0] = states.n_states
-    return SweptStates(
-        states, number, table.time, share, sweeps, bias, balance, tuple(left_out), corrected
-    )
+    bias = tuple(_bias(balance, along, k) for k in range(len(runs)))
+    facts = (*_facts_of_sweeps(bias, corrected, left_out), *states.notes)
+    return SweptStates(states, sweeps, bias, balance, number, table.time, share, corrected, facts)
+
+
+def _facts_of_sweeps(
+    bias: Sequence[SweepBias | None], corrected: bool, left_out: Sequence[int]
+) -> list[Fact]:
+    known = [sweep for sweep in bias if sweep is not None]
+    facts = []
+    if known:
+        shift = max(abs(sweep.frequency_shift) for sweep in known) / HERTZ
+        facts.append(
+            Fact(
+                "sweep_bias",
+                sweeps=len(bias),
+                shift_hz=shift,
+                lowest=min(sweep.peak_ratio for sweep in known),
+                removed=corrected,
+            )
+        )
+    return facts + [
+        Fact("moments_left_out", count=count, status=kind)
+        for kind, count in zip(SweepStatus, left_out, strict=True)
+        if count and kind is not SweepStatus.FOUND
+    ]
 
 
 def _moments(
@@ -342,32 +299,28 @@ def _moments(
     """States that can be read, and how every moment ended so far."""
     moments, status = [], []
     for k, run in enumerate(passed):
-        for omega, found in run:
-            if found is None:
+        for _, phasors in run:
+            if phasors is None:
                 status.append(SweepStatus.OUTSIDE)
-            elif found.clipped:
+            elif phasors.clipped:
                 status.append(SweepStatus.CLIPPED)
             else:
-                moment = swept_moment(chosen, k, omega, found)
-                error = np.min(found.std[1:, 0] / np.abs(found.series[1:, 0]))
+                moment = swept_moment(chosen, k, phasors)
+                error = np.min(phasors.std[1:, 0] / np.abs(phasors.series[1:, 0]))
                 blurred = not error < _BLURRED
                 status.append(SweepStatus.TOO_FAST if blurred else SweepStatus.FOUND)
                 moments += [] if blurred else [moment]
     return moments, status
 
 
-def _rises(reader: _Reader, rows: slice) -> bool:
-    return bool(reader.track.frequency[rows.stop - 1] > reader.track.frequency[rows.start])
-
-
 def _bias(balance: ModalBalance, moments: list[Moment], sweep: int) -> SweepBias | None:
     """What the sweep does to its resonance, by the mode that the balance found."""
-    own = [one for one in moments if one.sweep == sweep]
-    if not own or not np.isfinite(balance.constant):
+    mine = [moment for moment in moments if moment.sweep == sweep]
+    if not mine or not np.isfinite(balance.constant):
         return None
     stiffness, damping = balance.stiffness[-1], balance.damping[-1]
     if stiffness <= 0 or damping <= 0:
         return None
     omega = float(np.sqrt(stiffness))
-    near = min(own, key=lambda one: abs(one.found.rate[0] - omega))
-    return sweep_bias_where_slow(omega, float(damping / (2 * omega)), float(near.found.rate[1]))
+    near = min(mine, key=lambda moment: abs(moment.phasors.rate[0] - omega))
+    return sweep_bias_where_slow(omega, float(damping / (2 * omega)), float(near.phasors.rate[1]))

@@ -12,6 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from snrmjax.numerics.rules import BETWEEN_ZERO_AND_ONE, POSITIVE, require
+
 _REACH = 12.0  # half bandwidths about resonance in which the peak is sought
 _POINTS = 4001
 _FASTEST = 10.0  # normalised rate up to which there is a half-power width
@@ -39,13 +41,9 @@ def sweep_bias(natural_frequency: float, damping_ratio: float, rate: float) -> S
     >>> round(found.normalised_rate, 3), round(found.peak_ratio, 4)
     (0.125, 0.9972)
     """
-    if not (natural_frequency > 0 and 0 < damping_ratio < 1):
-        raise ValueError(
-            "`natural_frequency` must be positive and `damping_ratio` between 0 and 1, but they "
-            f"are {natural_frequency:g} and {damping_ratio:g}."
-        )
-    if not np.isfinite(rate):
-        raise ValueError(f"`rate` must be finite (rad/s²), but is {rate:g}.")
+    require("`natural_frequency`", natural_frequency, POSITIVE)
+    require("`damping_ratio`", damping_ratio, BETWEEN_ZERO_AND_ONE)
+    require("`rate` (rad/s²)", rate)
     half = damping_ratio * natural_frequency
     curvature = abs(rate) / half**2
     normalised = np.pi / 2 * curvature

@@ -47,7 +47,7 @@ class SweptMotion(NamedTuple):
 
 
 class ModalBalance(NamedTuple):
-    """What the balance of a mode says of it; `constant` is NaN where it says nothing."""
+    """Modal parameters from the swept force balance; `constant` is NaN where it has none."""
 
     constant: float  # modal constant, 1/kg: displacement times ω² over force, of one mode
     constant_std: float
@@ -71,21 +71,21 @@ def modal_balance(motion: SweptMotion) -> ModalBalance:
     size = np.abs(motion.displacement)
     used = motion.part(size > _LOUD * size.max())
     knots = np.linspace(*_range(used), _KNOTS)
-    found = _solved(used, knots)
-    if np.isfinite(found.constant):
+    balance = _solved(used, knots)
+    if np.isfinite(balance.constant):
         # Once more without states that are blurred: at a jump, where a sweep begins.
-        blur = 2 * used.frequency * used.first_std / np.abs(found.constant * used.force)
+        blur = 2 * used.frequency * used.first_std / np.abs(balance.constant * used.force)
         used = used.part(blur < max(_BLURRED, _OUTLYING * float(np.median(blur))))
-        found = _solved(used, knots) if used.frequency.size else _unknown(knots)
-    if not np.isfinite(found.constant):
-        return found
+        balance = _solved(used, knots) if used.frequency.size else _unknown(knots)
+    if not np.isfinite(balance.constant):
+        return balance
     place = np.arange(len(used.frequency)) * _PARTS // len(used.frequency)
     others = np.array([_solved(used.part(place != k), knots).constant for k in range(_PARTS)])
     std = float(np.sqrt((_PARTS - 1) / _PARTS * np.sum((others - others.mean()) ** 2)))
-    std = float(np.hypot(std, found.constant_std))
-    if not std < _SURE * abs(found.constant):
+    std = float(np.hypot(std, balance.constant_std))
+    if not std < _SURE * abs(balance.constant):
         return _unknown(knots)
-    return found._replace(constant_std=std)
+    return balance._replace(constant_std=std)
 
 
 def share_of_bias(motion: SweptMotion) -> Float[np.ndarray, " state"]:
@@ -133,20 +133,20 @@ def _solved(used: SweptMotion, knots: np.ndarray) -> ModalBalance:
         moving = _moving(used, damping) / used.displacement
         right = np.concatenate([moving.real - used.frequency**2, moving.imag])
         rows, wanted = design * weight[:, None], right * weight
-        found, _, rank, _ = np.linalg.lstsq(rows, wanted, rcond=None)
-        damping = lossy @ found[1 + powers :] * np.sqrt(scale)
+        fitted, _, rank, _ = np.linalg.lstsq(rows, wanted, rcond=None)
+        damping = lossy @ fitted[1 + powers :] * np.sqrt(scale)
     if rank < design.shape[1]:
         return _unknown(knots)
-    rest = rows @ found - wanted
+    rest = rows @ fitted - wanted
     spread = np.linalg.inv(rows.T @ rows)[0, 0] * np.sum(rest**2)
     spread /= max(len(rest) - design.shape[1], 1)
-    left = (design @ found - right) * np.tile(size / np.abs(used.force), 2) / abs(found[0] * unit)
+    left = (design @ fitted - right) * np.tile(size / np.abs(used.force), 2) / abs(fitted[0] * unit)
     return ModalBalance(
-        float(found[0] * unit),
+        float(fitted[0] * unit),
         float(np.sqrt(spread)) * unit,
         knots,
-        terms(knots, _STIFFNESS[:powers]) @ found[1 : 1 + powers] * scale,
-        terms(knots, _DAMPING[:damped]) @ found[1 + powers :] * np.sqrt(scale),
+        terms(knots, _STIFFNESS[:powers]) @ fitted[1 : 1 + powers] * scale,
+        terms(knots, _DAMPING[:damped]) @ fitted[1 + powers :] * np.sqrt(scale),
         float(np.sqrt(2 * np.mean(left**2))),
     )
 

@@ -128,19 +128,21 @@ def _fit(values: np.ndarray, away: np.ndarray, law: np.ndarray, highest: int) ->
         parts.append((powers[:2] * (turn**order).real, -powers[:2] * (turn**order).imag))
     design = np.concatenate([np.stack(columns), *(row for pair in parts for row in pair)])
     inverse = np.linalg.inv(design @ design.T)
-    found = values @ (inverse @ design).T
-    rest = values - found @ design
+    fitted = values @ (inverse @ design).T
+    rest = values - fitted @ design
     noise = np.sum(rest**2, axis=1) / (values.shape[1] - len(design))
     noise *= _colour(rest, law[1])
     spread = np.diag(inverse)
     n = DEGREE + 1
     back = half ** -np.arange(n, dtype=float)
-    series = (found[:, 2 : 2 + n] + 1j * found[:, 2 + n : 2 + 2 * n]) * back
+    series = (fitted[:, 2 : 2 + n] + 1j * fitted[:, 2 + n : 2 + 2 * n]) * back
     std = np.sqrt(noise[:, None] * (spread[2 : 2 + n] + spread[2 + n : 2 + 2 * n])) * back
     first = 2 + 2 * n + 4 * np.arange(highest - 1)
-    harmonics = np.concatenate([series[:, :1], found[:, first] + 1j * found[:, first + 2]], axis=1)
+    harmonics = np.concatenate(
+        [series[:, :1], fitted[:, first] + 1j * fitted[:, first + 2]], axis=1
+    )
     others = np.sqrt(noise[:, None] * (spread[first] + spread[first + 2]))
-    return _Fit(series, std, harmonics, np.concatenate([std[:, :1], others], axis=1), found[:, 0])
+    return _Fit(series, std, harmonics, np.concatenate([std[:, :1], others], axis=1), fitted[:, 0])
 
 
 def _colour(rest: np.ndarray, step: float) -> np.ndarray:
@@ -166,10 +168,10 @@ def displacement_series(
     turning = np.zeros(series.shape[-1], dtype=complex)
     turning[: len(rate)] = 1j * rate
     for _ in range(integrations):
-        found = _divided(series, turning)
+        solved = _divided(series, turning)
         for _ in range(DEGREE):
-            found = _divided(series - _derivative(found), turning)
-        series = found
+            solved = _divided(series - _derivative(solved), turning)
+        series = solved
     return series
 
 
@@ -181,8 +183,8 @@ def _derivative(series: np.ndarray) -> np.ndarray:
 
 def _divided(series: np.ndarray, by: np.ndarray) -> np.ndarray:
     """Quotient of two power series."""
-    found = np.zeros_like(series)
+    quotient = np.zeros_like(series)
     for k in range(series.shape[-1]):
-        before = sum(found[..., m] * by[k - m] for m in range(k))
-        found[..., k] = (series[..., k] - before) / by[0]
-    return found
+        before = sum(quotient[..., m] * by[k - m] for m in range(k))
+        quotient[..., k] = (series[..., k] - before) / by[0]
+    return quotient

@@ -22,8 +22,15 @@ from jaxtyping import Array, Float
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.methods.records.state_space import hold, is_balanced, modal_constant, model_resonances
 from snrmjax.methods.records.state_space_fit import StateSpaceFit, fit_state_space
-from snrmjax.methods.result import MethodPoint, MethodResult, MethodStatus, method_result
+from snrmjax.methods.result import (
+    MethodPoint,
+    MethodResult,
+    MethodStatus,
+    method_result,
+    points_of_curves,
+)
 from snrmjax.model.modes import LinearModes
+from snrmjax.numerics.facts import Fact
 
 _POINTS = 25
 _SMALLEST = 0.04  # of the largest velocity: where the curves begin
@@ -57,21 +64,27 @@ def pnlss(
     amplitude = np.linspace(_SMALLEST, 1.0, _POINTS) * fit.largest
     found = model_resonances(fit.model, amplitude / fit.velocity_unit, fit.exponents, fit.mode)
     balanced = np.cumprod(np.asarray(is_balanced(found))).astype(bool)
-    points = []
-    values = _curves(fit, np.asarray(found.angle), np.asarray(found.force), found.slopes)
-    for k, speed in enumerate(amplitude):
-        if not balanced[k]:
-            points.append(MethodPoint(MethodStatus.NO_RESONANCE, -1))
-        elif not values[1, k] > 0:
-            points.append(MethodPoint(MethodStatus.NOT_A_MODE, -1))
-        else:
-            omega, ratio, omega_std, ratio_std = (float(one) for one in values[:, k])
-            points.append(
-                MethodPoint(
-                    MethodStatus.FOUND, -1, float(speed), omega, omega_std, ratio, ratio_std
-                )
-            )
-    return method_result("pnlss", points, 0, _notes(fit))
+    omega, ratio, omega_std, ratio_std = _curves(
+        fit, np.asarray(found.angle), np.asarray(found.force), found.slopes
+    )
+    points = [
+        point if known else MethodPoint(MethodStatus.NO_RESONANCE, -1)
+        for point, known in zip(
+            points_of_curves(amplitude, omega, omega_std, ratio, ratio_std), balanced, strict=True
+        )
+    ]
+    notes = [
+        Fact(
+            "state_space_fitted",
+            n_monomials=len(fit.exponents),
+            misfit=fit.misfit,
+            linear_misfit=fit.linear_misfit,
+            validation=None if np.isnan(fit.validation) else fit.validation,
+        )
+    ]
+    if fit.excess > _BEYOND:
+        notes.append(Fact("misfit_beyond_noise", times=fit.excess))
+    return method_result("pnlss", points, 0, notes)
 
 
 def _curves(
@@ -80,7 +93,7 @@ def _curves(
     """Natural frequency (rad/s), damping ratio, and 1σ of each."""
     flat, rebuild = ravel_pytree(fit.model)
     constant, by_coefficients = jax.value_and_grad(
-        lambda one: modal_constant(rebuild(one), fit.mode)
+        lambda coefficients: modal_constant(rebuild(coefficients), fit.mode)
     )(flat)
     ratio = float(constant) * force * hold(angle) / (2 * angle)
     by_angle, by_force = np.asarray(slopes)
@@ -90,27 +103,7 @@ def _curves(
         - by_angle / angle[:, None]
     )
     angle_std, relative_std = (
-        np.sqrt(np.maximum(np.einsum("ki,ij,kj->k", one, fit.covariance, one), 0))
-        for one in (by_angle, relative)
+        np.sqrt(np.maximum(np.einsum("ki,ij,kj->k", slope, fit.covariance, slope), 0))
+        for slope in (by_angle, relative)
     )
     return np.stack([angle * fit.rate, ratio, angle_std * fit.rate, relative_std * np.abs(ratio)])
-
-
-def _notes(fit: StateSpaceFit) -> tuple[str, ...]:
-    checked = (
-        "no realisation was left to validate it"
-        if np.isnan(fit.validation)
-        else f"{100 * fit.validation:.2g} % of a realisation that was not fitted"
-    )
-    left = (
-        f"{len(fit.exponents)} monomials a state; the model leaves {100 * fit.misfit:.2g} % (rms) "
-        f"of the velocity, the linear one {100 * fit.linear_misfit:.2g} %; {checked}"
-    )
-    if not fit.excess > _BEYOND:
-        return (left,)
-    return (
-        left,
-        f"what is left of the fitted lines is {fit.excess:.2g} times the noise by which periods "
-        "scatter: forces are no polynomials of these degrees, or the record is not periodic, and "
-        "the bands do not hold the error that this makes",
-    )

@@ -18,13 +18,13 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from snrmjax.identify.pointwise.snrm import reference_sensor
 from snrmjax.measure.recordings.ring_down import find_ring_downs
 from snrmjax.measure.recordings.steps import moves_within_steps, recognise_steps
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.recordings.tone_track import ToneTrack, track_tone, unwrapped_phase
 from snrmjax.measure.sweeps.sweep_runs import sweep_runs
-from snrmjax.model.modes import LinearModes
+from snrmjax.model.modes import LinearModes, reference_sensor
+from snrmjax.numerics.facts import Fact
 
 _MOTIONS = ("velocity", "acceleration", "displacement")
 _HERTZ = 2 * np.pi
@@ -68,7 +68,7 @@ class RecordedTest(NamedTuple):
     recording: TimeRecording
     channels: RecordChannels
     kind: RecordKind
-    why: str
+    why: Fact  # by which rule
     free: tuple[tuple[int, int], ...] = ()  # samples of free decays, start and stop
     frequency: float = np.nan  # rad/s, strongest of the motion
 
@@ -103,7 +103,7 @@ def recorded_test(recording: TimeRecording, modes: LinearModes) -> RecordedTest:
     free = _free_stretches(recording, guide, channels.reference)
     if sum(stop - start for start, stop in free) >= _FREE * recording.n_samples:
         _near_the_mode(recording, frequency, frequency, rest)
-        why = f"{guide} stops for {len(free)} stretch{'es' if len(free) > 1 else ''} of 12 cycles"
+        why = Fact("drive_stops", channel=guide, n=len(free))
         return RecordedTest(recording, channels, RecordKind.FREE_DECAY, why, free, frequency)
     track = _tone(recording, guide)
     if track is not None:
@@ -112,29 +112,29 @@ def recorded_test(recording: TimeRecording, modes: LinearModes) -> RecordedTest:
         kind, why = _of_tone(recording, guide, track)
         return RecordedTest(recording, channels, kind, why, (), frequency)
     if fall.decays:
-        why = f"the motion decays, and {guide} is noise"
+        why = Fact("motion_decays_under_noise", channel=guide)
         parts = ((fall.start, len(motion)),)
         frequency = _of_fall(motion, fall, recording.sampling_rate)
         return RecordedTest(recording, channels, RecordKind.FREE_DECAY, why, parts, frequency)
     low, high = _band(recording.values([guide], 0, _LOOKED_AT)[0], recording.sampling_rate)
     _near_the_mode(recording, low, high, rest)
-    why = f"{guide} is no tone: it holds {low / _HERTZ:.4g} to {high / _HERTZ:.4g} Hz"
+    why = Fact("drive_is_no_tone", channel=guide, low_hz=low / _HERTZ, high_hz=high / _HERTZ)
     return RecordedTest(recording, channels, RecordKind.BROADBAND, why, (), frequency)
 
 
 def _channels(recording: TimeRecording, modes: LinearModes) -> RecordChannels:
     """Channels by quantity, and the sensors that they are of."""
     kept = {
-        kind: [one for one in recording.channels if one.quantity == kind]
+        kind: [channel for channel in recording.channels if channel.quantity == kind]
         for kind in ("force", "voltage")
     }
     for kind, found in kept.items():
         if len(found) > 1:
             raise ValueError(
                 f"{recording.name} has several channels of {kind} "
-                f"({', '.join(one.name for one in found)}): keep the one that drives the mode."
+                f"({', '.join(each.name for each in found)}): keep the one that drives the mode."
             )
-    motions = [one for one in recording.channels if one.quantity in _MOTIONS]
+    motions = [channel for channel in recording.channels if channel.quantity in _MOTIONS]
     if not motions:
         listed = ", ".join(map(str, recording.channels))
         raise ValueError(
@@ -142,21 +142,22 @@ def _channels(recording: TimeRecording, modes: LinearModes) -> RecordChannels:
             "velocity_m_s, acceleration_m_s2 or displacement_m."
         )
     at: dict[str, str] = {}
-    for one in motions:
+    for channel in motions:
         for sensor in modes.sensors:
-            place = f"{one.point}{one.direction}"
-            if sensor in (one.point, one.name, place, f"{one.name}:{place}"):  # as UFF names it
-                at.setdefault(sensor, one.name)
+            place = f"{channel.point}{channel.direction}"
+            names = (channel.point, channel.name, place, f"{channel.name}:{place}")
+            if sensor in names:  # the last as UFF names it
+                at.setdefault(sensor, channel.name)
     reference = modes.sensors[reference_sensor(modes)]
     if not at and len(motions) == 1 and not motions[0].point:
         at = {reference: motions[0].name}
     if reference not in at:
         raise ValueError(
             f"{recording.name} has no motion of the sensor {reference}, where the mode moves most, "
-            f"but {', '.join(one.name for one in motions)}."
+            f"but {', '.join(channel.name for channel in motions)}."
         )
-    names = [found[0].name if found else None for found in kept.values()]
-    return RecordChannels(names[0], names[1], tuple(at.values()), tuple(at), at[reference])
+    force, drive = (found[0].name if found else None for found in kept.values())
+    return RecordChannels(force, drive, tuple(at.values()), tuple(at), at[reference])
 
 
 class _Fall(NamedTuple):
@@ -193,7 +194,7 @@ def _undriven(
             "decay nor a forced test."
         )
     _near_the_mode(recording, frequency, frequency, rest)
-    why = "no force or drive acts, and the motion falls"
+    why = Fact("motion_falls_undriven")
     free = ((fall.start, recording.n_samples if count < _LOOKED_AT else count),)
     return RecordedTest(recording, channels, RecordKind.FREE_DECAY, why, free, frequency)
 
@@ -207,8 +208,8 @@ def _free_stretches(
     except ValueError:  # the drive never stops: its only other reasons were looked at before
         return ()
     return tuple(
-        (one.start + int(np.ceil(_HERTZ * recording.sampling_rate / one.frequency)), one.stop)
-        for one in found
+        (free.start + int(np.ceil(_HERTZ * recording.sampling_rate / free.frequency)), free.stop)
+        for free in found
     )
 
 
@@ -225,20 +226,20 @@ def _tone(recording: TimeRecording, guide: str) -> ToneTrack | None:
     return track if amplitude < _TONE_AMPLITUDE and frequency < _TONE_FREQUENCY else None
 
 
-def _of_tone(recording: TimeRecording, guide: str, track: ToneTrack) -> tuple[RecordKind, str]:
+def _of_tone(recording: TimeRecording, guide: str, track: ToneTrack) -> tuple[RecordKind, Fact]:
     rate = recording.sampling_rate
     steps = [
-        one
-        for one in recognise_steps(track, rate, least_amplitude_step=0.05, least_step=0.0)
-        if (one.stop - one.start) * one.frequency / _HERTZ / rate >= _STEP_CYCLES
+        step
+        for step in recognise_steps(track, rate, least_amplitude_step=0.05, least_step=0.0)
+        if (step.stop - step.start) * step.frequency / _HERTZ / rate >= _STEP_CYCLES
     ]
-    covered = sum(one.stop - one.start for one in steps) / max(float(np.ptp(track.middle)), 1.0)
+    covered = sum(step.stop - step.start for step in steps) / max(float(np.ptp(track.middle)), 1.0)
     stays = moves_within_steps(steps, track, rate) < _MOVES
     if len(steps) > 1 and covered >= _STEPS_COVER and stays:
-        return RecordKind.STEPPED_SINE, f"{guide} is a tone of {len(steps)} steps"
+        return RecordKind.STEPPED_SINE, Fact("tone_in_steps", channel=guide, n=len(steps))
     runs = sweep_runs(track, unwrapped_phase(track))
     if runs:
-        return RecordKind.SLOW_SWEEP, f"{guide} is a tone whose frequency moves, {len(runs)} times"
+        return RecordKind.SLOW_SWEEP, Fact("tone_that_moves", channel=guide, n=len(runs))
     raise ValueError(
         f"{recording.name}: {guide} is a single tone of "
         f"{np.median(track.frequency) * rate / _HERTZ:.5g} Hz, of which no method makes a backbone."
@@ -267,7 +268,7 @@ def _of_fall(motion: Float[np.ndarray, " sample"], fall: _Fall, rate: float) -> 
 def _band(force: Float[np.ndarray, " sample"], rate: float) -> tuple[float, float]:
     omega, power = _spectrum(force, rate)
     share = np.cumsum(power) / np.sum(power)
-    low, high = (float(omega[np.searchsorted(share, one)]) for one in _BAND)
+    low, high = (float(omega[np.searchsorted(share, edge)]) for edge in _BAND)
     return low, high
 
 

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from snrmjax.measure.recordings.channels import channel_number
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.methods.records.resonant_decay import even_record
-from snrmjax.methods.records.ring_down_decays import above_noise, white_noise
+from snrmjax.numerics.facts import Fact
 
 _HERTZ = 2 * np.pi
 _ABOVE_NOISE = 4.0  # standard deviations of noise down to which a motion is read
@@ -25,7 +25,7 @@ class RecordedVelocity(NamedTuple):
     velocity: Float[np.ndarray, " sample"]  # m/s
     start: int  # sample of the record at which it begins
     floor: float  # m/s: smaller amplitudes are noise
-    notes: tuple[str, ...] = ()
+    notes: tuple[Fact, ...] = ()
 
 
 def recorded_velocity(
@@ -49,10 +49,8 @@ def recorded_velocity(
     quantity = recording.channels[channel_number(recording.channels, name)].quantity
     start, stop = part
     values = recording.values([name], start, stop)[0]
-    time, signal = even_record(
-        recording.time(start, stop), values - values.mean(), f"channel {name}"
-    )
-    notes: tuple[str, ...] = ()
+    time, signal = even_record(recording.time(start, stop), values - values.mean())
+    notes: tuple[Fact, ...] = ()
     cycle = max(1, int(np.ceil(_HERTZ * recording.sampling_rate / frequency)))
     if quantity != "velocity":
         from scipy.interpolate import make_interp_spline
@@ -60,7 +58,7 @@ def recorded_velocity(
         curve = make_interp_spline(time, signal, k=_SPLINE)
         change = curve.derivative() if quantity == "displacement" else curve.antiderivative()
         signal = np.asarray(change(time))
-        notes = (f"velocity of {quantity} by a spline",)
+        notes = (Fact("velocity_by_spline", quantity=quantity),)
     if quantity == "acceleration":
         from scipy.signal import butter, sosfiltfilt
 
@@ -76,6 +74,24 @@ def recorded_velocity(
         )  # fmt: skip
         signal = sosfiltfilt(sections, signal)[ends:-ends]
         time, start = time[ends:-ends], start + ends
-    floor = _ABOVE_NOISE * white_noise(signal)
-    kept = signal if forced else above_noise(signal, floor, cycle)
+    floor = _ABOVE_NOISE * _white_noise(signal)
+    kept = signal if forced else _above(signal, floor, cycle)
     return RecordedVelocity(time[: len(kept)], kept, start, floor, notes)
+
+
+def _white_noise(signal: Float[np.ndarray, " sample"]) -> float:
+    """1σ of white noise by the median of the spectrum."""
+    from scipy.signal import welch
+
+    density = welch(signal, nperseg=min(len(signal), 4096))[1]
+    return float(np.sqrt(np.median(density) / np.log(2) / 2))
+
+
+def _above(
+    signal: Float[np.ndarray, " sample"], least: float, cycle: int
+) -> Float[np.ndarray, " sample"]:
+    """A decay as long as the largest value of each cycle is above noise."""
+    count = len(signal) // cycle
+    sizes = np.abs(signal[: count * cycle]).reshape(count, cycle).max(axis=1)
+    quiet = np.flatnonzero(sizes < least)
+    return signal[: (int(quiet[0]) + 1) * cycle] if quiet.size else signal

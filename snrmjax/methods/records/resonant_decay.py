@@ -20,7 +20,7 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 from jaxtyping import Float
 
-from snrmjax.methods.result import MethodPoint, MethodResult, MethodStatus, method_result
+from snrmjax.methods.result import MethodPoint, MethodResult, method_result, points_of_curves
 from snrmjax.numerics.facts import Fact
 
 Reading = Literal["peaks", "zero_crossings", "hilbert"]
@@ -76,11 +76,11 @@ def resonant_decay(
     Validity: one mode, light damping, nothing driving; a filter as narrow as the frequency moves
     within its memory smooths both curves more than the note says.
     """
-    times, signal = checked_record(time, velocity, "resonant_decay")
+    times, signal = checked_record(time, velocity)
     if reading not in get_args(Reading):
         raise ValueError(f"`reading` must be one of {get_args(Reading)}, but is {reading!r}.")
     step = float(np.mean(np.diff(times)))
-    every, settled = times, slice(None)
+    whole, settled = times, slice(None)
     if band is not None:
         signal, settled = _filtered(signal, step, band)
         times, signal = times[settled], signal[settled]
@@ -94,10 +94,10 @@ def resonant_decay(
     notes = [Fact("decay_read_by", reading=reading)]
     if band is not None:
         # The decay that was read, read with and without the filter: nothing else differs.
-        decay = _fitted_decay(lines, every)
+        decay = _fitted_decay(lines, whole)
         with_filter, without = (
-            _at_times(_local_lines(_TRACES[reading](times, one[settled]), None, window), lines)
-            for one in (_filtered(decay, step, band)[0], decay)
+            _at_times(_local_lines(_TRACES[reading](times, record[settled]), None, window), lines)
+            for record in (_filtered(decay, step, band)[0], decay)
         )
         bias = with_filter - without
         notes.append(_of_bias(bias, lines))
@@ -106,23 +106,23 @@ def resonant_decay(
 
 
 def checked_record(
-    time: Float[np.ndarray, " sample"], velocity: Float[np.ndarray, " sample"], method: str
+    time: Float[np.ndarray, " sample"], velocity: Float[np.ndarray, " sample"]
 ) -> tuple[Float[np.ndarray, " sample"], Float[np.ndarray, " sample"]]:
-    """A record of one channel as arrays, if a method can read it; `method` is named in errors."""
-    times, signal = even_record(time, velocity, method)
+    """A record of one channel as arrays. Raises `ValueError` where no method can read it."""
+    times, signal = even_record(time, velocity)
     signal = signal - signal.mean()
     ups = np.count_nonzero((signal[:-1] < 0) & (signal[1:] >= 0))
-    require_cycles(signal, float(ups), method)
+    require_cycles(signal, float(ups))
     if len(signal) / ups < _FEWEST_SAMPLES:
         raise ValueError(
-            f"{method} needs {_FEWEST_SAMPLES} samples a cycle, but the record has "
+            f"{_FEWEST_SAMPLES} samples a cycle are needed, but the record has "
             f"{len(signal) / ups:.1f}: the sampling rate is too low, or noise crosses zero (state "
             "`band`)."
         )
     return times, signal
 
 
-def require_cycles(signal: Float[np.ndarray, " sample"], cycles: float, method: str) -> None:
+def require_cycles(signal: Float[np.ndarray, " sample"], cycles: float) -> None:
     """Raise `ValueError` unless a record has twelve cycles, or five in which it falls enough."""
     if cycles >= _FEWEST_CYCLES:
         return
@@ -130,32 +130,32 @@ def require_cycles(signal: Float[np.ndarray, " sample"], cycles: float, method: 
     first, last = np.abs(signal[:part]).max(), np.abs(signal[-part:]).max()
     if cycles < _FEWEST_FALLING or last > first * np.exp(-_QUARTER):
         raise ValueError(
-            f"{method} needs {_FEWEST_CYCLES} cycles, or {_FEWEST_FALLING} in which the motion "
-            f"falls to a quarter, but the record has {cycles:.3g}."
+            f"{_FEWEST_CYCLES} cycles are needed, or {_FEWEST_FALLING} in which the motion falls "
+            f"to a quarter, but the record has {cycles:.3g}."
         )
 
 
 def even_record(
-    time: Float[np.ndarray, " sample"], velocity: Float[np.ndarray, " sample"], method: str
+    time: Float[np.ndarray, " sample"], velocity: Float[np.ndarray, " sample"]
 ) -> tuple[Float[np.ndarray, " sample"], Float[np.ndarray, " sample"]]:
-    """A finite, evenly spaced record that is not clipped; `method` is named in errors."""
+    """A finite, evenly spaced record that is not clipped; raises `ValueError` of others."""
     times, signal = np.asarray(time, dtype=float), np.asarray(velocity, dtype=float)
     if times.ndim != 1 or times.shape != signal.shape or len(times) < _FEWEST_SAMPLES:
         raise ValueError(
-            f"{method} needs `time` and `velocity` of one length, but they have shapes "
-            f"{times.shape} and {signal.shape}."
+            f"`time` and `velocity` must be of one length, but have shapes {times.shape} and "
+            f"{signal.shape}."
         )
     if not (np.isfinite(times).all() and np.isfinite(signal).all()):
-        raise ValueError(f"{method} needs a record of finite numbers, but it has NaN or inf.")
+        raise ValueError("the record must be of finite numbers, but has NaN or inf.")
     steps = np.diff(times)
     if steps.min() <= 0 or np.ptp(steps) > _EVEN * steps.mean():
-        raise ValueError(f"{method} needs evenly spaced rising times, but they are not.")
+        raise ValueError("times must be evenly spaced and rise, but are not.")
     largest = np.abs(signal).max()
     flat = np.abs(signal) >= largest * (1 - 1e-9)
     run = np.convolve(flat, np.ones(_CLIPPED), "valid").max()
     if largest > 0 and run >= _CLIPPED:
         raise ValueError(
-            f"{method}: the record stays at its largest value, {largest:.4g} m/s, for "
+            f"the record stays at its largest value, {largest:.4g} m/s, for "
             f"{_CLIPPED} samples or more: it is clipped."
         )
     return times, signal
@@ -177,7 +177,7 @@ def _filtered(
     ends = int(np.ceil(_FILTER_ENDS / ((high - low) * step)))
     if 3 * ends > len(signal):
         raise ValueError(
-            f"resonant_decay: a band of {high - low:g} Hz spoils {ends * step:.3g} s at each end, "
+            f"a band of {high - low:g} Hz spoils {ends * step:.3g} s at each end, "
             f"but the record has {len(signal) * step:.3g} s: widen the band."
         )
     return sosfiltfilt(sections, signal), slice(ends, len(signal) - ends)
@@ -264,7 +264,7 @@ def _local_lines(trace: _Trace, end: int | None, window: float) -> Float[np.ndar
     end = len(trace.time) if end is None else end
     if end < width:
         raise ValueError(
-            f"resonant_decay needs {window:g} cycles above the least amplitude, but the record has "
+            f"{window:g} cycles above the least amplitude are needed, but the record has "
             f"{end / trace.per_cycle:.3g}."
         )
     starts = np.arange(0, end - width + 1, max(1, width // 2))
@@ -318,12 +318,7 @@ def _points(
     bias = maximum_filter1d(np.abs(bias), _SWING, axis=0)
     omega_std = np.hypot(_scatter(omega, speed), bias[:, _OMEGA])
     decay_std = np.hypot(_scatter(decay, speed), bias[:, _SLOPE])
-    return [
-        MethodPoint(MethodStatus.FOUND, -1, *(float(value) for value in row))
-        if row[3] > 0
-        else MethodPoint(MethodStatus.NOT_A_MODE, -1)
-        for row in np.stack([speed, omega, omega_std, -decay / omega, decay_std / omega], axis=1)
-    ]
+    return points_of_curves(speed, omega, omega_std, -decay / omega, decay_std / omega)
 
 
 def _fitted_decay(

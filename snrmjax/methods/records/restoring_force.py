@@ -20,6 +20,7 @@ from snrmjax.methods.one_sensor import drive_point
 from snrmjax.methods.records.resonant_decay import checked_record, velocity_extremes
 from snrmjax.methods.result import MethodPoint, MethodResult, MethodStatus, method_result
 from snrmjax.model.modes import LinearModes
+from snrmjax.numerics.facts import Fact
 
 _POINTS = 25  # amplitudes at which the fitted surface is asked
 _ANGLES = 128  # of half a cycle
@@ -71,8 +72,8 @@ def fit_restoring_force(
     if not 1 <= degree <= _MOST:
         raise ValueError(f"`degree` must be from 1 to {_MOST}, but is {degree}.")
     if force is not None and modes is None:
-        raise ValueError("restoring_force needs `modes` with a force: they say what it drives.")
-    times, speed = checked_record(time, velocity, "restoring_force")
+        raise ValueError("`modes` are needed with a force: they say what it drives.")
+    times, speed = checked_record(time, velocity)
     curve = make_interp_spline(times, speed, k=_SPLINE)
     acceleration = curve.derivative()(times)
     displacement = curve.antiderivative()(times)
@@ -123,17 +124,16 @@ def restoring_force(
     fitted = fit_restoring_force(
         time, velocity, force, modes, degree=degree, least_amplitude=least_amplitude
     )
-    points = _points(fitted)
-    note = f"the two forces leave {100 * fitted.misfit:.2g} % of the acceleration (rms)"
-    return method_result("restoring_force", points, 0, (note,))
+    notes = (Fact("left_by_two_forces", misfit=fitted.misfit),)
+    return method_result("restoring_force", _points(fitted), 0, notes)
 
 
 def _of_length(force: Float[np.ndarray, " sample"], length: int) -> Float[np.ndarray, " sample"]:
     values = np.asarray(force, dtype=float)
     if values.shape != (length,) or not np.isfinite(values).all():
         raise ValueError(
-            f"restoring_force needs a finite `force` of {length} samples, as `time` has, but it "
-            f"has shape {values.shape}."
+            f"`force` must be finite and have {length} samples, as `time` has, but it has shape "
+            f"{values.shape}."
         )
     return values
 

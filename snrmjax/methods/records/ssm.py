@@ -23,7 +23,7 @@ from scipy.signal import decimate
 
 from snrmjax.methods.records.normal_form import NormalForm, form_of, seen, unknowns_of
 from snrmjax.methods.records.resonant_decay import even_record, require_cycles
-from snrmjax.methods.result import MethodPoint, MethodResult, MethodStatus, method_result
+from snrmjax.methods.result import MethodResult, method_result, points_of_curves
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.levenberg_marquardt import Minimum, StepRule, minimise
 
@@ -89,12 +89,7 @@ def ssm(
     amplitude = np.linspace(found.smallest, found.largest, _POINTS)
     values = _curves(found.form, amplitude)
     spread = _curve_std(found, amplitude)
-    points = [
-        MethodPoint(MethodStatus.FOUND, -1, *(float(one) for one in row))
-        if row[3] > 0
-        else MethodPoint(MethodStatus.NOT_A_MODE, -1)
-        for row in np.stack([amplitude, values[0], spread[0], values[1], spread[1]], axis=1)
-    ]
+    points = points_of_curves(amplitude, values[0], spread[0], values[1], spread[1])
     degree = 2 * len(found.form.decay) - 1
     notes = (
         Fact("normal_form_fitted", degree=degree, noise_std=found.noise_std),
@@ -123,16 +118,16 @@ def fit_submanifold(
     """
     if terms is not None and not 1 <= terms <= _MOST_TERMS:
         raise ValueError(f"`terms` must be from 1 to {_MOST_TERMS}, but is {terms}.")
-    times, signal = even_record(time, velocity, "ssm")
+    times, signal = even_record(time, velocity)
     while len(times) > _MOST_SAMPLES:
         signal, times = decimate(signal, 2, ftype="fir", zero_phase=True), times[::2]
     step = float(np.mean(np.diff(times)))
     times = times - times[0]
     hertz = _main_frequency(signal, step)
-    require_cycles(signal, hertz * float(times[-1]), "ssm")
+    require_cycles(signal, hertz * float(times[-1]))
     if 1 / (hertz * step) < _FEWEST_SAMPLES:
         raise ValueError(
-            f"ssm needs {_FEWEST_SAMPLES} samples a cycle, but the record has "
+            f"{_FEWEST_SAMPLES} samples a cycle are needed, but the record has "
             f"{1 / (hertz * step):.1f}: the sampling rate is too low."
         )
     lag = max(1, round(1 / (_DELAYS * hertz * step)))
@@ -140,13 +135,13 @@ def fit_submanifold(
     size = np.abs(coordinate)
     below = np.flatnonzero(size < max(least_amplitude, 0.0))
     end = below[0] if below.size else len(size)
-    require_cycles(signal[:end], end * step * hertz, "ssm")
+    require_cycles(signal[:end], end * step * hertz)
     times, signal, coordinate = times[:end], signal[:end], coordinate[:end]
     per_cycle = 1 / (hertz * step)
     orders = tuple(order for order in _ORDERS if order < per_cycle / 2)
     best = _selected(times, signal, coordinate, orders, terms)
     if best is None:
-        raise ValueError("ssm: the record holds no oscillation that decays smoothly.")
+        raise ValueError("the record holds no oscillation that decays smoothly.")
     return _submanifold(best, times, signal, misfit, hertz)
 
 
@@ -169,7 +164,7 @@ def _on_the_plane(signal: np.ndarray, lag: int) -> tuple[Complex[np.ndarray, " k
     multipliers, left = np.linalg.eig(moved)  # rows: plane(t + lag)ᵀ = plane(t)ᵀ · moved
     k = int(np.argmax(multipliers.imag))
     if not multipliers[k].imag > 0:
-        raise ValueError("ssm: the record holds no oscillation in its plane of largest motion.")
+        raise ValueError("the record holds no oscillation in its plane of largest motion.")
     turning = left[:, k] @ plane
     design = np.stack([turning.real, -turning.imag], axis=1)
     real, imaginary = np.linalg.lstsq(design, signal[:count], rcond=None)[0]
@@ -202,7 +197,7 @@ def _selected(
     starts: list[NormalForm] = []
     for terms in range(1, (wanted or _MOST_TERMS) + 1):
         starts.append(_started(times, coordinate, orders, terms))
-        tried = [_with_terms(one, terms) for one in starts]
+        tried = [_with_terms(form, terms) for form in starts]
         fit = _fitted(times, signal, tried if best is None else [*tried, best.form])
         if fit is None:
             return best
@@ -245,7 +240,7 @@ def _started(
 
 def _fitted(times: np.ndarray, signal: np.ndarray, starts: list[NormalForm]) -> _Fit | None:
     """The trajectory that fits best from the best of some starts, or None where there is none."""
-    squares = [float(np.mean(_trial(one, times, signal, 1.0).residuals ** 2)) for one in starts]
+    squares = [float(np.mean(_trial(form, times, signal, 1.0).residuals ** 2)) for form in starts]
     if not np.isfinite(squares).any():
         return None
     form = starts[int(np.nanargmin(squares))]
@@ -256,8 +251,8 @@ def _fitted(times: np.ndarray, signal: np.ndarray, starts: list[NormalForm]) -> 
 
         def evaluate(points: np.ndarray, unit: float = unit) -> list[_Trial]:
             return [
-                _trial(form_of(one, terms, orders, form.scale), times, signal, unit)
-                for one in points
+                _trial(form_of(point, terms, orders, form.scale), times, signal, unit)
+                for point in points
             ]
 
         [fit] = minimise(

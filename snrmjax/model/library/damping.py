@@ -34,7 +34,6 @@ class QuadraticDamping(AbstractMemoryless):
     coefficient: Scalar = parameter("1/(kg^1/2 m)", "quadratic damping", prior=NOT_BELOW_ZERO)
 
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
-        """See `AbstractMemoryless.force`."""
         return self.coefficient * jnp.abs(velocity) * velocity
 
 
@@ -50,7 +49,6 @@ class CubicDamping(AbstractMemoryless):
     coefficient: Scalar = parameter("s/(kg m²)", "cubic damping")
 
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
-        """See `AbstractMemoryless.force`."""
         return self.coefficient * velocity**3
 
 
@@ -69,5 +67,4 @@ class VanDerPolDamping(AbstractMemoryless):
     coefficient: Scalar = parameter("1/(kg m² s)", "damping per squared displacement")
 
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
-        """See `AbstractMemoryless.force`."""
         return self.coefficient * displacement**2 * velocity

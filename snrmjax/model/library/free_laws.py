@@ -61,14 +61,13 @@ class AbstractLaw(AbstractEffect):
 
     @classmethod
     def starts(cls, scales: MotionScales) -> Starts:
-        """See `AbstractEffect.starts`: none."""
         return []
 
     def idle(self, natural_frequency: float, damping_ratio: float) -> Self:
-        """See `AbstractEffect.idle`: the same knots without any force."""
+        """The same knots without any force."""
         knots = {
-            name: getattr(self, name) * (0.0 if one.entries is Entries.VALUES else 1.0)
-            for name, one in self.parameters().items()
+            name: getattr(self, name) * (0.0 if parameter.entries is Entries.VALUES else 1.0)
+            for name, parameter in self.parameters().items()
         }
         return type(self)(**knots)
 
@@ -102,9 +101,8 @@ class StiffnessLaw(AbstractLaw, AbstractMemoryless):
     restoring_force: Knots = _forces("restoring force at the displacement")
 
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
-        """See `AbstractMemoryless.force`."""
-        own = self.restoring_force
-        return drawn_force(displacement, self.displacement, own, own)
+        table = self.restoring_force
+        return drawn_force(displacement, self.displacement, table, table)
 
 
 class UnevenStiffnessLaw(AbstractLaw, AbstractMemoryless):
@@ -126,7 +124,6 @@ class UnevenStiffnessLaw(AbstractLaw, AbstractMemoryless):
     reversed_force: Knots = _forces("restoring force in the other direction")
 
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
-        """See `AbstractMemoryless.force`."""
         tables = self.displacement, self.restoring_force, self.reversed_force
         return drawn_force(displacement, *tables)
 
@@ -146,9 +143,8 @@ class DampingLaw(AbstractLaw, AbstractMemoryless):
     damping_force: Knots = _forces("damping force at the velocity")
 
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
-        """See `AbstractMemoryless.force`."""
-        own = self.damping_force
-        return drawn_force(velocity, self.velocity, own, own)
+        table = self.damping_force
+        return drawn_force(velocity, self.velocity, table, table)
 
 
 class UnevenDampingLaw(AbstractLaw, AbstractMemoryless):
@@ -168,7 +164,6 @@ class UnevenDampingLaw(AbstractLaw, AbstractMemoryless):
     reversed_force: Knots = _forces("damping force in the other direction")
 
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
-        """See `AbstractMemoryless.force`."""
         return drawn_force(velocity, self.velocity, self.damping_force, self.reversed_force)
 
 
@@ -180,15 +175,13 @@ class DisplacementDampingLaw(AbstractLaw, AbstractMemoryless):
 
     kind: ClassVar[str] = "displacement_damping_law"
     description: ClassVar[str] = (
-        "A damping that changes with the displacement, as in a gap that squeezes a film, drawn "
-        "from data."
+        "A damping that changes with the displacement, as of a thin gap, drawn from data."
     )
     shape: ClassVar[Shape] = Shape(Part.DAMPING, Symmetry.ODD, Argument.BOTH)
     displacement: Knots = _displacements()
     coefficient: Knots = parameter("1/s", "damping at the displacement", entries=Entries.VALUES)
 
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
-        """See `AbstractMemoryless.force`."""
         size = jnp.abs(displacement)
         return velocity * secant_at(size, self.displacement, self.coefficient)
 
@@ -216,5 +209,4 @@ class SlipLaw(AbstractLaw, AbstractSliders):
     )
 
     def sliders(self) -> Sliders:
-        """See `AbstractSliders.sliders`."""
         return Sliders(jnp.asarray(self.stiffness), jnp.asarray(self.slip_displacement))

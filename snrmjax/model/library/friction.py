@@ -17,7 +17,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from snrmjax.model.effect_base import AbstractHysteresis, Scalar, Starts
+from snrmjax.model.effect_base import (
+    AbstractHysteresis,
+    Samples,
+    Scalar,
+    Starts,
+    States,
+)
 from snrmjax.model.effect_metadata import (
     NOT_BELOW_ZERO,
     Argument,
@@ -99,27 +105,20 @@ class AbstractSliders(AbstractHysteresis):
     def sliders(self) -> Sliders:
         """The sliders, for integration in time."""
 
-    def initial_states(self) -> Float[Array, " state"]:
-        """See `AbstractHysteresis.initial_states`."""
+    def initial_states(self) -> States:
         return jnp.zeros_like(self.sliders().slip_displacement)
 
-    def state_force(
-        self, displacement: Scalar, velocity: Scalar, states: Float[Array, " state"]
-    ) -> Scalar:
-        """See `AbstractHysteresis.state_force`; errors of an integrator's positions are removed."""
+    def state_force(self, displacement: Scalar, velocity: Scalar, states: States) -> Scalar:
+        """Errors of an integrator's positions are removed."""
         return -jnp.sum(self.sliders().stiffness * self.moved_states(displacement, states))
 
-    def state_rate(
-        self, displacement: Scalar, velocity: Scalar, states: Float[Array, " state"]
-    ) -> Float[Array, " state"]:
-        """See `AbstractHysteresis.state_rate`: ż = q̇ while a slider is dragged, otherwise 0."""
+    def state_rate(self, displacement: Scalar, velocity: Scalar, states: States) -> States:
+        """The velocity q̇ while a slider is dragged, otherwise 0."""
         stretch, slip = displacement - states, self.sliders().slip_displacement
         dragged = jnp.where(velocity > 0, stretch >= slip, stretch <= -slip)
         return jnp.where(dragged, velocity, 0.0)
 
-    def moved_states(
-        self, displacement: Scalar, states: Float[Array, " state"]
-    ) -> Float[Array, " state"]:
+    def moved_states(self, displacement: Scalar, states: States) -> States:
         """Positions after q went to `displacement` without turning: exact, unlike an integrator.
 
         An integrator of fixed steps does best to call this after each of them.
@@ -128,21 +127,15 @@ class AbstractSliders(AbstractHysteresis):
         return jnp.clip(states, displacement - slip, displacement + slip)
 
     def settled_states(
-        self, displacement: Float[Array, " time"], velocity: Float[Array, " time"]
+        self, displacement: Samples, velocity: Samples
     ) -> Float[Array, "time state"]:
-        """See `AbstractHysteresis.settled_states`."""
         return settled_positions(displacement, self.sliders().slip_displacement)
 
-    def cycle_force(
-        self, displacement: Float[Array, " time"], velocity: Float[Array, " time"]
-    ) -> Float[Array, " time"]:
-        """See `AbstractForce.cycle_force`."""
+    def cycle_force(self, displacement: Samples, velocity: Samples) -> Samples:
         return self.settled_states(displacement, velocity) @ -self.sliders().stiffness
 
-    def quick_cycle_force(
-        self, displacement: Float[Array, " time"], velocity: Float[Array, " time"]
-    ) -> Float[Array, " time"]:
-        """See `AbstractForce.quick_cycle_force`: over a cycle between two turning points."""
+    def quick_cycle_force(self, displacement: Samples, velocity: Samples) -> Samples:
+        """Over a cycle between two turning points."""
         sliders = self.sliders()
         return slipped_position(displacement, sliders.slip_displacement) @ -sliders.stiffness
 
@@ -172,12 +165,11 @@ class JenkinsSlider(AbstractSliders):
 
     @classmethod
     def starts(cls, scales: MotionScales) -> Starts:
-        """See `AbstractEffect.starts`: slip at several shares of the largest amplitude."""
+        """Slip at several shares of the largest amplitude."""
         shares = (0.05, 0.15, 0.3, 0.5, 0.75)
         return [(3.0 * scales.change, share * scales.largest) for share in shares]
 
     def sliders(self) -> Sliders:
-        """See `AbstractSliders.sliders`."""
         return Sliders(jnp.asarray(self.stiffness)[None], jnp.asarray(self.slip_displacement)[None])
 
 
@@ -223,11 +215,10 @@ class IwanMicroslip(AbstractSliders):
 
     @classmethod
     def starts(cls, scales: MotionScales) -> Starts:
-        """See `AbstractEffect.starts`: several exponents p, with Δ(ω̃²) ≈ −cQ^(p−1)."""
+        """Several exponents p, with Δ(ω̃²) ≈ −cQ^(p−1)."""
         return [(scales.change / scales.amplitude ** (p - 1), p) for p in (1.2, 1.5, 2.0, 2.6)]
 
     def scaled_for(self, displacement: Scalar, velocity: Scalar) -> Self:
-        """See `AbstractHysteresis.scaled_for`."""
         return self.with_thresholds(displacement)
 
     def with_thresholds(self, largest: Scalar) -> Self:
@@ -239,7 +230,7 @@ class IwanMicroslip(AbstractSliders):
         return type(self)(*fields)
 
     def sliders(self) -> Sliders:
-        """See `AbstractSliders.sliders`. Raises `ValueError` before `with_thresholds`."""
+        """Raises `ValueError` before `with_thresholds`."""
         if self.largest_slip is None:
             raise ValueError(
                 "iwan_microslip has no states yet: `scaled_for` or `with_thresholds` must set the "
@@ -255,18 +246,13 @@ class IwanMicroslip(AbstractSliders):
         stiffness = jnp.where(at_rest, 0.0, total) * _WEIGHT
         return Sliders(stiffness, largest * jnp.asarray(_NODE) ** (1 / (p - 1)))
 
-    def cycle_force(
-        self, displacement: Float[Array, " time"], velocity: Float[Array, " time"]
-    ) -> Float[Array, " time"]:
-        """See `AbstractForce.cycle_force`."""
+    def cycle_force(self, displacement: Samples, velocity: Samples) -> Samples:
         half_range = 0.5 * (jnp.max(displacement) - jnp.min(displacement))
         sliders = self._sliders_up_to(half_range)
         return settled_positions(displacement, sliders.slip_displacement) @ -sliders.stiffness
 
-    def quick_cycle_force(
-        self, displacement: Float[Array, " time"], velocity: Float[Array, " time"]
-    ) -> Float[Array, " time"]:
-        """See `AbstractForce.quick_cycle_force`: Masing's rule between two turning points."""
+    def quick_cycle_force(self, displacement: Samples, velocity: Samples) -> Samples:
+        """Masing's rule between two turning points."""
         high, low, falling = _turning_points(displacement)
         half_range = 0.5 * (high - low)
         gone = jnp.where(falling, high - displacement, displacement - low) / 2
@@ -323,39 +309,27 @@ class CoulombFriction(AbstractHysteresis):
     )
     smoothing_velocity: Scalar = eqx.field(default_factory=lambda: jnp.zeros(()))
 
-    def cycle_force(
-        self, displacement: Float[Array, " time"], velocity: Float[Array, " time"]
-    ) -> Float[Array, " time"]:
-        """See `AbstractForce.cycle_force`."""
+    def cycle_force(self, displacement: Samples, velocity: Samples) -> Samples:
         mean_square = jnp.mean(velocity**2)
         moving = mean_square > 0
         width = SMOOTHING * jnp.sqrt(jnp.where(moving, mean_square, 1.0))
         return jnp.where(moving, self.force * jnp.tanh(velocity / width), 0.0)
 
     def scaled_for(self, displacement: Scalar, velocity: Scalar) -> Self:
-        """See `AbstractHysteresis.scaled_for`."""
         return type(self)(self.force, SMOOTHING * jnp.asarray(velocity, dtype=jnp.float64))
 
-    def initial_states(self) -> Float[Array, " state"]:
-        """See `AbstractHysteresis.initial_states`: there are none."""
+    def initial_states(self) -> States:
         return jnp.zeros(0)
 
-    def state_force(
-        self, displacement: Scalar, velocity: Scalar, states: Float[Array, " state"]
-    ) -> Scalar:
-        """See `AbstractHysteresis.state_force`."""
+    def state_force(self, displacement: Scalar, velocity: Scalar, states: States) -> Scalar:
         width = self.smoothing_velocity
         smooth = jnp.tanh(velocity / jnp.where(width > 0, width, 1.0))
         return self.force * jnp.where(width > 0, smooth, jnp.sign(velocity))
 
-    def state_rate(
-        self, displacement: Scalar, velocity: Scalar, states: Float[Array, " state"]
-    ) -> Float[Array, " state"]:
-        """See `AbstractHysteresis.state_rate`: there are none."""
+    def state_rate(self, displacement: Scalar, velocity: Scalar, states: States) -> States:
         return jnp.zeros(0)
 
     def settled_states(
-        self, displacement: Float[Array, " time"], velocity: Float[Array, " time"]
+        self, displacement: Samples, velocity: Samples
     ) -> Float[Array, "time state"]:
-        """See `AbstractHysteresis.settled_states`: there are none."""
         return jnp.zeros((displacement.shape[0], 0))

@@ -21,6 +21,7 @@ from snrmjax.model.library.confusions import WHICH_RESONANCE
 from snrmjax.model.modes import LinearModes
 from snrmjax.model.potential import Monomial, PolynomialPotential
 from snrmjax.numerics.rules import OF_A_DAMPING_RATIO, OF_A_FREQUENCY
+from snrmjax.numerics.units import HERTZ
 
 _NEAR = (0.8, 1.2)  # over the multiple of the natural frequency: where a further mode may lie
 
@@ -46,11 +47,10 @@ class AbstractInternalResonance(AbstractAddedMode):
 
     @classmethod
     def starts(cls, scales: MotionScales) -> Starts:
-        """See `AbstractEffect.starts`: further modes at and near n times the frequency.
+        """Further modes at and near n times the frequency.
 
-        At resonance q_new ~ bQⁿ/(2ⁿ⁻¹·2ζω²), which acts back like n b Qⁿ⁻² q_new.
-        """
-        n, hz = cls.order, scales.frequency / (2 * np.pi)
+        At resonance q_new ~ bQⁿ/(2ⁿ⁻¹·2ζω²), which acts back like n b Qⁿ⁻² q_new."""
+        n, hz = cls.order, scales.frequency / HERTZ
         size = np.sqrt(scales.change * 0.02 * (n * scales.frequency) ** 2)
         size = float(size / scales.amplitude ** (n - 1))
         shares = (0.95, 0.985, 1.0, 1.015, 1.05)
@@ -58,28 +58,26 @@ class AbstractInternalResonance(AbstractAddedMode):
 
     @classmethod
     def bounds(cls, scales: MotionScales) -> Bounds:
-        """See `AbstractEffect.bounds`: the further mode lies near n times the frequency."""
-        hz = cls.order * scales.frequency / (2 * np.pi)
+        """The further mode lies near n times the frequency."""
+        hz = cls.order * scales.frequency / HERTZ
         free, _, damped = super().bounds(scales)
         return [free, (_NEAR[0] * hz, _NEAR[1] * hz), damped]
 
     @classmethod
     def steps(cls, start: tuple[float, ...]) -> tuple[float, ...]:
-        """See `AbstractEffect.steps`."""
         coefficient, hz, ratio = start
         return abs(coefficient), 0.01 * hz, 0.5 * ratio
 
     @classmethod
     def without_strength(cls, natural_frequency: float, damping_ratio: float) -> Self:
-        """See `AbstractEffect.without_strength`: the further mode a tenth above n times ω₀."""
-        hz = 1.1 * cls.order * natural_frequency / (2 * np.pi)
+        """The further mode a tenth above n times ω₀."""
+        hz = 1.1 * cls.order * natural_frequency / HERTZ
         return cls(*(jnp.asarray(value) for value in (0.0, hz, damping_ratio)))
 
     def expanded(
         self, modes: LinearModes, potential: PolynomialPotential
     ) -> tuple[LinearModes, PolynomialPotential]:
-        """See `AbstractAddedMode.expanded`."""
-        n_modes, frequency = modes.n_modes, 2 * jnp.pi * jnp.asarray(self.frequency_hz)
+        n_modes, frequency = modes.n_modes, HERTZ * jnp.asarray(self.frequency_hz)
         unseen = jnp.zeros((modes.mode_shape.shape[0], 1))
         expanded_modes = dataclasses.replace(
             modes,

@@ -4,11 +4,10 @@ from typing import ClassVar
 
 import jax.numpy as jnp
 
-from snrmjax.model.effect_base import AbstractLinearChange, Scalar, Starts
+from snrmjax.model.effect_base import AbstractLinearChange, Scalar
 from snrmjax.model.effect_metadata import (
     MORE_THAN_NOTHING,
     Confusion,
-    MotionScales,
     Part,
     Shape,
     parameter,
@@ -41,17 +40,12 @@ class LinearFrequencyShift(AbstractLinearChange):
         "relative shift of the natural frequency",
         rules=(ABOVE_MINUS_ONE,),
         prior=MORE_THAN_NOTHING,
+        start=lambda scales: 0.5 * scales.change / scales.frequency**2,
     )
-
-    @classmethod
-    def starts(cls, scales: MotionScales) -> Starts:
-        """See `AbstractEffect.starts`."""
-        return [(0.5 * scales.change / scales.frequency**2,)]
 
     def linear_terms(
         self, natural_frequency: Scalar, damping_ratio: Scalar, order: Scalar
     ) -> tuple[Scalar, Scalar, Scalar]:
-        """See `AbstractLinearChange.linear_terms`."""
         return _shifted(natural_frequency, damping_ratio, self.relative_shift)
 
 
@@ -73,17 +67,12 @@ class FrequencyDrift(AbstractLinearChange):
         "relative shift of the natural frequency over the test",
         rules=(ABOVE_MINUS_ONE,),
         prior=MORE_THAN_NOTHING,
+        start=lambda scales: scales.change / scales.frequency**2,
     )
-
-    @classmethod
-    def starts(cls, scales: MotionScales) -> Starts:
-        """See `AbstractEffect.starts`."""
-        return [(scales.change / scales.frequency**2,)]
 
     def linear_terms(
         self, natural_frequency: Scalar, damping_ratio: Scalar, order: Scalar
     ) -> tuple[Scalar, Scalar, Scalar]:
-        """See `AbstractLinearChange.linear_terms`."""
         return _shifted(natural_frequency, damping_ratio, self.relative_drift * order)
 
 
@@ -94,17 +83,14 @@ class LinearDampingChange(AbstractLinearChange):
     description: ClassVar[str] = "The linear damping differs from the one stated."
     shape: ClassVar[Shape] = Shape(Part.DAMPING, power=0)
     acts_like: ClassVar[str | None] = Part.DAMPING
-    damping_ratio_change: Scalar = parameter("1", "change of the damping ratio")
-
-    @classmethod
-    def starts(cls, scales: MotionScales) -> Starts:
-        """See `AbstractEffect.starts`."""
-        return [(0.5 * scales.change / scales.frequency**2,)]
+    damping_ratio_change: Scalar = parameter(
+        *("1", "change of the damping ratio"),
+        start=lambda scales: 0.5 * scales.change / scales.frequency**2,
+    )
 
     def linear_terms(
         self, natural_frequency: Scalar, damping_ratio: Scalar, order: Scalar
     ) -> tuple[Scalar, Scalar, Scalar]:
-        """See `AbstractLinearChange.linear_terms`."""
         return jnp.zeros(()), 2 * self.damping_ratio_change * natural_frequency, jnp.zeros(())
 
 
@@ -119,16 +105,13 @@ class AddedMass(AbstractLinearChange):
     confusions: ClassVar[tuple[Confusion, ...]] = (STIFFNESS_OR_MASS,)
     like_force_gain: ClassVar[bool] = True
     mass: Scalar = parameter(
-        "1", "mass over the modal mass", rules=(ABOVE_MINUS_ONE,), prior=MORE_THAN_NOTHING
+        *("1", "mass over the modal mass"),
+        rules=(ABOVE_MINUS_ONE,),
+        prior=MORE_THAN_NOTHING,
+        start=lambda scales: scales.change / scales.frequency**2,
     )
-
-    @classmethod
-    def starts(cls, scales: MotionScales) -> Starts:
-        """See `AbstractEffect.starts`."""
-        return [(scales.change / scales.frequency**2,)]
 
     def linear_terms(
         self, natural_frequency: Scalar, damping_ratio: Scalar, order: Scalar
     ) -> tuple[Scalar, Scalar, Scalar]:
-        """See `AbstractLinearChange.linear_terms`."""
         return jnp.asarray(self.mass), jnp.zeros(()), jnp.zeros(())

@@ -1,6 +1,6 @@
 """Errors of force and instruments, and responses of modes that the model lacks."""
 
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import jax.numpy as jnp
 import numpy as np
@@ -33,10 +33,16 @@ from snrmjax.model.library.confusions import (
     STRUCTURE_OR_FORCE_SPECTRUM,
 )
 from snrmjax.numerics.rules import ABOVE_MINUS_ONE, OF_A_DAMPING_RATIO, OF_A_FREQUENCY
+from snrmjax.numerics.units import DEGREE, HERTZ
 
 _SIZE = "size of the response"
 _LIGHT = 1e-3  # damping ratio of a close mode, where the model itself has none
 _WIDE = 0.15  # relative distance in frequency, beyond which a mode is a far one
+_RELATIVE: dict[str, Any] = {  # what a relative error may be, and from what it begins
+    "rules": (ABOVE_MINUS_ONE,),
+    "prior": MORE_THAN_NOTHING,
+    "start": lambda _: VISIBLE_CHANGE,
+}
 Amplitude = Float[Array, " state"]
 Velocity = Complex[Array, "state harmonic sensor"]
 
@@ -50,16 +56,14 @@ class ForceHarmonics(AbstractForceSpectrum):
     )
     shape: ClassVar[Shape] = Shape(Part.HARMONICS)
     confusions: ClassVar[tuple[Confusion, ...]] = (STRUCTURE_OR_FORCE_SPECTRUM,)
-    second: Scalar = parameter("1", "harmonic 2 of the force over its fundamental")
-    third: Scalar = parameter("1", "harmonic 3 of the force over its fundamental", typical=0.0)
-
-    @classmethod
-    def starts(cls, scales: MotionScales) -> Starts:
-        """See `AbstractEffect.starts`."""
-        return [(0.02, 0.02)]
+    second: Scalar = parameter(
+        "1", "harmonic 2 of the force over its fundamental", start=lambda _: 0.02
+    )
+    third: Scalar = parameter(
+        "1", "harmonic 3 of the force over its fundamental", typical=0.0, start=lambda _: 0.02
+    )
 
     def load_orders(self) -> Float[Array, " order"]:
-        """See `AbstractForceSpectrum.load_orders`."""
         return jnp.stack([jnp.zeros(()), jnp.ones(()), self.second, self.third])
 
 
@@ -75,19 +79,11 @@ class ForceGainError(AbstractMeasurementEffect):
     confusions: ClassVar[tuple[Confusion, ...]] = (SIZE_OF_RESPONSE, FORCE_OR_SENSOR_GAIN)
     is_linear: ClassVar[bool] = True
     like_force_gain: ClassVar[bool] = True
-    gain: Scalar = parameter(
-        "1", "relative error of the force", rules=(ABOVE_MINUS_ONE,), prior=MORE_THAN_NOTHING
-    )
-
-    @classmethod
-    def starts(cls, scales: MotionScales) -> Starts:
-        """See `AbstractEffect.starts`."""
-        return [(VISIBLE_CHANGE,)]
+    gain: Scalar = parameter(*("1", "relative error of the force"), **_RELATIVE)
 
     def recorded(
         self, frequency: Amplitude, force: Amplitude, velocity: Velocity, displacement: Amplitude
     ) -> tuple[Amplitude, Velocity]:
-        """See `AbstractMeasurementEffect.recorded`."""
         return force / (1 + self.gain), velocity
 
 
@@ -100,17 +96,14 @@ class ForceOffsetError(AbstractMeasurementEffect):
         "floor or a threshold makes it."
     )
     confusions: ClassVar[tuple[Confusion, ...]] = (FRICTION_OR_FORCE_OFFSET,)
-    offset: Scalar = parameter("N", "true less recorded amplitude of the force")
-
-    @classmethod
-    def starts(cls, scales: MotionScales) -> Starts:
-        """See `AbstractEffect.starts`."""
-        return [(VISIBLE_CHANGE * scales.smallest_force,)]
+    offset: Scalar = parameter(
+        *("N", "true less recorded amplitude of the force"),
+        start=lambda scales: VISIBLE_CHANGE * scales.smallest_force,
+    )
 
     def recorded(
         self, frequency: Amplitude, force: Amplitude, velocity: Velocity, displacement: Amplitude
     ) -> tuple[Amplitude, Velocity]:
-        """See `AbstractMeasurementEffect.recorded`."""
         return force - self.offset, velocity
 
 
@@ -126,19 +119,11 @@ class SensorGainError(AbstractMeasurementEffect):
     confusions: ClassVar[tuple[Confusion, ...]] = (SIZE_OF_RESPONSE, FORCE_OR_SENSOR_GAIN)
     is_linear: ClassVar[bool] = True
     like_force_gain: ClassVar[bool] = True
-    gain: Scalar = parameter(
-        "1", "relative error of the velocity", rules=(ABOVE_MINUS_ONE,), prior=MORE_THAN_NOTHING
-    )
-
-    @classmethod
-    def starts(cls, scales: MotionScales) -> Starts:
-        """See `AbstractEffect.starts`."""
-        return [(VISIBLE_CHANGE,)]
+    gain: Scalar = parameter(*("1", "relative error of the velocity"), **_RELATIVE)
 
     def recorded(
         self, frequency: Amplitude, force: Amplitude, velocity: Velocity, displacement: Amplitude
     ) -> tuple[Amplitude, Velocity]:
-        """See `AbstractMeasurementEffect.recorded`."""
         return force, velocity * (1 + self.gain)
 
 
@@ -156,17 +141,14 @@ class SensorPhaseError(AbstractMeasurementEffect):
     confusions: ClassVar[tuple[Confusion, ...]] = (FAR_MODE_OR_PHASE_ERROR,)
     is_linear: ClassVar[bool] = True
     only_phase: ClassVar[bool] = True
-    phase_deg: Scalar = parameter("°", "phase by which the recorded velocity leads")
-
-    @classmethod
-    def starts(cls, scales: MotionScales) -> Starts:
-        """See `AbstractEffect.starts`."""
-        return [(float(np.degrees(VISIBLE_CHANGE)),)]
+    phase_deg: Scalar = parameter(
+        *("°", "phase by which the recorded velocity leads"),
+        start=lambda _: VISIBLE_CHANGE / DEGREE,
+    )
 
     def recorded(
         self, frequency: Amplitude, force: Amplitude, velocity: Velocity, displacement: Amplitude
     ) -> tuple[Amplitude, Velocity]:
-        """See `AbstractMeasurementEffect.recorded`."""
         order = jnp.arange(velocity.shape[-2])[:, None]
         return force, velocity * jnp.exp(1j * order * jnp.deg2rad(self.phase_deg))
 
@@ -187,17 +169,14 @@ class ResidualMode(AbstractMeasurementEffect):
     is_linear: ClassVar[bool] = True
     follows_force: ClassVar[bool] = True
     stage: ClassVar[int] = 1
-    receptance: Scalar = parameter("m/N", "displacement of the far modes over the force")
-
-    @classmethod
-    def starts(cls, scales: MotionScales) -> Starts:
-        """See `AbstractEffect.starts`."""
-        return [(VISIBLE_CHANGE * scales.receptance,)]
+    receptance: Scalar = parameter(
+        *("m/N", "displacement of the far modes over the force"),
+        start=lambda scales: VISIBLE_CHANGE * scales.receptance,
+    )
 
     def recorded(
         self, frequency: Amplitude, force: Amplitude, velocity: Velocity, displacement: Amplitude
     ) -> tuple[Amplitude, Velocity]:
-        """See `AbstractMeasurementEffect.recorded`."""
         return force, _moved_by(velocity, 1j * frequency * self.receptance * force)
 
 
@@ -233,7 +212,7 @@ class CloseMode(AbstractMeasurementEffect):
     frequency_hz: Scalar = parameter(
         *("Hz", "its natural frequency"),
         rules=OF_A_FREQUENCY,
-        prior=Prior(1 - 2 * _WIDE, 1 + 2 * _WIDE, lambda scales: scales.frequency / (2 * np.pi)),
+        prior=Prior(1 - 2 * _WIDE, 1 + 2 * _WIDE, lambda scales: scales.frequency / HERTZ),
     )
     damping_ratio: Scalar = parameter(
         *("1", "its damping ratio"), rules=OF_A_DAMPING_RATIO, prior=FURTHER_DAMPING
@@ -247,28 +226,26 @@ class CloseMode(AbstractMeasurementEffect):
         for away in (-8.0, -3.0, 3.0, 8.0):
             share = 1 + float(np.clip(away * ratio, -_WIDE, _WIDE))
             distance = abs(share**2 - 1 + 2j * ratio * share) * scales.frequency**2
-            hz = share * scales.frequency / (2 * np.pi)
+            hz = share * scales.frequency / HERTZ
             starts.append((VISIBLE_CHANGE * scales.receptance * distance, hz, ratio))
         return starts
 
     @classmethod
     def steps(cls, start: tuple[float, ...]) -> tuple[float, ...]:
-        """See `AbstractEffect.steps`: a half bandwidth in frequency."""
+        """A half bandwidth in frequency."""
         constant, hz, ratio = start
         return abs(constant), ratio * hz, 0.5 * ratio
 
     @classmethod
     def without_strength(cls, natural_frequency: float, damping_ratio: float) -> Self:
-        """See `AbstractEffect.without_strength`."""
-        hz = 1.1 * natural_frequency / (2 * np.pi)
+        hz = 1.1 * natural_frequency / HERTZ
         return cls(*(jnp.asarray(value) for value in (0.0, hz, damping_ratio)))
 
     def recorded(
         self, frequency: Amplitude, force: Amplitude, velocity: Velocity, displacement: Amplitude
     ) -> tuple[Amplitude, Velocity]:
-        """See `AbstractMeasurementEffect.recorded`."""
-        own = 2 * jnp.pi * self.frequency_hz
-        stiffness = own**2 - frequency**2 + 2j * self.damping_ratio * own * frequency
+        natural = HERTZ * self.frequency_hz
+        stiffness = natural**2 - frequency**2 + 2j * self.damping_ratio * natural * frequency
         return force, _moved_by(velocity, 1j * frequency * self.modal_constant * force / stiffness)
 
 
@@ -290,17 +267,14 @@ class ModeShapeChange(AbstractMeasurementEffect):
         ),
     )
     stage: ClassVar[int] = 0
-    coefficient: Scalar = parameter("1/(kg m²)", "relative change per squared amplitude")
-
-    @classmethod
-    def starts(cls, scales: MotionScales) -> Starts:
-        """See `AbstractEffect.starts`."""
-        return [(VISIBLE_CHANGE / scales.amplitude**2,)]
+    coefficient: Scalar = parameter(
+        *("1/(kg m²)", "relative change per squared amplitude"),
+        start=lambda scales: VISIBLE_CHANGE / scales.amplitude**2,
+    )
 
     def recorded(
         self, frequency: Amplitude, force: Amplitude, velocity: Velocity, displacement: Amplitude
     ) -> tuple[Amplitude, Velocity]:
-        """See `AbstractMeasurementEffect.recorded`."""
         return force, velocity * (1 + self.coefficient * displacement**2)[..., None, None]
 
 

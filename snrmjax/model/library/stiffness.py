@@ -47,7 +47,6 @@ class CubicStiffness(AbstractMemoryless):
     coefficient: Scalar = parameter("1/(kg m² s²)", "cubic stiffness")
 
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
-        """See `AbstractMemoryless.force`."""
         return self.coefficient * displacement**3
 
 
@@ -69,12 +68,11 @@ class QuadraticStiffness(AbstractMemoryless):
 
     @classmethod
     def starts(cls, scales: MotionScales) -> Starts:
-        """See `AbstractEffect.starts`: softening by the visible change, with either sign."""
+        """Softening by the visible change, with either sign."""
         size = float(np.sqrt(1.2 * scales.change) * scales.frequency / scales.amplitude)
         return [(size,), (-size,)]
 
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
-        """See `AbstractMemoryless.force`."""
         return self.coefficient * displacement**2
 
 
@@ -90,7 +88,6 @@ class QuinticStiffness(AbstractMemoryless):
     coefficient: Scalar = parameter("1/(kg² m⁴ s²)", "quintic stiffness")
 
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
-        """See `AbstractMemoryless.force`."""
         return self.coefficient * displacement**5
 
 
@@ -111,11 +108,10 @@ class BilinearStiffness(AbstractKinked):
 
     @classmethod
     def starts(cls, scales: MotionScales) -> Starts:
-        """See `AbstractEffect.starts`: a twentieth of the linear stiffness, with either sign."""
+        """A twentieth of the linear stiffness, with either sign."""
         return [(0.05 * scales.frequency**2,), (-0.05 * scales.frequency**2,)]
 
     def rounded_force(self, displacement: Scalar, velocity: Scalar, width: Scalar) -> Scalar:
-        """See `AbstractKinked.rounded_force`."""
         return 0.5 * self.stiffness * (ramp(displacement, width) + ramp(-displacement, width))
 
 
@@ -139,11 +135,10 @@ class GapStiffness(AbstractKinked):
 
     @classmethod
     def starts(cls, scales: MotionScales) -> Starts:
-        """See `AbstractEffect.starts`: gaps at several shares of the largest amplitude."""
+        """Gaps at several shares of the largest amplitude."""
         return _contact_starts(scales, 3.0)
 
     def rounded_force(self, displacement: Scalar, velocity: Scalar, width: Scalar) -> Scalar:
-        """See `AbstractKinked.rounded_force`."""
         above = ramp(displacement - self.gap, width)
         return self.stiffness * (above - ramp(-displacement - self.gap, width))
 
@@ -165,11 +160,10 @@ class OneSidedStop(AbstractKinked):
 
     @classmethod
     def starts(cls, scales: MotionScales) -> Starts:
-        """See `AbstractEffect.starts`: gaps at several shares of the largest amplitude."""
+        """Gaps at several shares of the largest amplitude."""
         return _contact_starts(scales, 6.0)
 
     def rounded_force(self, displacement: Scalar, velocity: Scalar, width: Scalar) -> Scalar:
-        """See `AbstractKinked.rounded_force`."""
         return self.stiffness * ramp(displacement - self.gap, width)
 
 
@@ -190,10 +184,9 @@ class StaticPreload(AbstractMemoryless):
 
     @classmethod
     def starts(cls, scales: MotionScales) -> Starts:
-        """See `AbstractEffect.starts`: a static displacement of a fifth of the amplitude."""
+        """A static displacement of a fifth of the amplitude."""
         size = 0.2 * scales.frequency**2 * scales.amplitude
         return [(size,), (-size,)]
 
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
-        """See `AbstractMemoryless.force`."""
         return jnp.broadcast_to(self.constant_force, jnp.shape(displacement))

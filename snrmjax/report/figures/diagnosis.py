@@ -145,7 +145,7 @@ def comparison_figure(
     frequency, speed = np.asarray(data.frequency) / HERTZ, np.abs(np.asarray(data.velocity))[:, r]
     same = at_curve_force(data, [curve.force for curve in before])
     lines = [
-        [(one.frequency / HERTZ, np.abs(np.asarray(one.velocity)[:, 1, r])) for one in curves]
+        [(curve.frequency / HERTZ, np.abs(np.asarray(curve.velocity)[:, 1, r])) for curve in curves]
         for curves in (before, after)
     ]
     return _beside_one_another(lines, frequency, speed, same, ("Velocity amplitude", "m/s"))
@@ -161,7 +161,9 @@ def held_velocity_figure(
     r = sensor_index(data.sensors, sensor)
     good = np.asarray(data.measured)[:, r]
     frequency, force = np.asarray(data.frequency)[good] / HERTZ, np.asarray(data.force)[good]
-    lines = [[(one.frequency / HERTZ, one.force) for one in curves] for curves in (before, after)]
+    lines = [
+        [(curve.frequency / HERTZ, curve.force) for curve in curves] for curves in (before, after)
+    ]
     every, what = np.ones(len(force), dtype=bool), ("Force amplitude", "N")
     return _beside_one_another(lines, frequency, force, every, what, ", velocity held")
 

@@ -254,7 +254,11 @@ def response_figure(
                 response_line(axes, x, y, pieces, name, colour, width, beyond)
         for axes, y in ((speeds, np.abs(states) / unit.size), (phases, phase_of(states, backbone))):
             marks(axes, omega, y, DOT, "measured")
-        found = [(one.frequency / HERTZ, one.velocity) for one in resonances if one.force == force]
+        found = [
+            (resonance.frequency / HERTZ, resonance.velocity)
+            for resonance in resonances
+            if resonance.force == force
+        ]
         star = {**STAR, "markersize": 10.0, "zorder": 5}
         marks(speeds, [f for f, _ in found], [v / unit.size for _, v in found], star, "resonance")
         marks(phases, [f for f, _ in found], np.zeros(len(found)), star)

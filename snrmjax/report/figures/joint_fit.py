@@ -10,7 +10,6 @@ from matplotlib.ticker import PercentFormatter
 from snrmjax.identify.inference.contributions import Contribution, Contributions
 from snrmjax.identify.inference.fitted_response import FittedResponse
 from snrmjax.identify.inference.optimal_design import NextMeasurement
-from snrmjax.identify.inference.refits import Profile
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.pointwise.backbone_points import BackbonePoints
 from snrmjax.io.units import DEGREE, HERTZ
@@ -209,21 +208,6 @@ def contributions_figure(rows: Sequence[Contribution]) -> Figure:
     return figure
 
 
-def profile_figure(profile: Profile) -> Figure:
-    """Rise of χ² against one unknown, and where it ends the 95 % interval.
-
-    A parabola is what an unknown with a normal distribution has. Refits that failed are left out.
-    """
-    figure, ((axes,),) = panels(COLUMN, 2.8, 1, 1)
-    marks(axes, profile.values, profile.rise, {**DOT, "color": MEASURED}, "refits")
-    axes.plot(profile.values, profile.rise, color=MEASURED)
-    axes.axhline(BAND**2, color=SIMULATED, linestyle="--", linewidth=LINE, label="95 %")
-    axes.set_ylim(bottom=0.0)
-    name_axes(axes, "", f"{plain(profile.name)} ({profile.unit})", "Rise of χ² (1)")
-    legend(figure)
-    return figure
-
-
 def next_measurements_figure(
     responses: Sequence[FittedResponse], measurements: Sequence[NextMeasurement], *, sensor: str
 ) -> Figure:
@@ -235,19 +219,25 @@ def next_measurements_figure(
     """
     if not responses:
         raise ValueError("there is no response to show: `responses` is empty.")
-    forces = sorted({one.force for one in responses})
-    largest = max(float(np.max(np.abs(one.velocity))) for one in responses)
+    forces = sorted({response.force for response in responses})
+    largest = max(float(np.max(np.abs(response.velocity))) for response in responses)
     unit = unit_for(largest, "m/s")
     figure, speeds, phases = amplitude_and_phase(PAGE, 5.0, sensor, unit)
     resonant = np.concatenate(
-        [one.velocity[[np.argmax(np.abs(one.velocity))]] for one in responses]
+        [response.velocity[[np.argmax(np.abs(response.velocity))]] for response in responses]
     )
     sign = 1.0 if np.sum(resonant.real) >= 0 else -1.0
-    drives = {one.force: one.drive for one in measurements if one.drive is not None}
+    drives = {
+        measurement.force: measurement.drive
+        for measurement in measurements
+        if measurement.drive is not None
+    }
     for curve in responses:
         colour = SERIES[forces.index(curve.force) % len(SERIES)]
         size = np.abs(curve.velocity)
-        mine = [one.velocity for one in measurements if one.force == curve.force]
+        mine = [
+            measurement.velocity for measurement in measurements if measurement.force == curve.force
+        ]
         near = size >= min([0.25 * size.max(), *(0.8 * v for v in mine)])
         drive = drives.get(curve.force)
         name = with_unit(curve.force, "N") if drive is None else with_unit(drive, "V")
@@ -256,10 +246,15 @@ def next_measurements_figure(
         for axes, y in ((speeds, size[near] / unit.size), (phases, turn)):
             pieces = (curve.stable[near], name, colour, LINE, curve.continued[near])
             response_line(axes, x, y, *pieces)
-    for one in measurements:
-        marks(speeds, one.frequency / HERTZ, one.velocity / unit.size, {**HOLLOW, "clip_on": True})
-        turn = np.angle(sign * np.exp(1j * one.phase)) / DEGREE
-        marks(phases, one.frequency / HERTZ, turn, HOLLOW)
+    for measurement in measurements:
+        marks(
+            speeds,
+            measurement.frequency / HERTZ,
+            measurement.velocity / unit.size,
+            {**HOLLOW, "clip_on": True},
+        )
+        turn = np.angle(sign * np.exp(1j * measurement.phase)) / DEGREE
+        marks(phases, measurement.frequency / HERTZ, turn, HOLLOW)
     for ranks, first in _together(measurements):
         at = (first.frequency / HERTZ, first.velocity / unit.size)
         text = ", ".join(map(str, ranks))
@@ -279,12 +274,12 @@ def next_measurements_figure(
 def _together(measurements: Sequence[NextMeasurement]) -> list[tuple[list[int], NextMeasurement]]:
     """Ranks whose marks would hide one another, with the first of them."""
     groups: list[tuple[list[int], NextMeasurement]] = []
-    for one in measurements:
+    for measurement in measurements:
         for ranks, first in groups:
-            near = abs(one.frequency / first.frequency - 1) < 0.005
-            if near and abs(one.velocity / first.velocity - 1) < 0.03:
-                ranks.append(one.rank)
+            near = abs(measurement.frequency / first.frequency - 1) < 0.005
+            if near and abs(measurement.velocity / first.velocity - 1) < 0.03:
+                ranks.append(measurement.rank)
                 break
         else:
-            groups.append(([one.rank], one))
+            groups.append(([measurement.rank], measurement))
     return groups

@@ -91,20 +91,20 @@ def points_by_level(
     from bokeh.models import CDSView, HoverTool, IndexFilter
 
     names = np.unique(level)
-    colours = level_colours([int(one) for one in names])
+    colours = level_colours([int(name) for name in names])
     drawn: list[list[Any]] = [[] for _ in panels]
-    for one in names:
-        view = CDSView(filter=IndexFilter(np.flatnonzero(level == one).tolist()))
+    for name in names:
+        view = CDSView(filter=IndexFilter(np.flatnonzero(level == name).tolist()))
         first = None
         for k, (figure, x, y) in enumerate(panels):
-            label = {"legend_label": f"level {one}"} if k == 0 else {}
+            label = {"legend_label": f"level {name}"} if k == 0 else {}
             renderer = figure.scatter(
                 x,
                 y,
                 source=source,
                 view=view,
                 size=6,
-                color=colours[int(one)],
+                color=colours[int(name)],
                 line_color="white",
                 line_width=0.4,
                 nonselection_fill_alpha=0.25,

@@ -118,9 +118,9 @@ def quality_figure(found: Condensation) -> Figure:
     quality = found.quality
     ratio, error = quality.nonlinear_ratio, quality.case_error
     named = np.zeros(len(ratio), dtype=bool)
-    for one in found.warnings:
-        if one.kind == "inconsistent_case":
-            named[list(one.cases)] = True
+    for warning in found.warnings:
+        if warning.kind == "inconsistent_case":
+            named[list(warning["cases"])] = True
     shown = np.isfinite(error) & (error > 0)
     marks(axes, ratio[shown & ~named], error[shown & ~named], DOT, "load case")
     cross = {**CROSS, "markeredgecolor": IDENTIFIED}

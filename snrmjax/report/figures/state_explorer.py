@@ -88,7 +88,7 @@ def state_explorer(
     ]
     points_by_level(panels, source, np.asarray(data.level), hover)
     rows = [one for one, _, _ in panels]
-    if any(one is not None for one in records):
+    if any(record is not None for record in records):
         rows += _record_panels(source, records, load)
     return live_figures(column(*rows, sizing_mode="stretch_width"))
 
@@ -131,9 +131,9 @@ def _record_panels(
     """Record and fit of one state over a period, and the harmonics of its force."""
     from bokeh.models import ColumnDataSource, CustomJS
 
-    kept = [one for one in records if one is not None]
+    kept = [record for record in records if record is not None]
     numbers = iter(range(len(kept)))
-    row = [-1 if one is None else next(numbers) for one in records]
+    row = [-1 if record is None else next(numbers) for record in records]
     largest = int(np.nanargmax(np.where(np.array(row) < 0, -1.0, source.data["velocity"])))
     orders = [order for order in kept[0].orders if order >= 1]
     sizes = {"samples": _SAMPLES, "fit": _CURVE, "orders": len(orders)}
@@ -181,7 +181,7 @@ def _record_panels(
 
 def _joined(parts: Sequence[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
     """Records after one another, in four bytes a number."""
-    return {name: np.concatenate([one[name] for one in parts]).astype("f4") for name in parts[0]}
+    return {name: np.concatenate([part[name] for part in parts]).astype("f4") for name in parts[0]}
 
 
 def _samples(one: FoldedRecord, moved: Unit, load: Unit) -> dict[str, np.ndarray]:

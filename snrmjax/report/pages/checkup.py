@@ -14,7 +14,7 @@ def write(folder: Path, found: Checkup) -> None:
 def headline(found: Checkup) -> list[str]:
     """Each finding with its evidence and what mends it."""
     lines = []
-    for one in found.findings:
-        lines.append(f"{one.severity}: {one.kind} in {one.where}: {one.evidence}")
-        lines.append(f"  mend: {one.mend}")
+    for finding in found.findings:
+        lines.append(f"{finding.severity}: {finding.kind} in {finding.where}: {finding.evidence}")
+        lines.append(f"  mend: {finding.mend}")
     return lines or ["nothing found"]

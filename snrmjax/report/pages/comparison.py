@@ -58,11 +58,13 @@ def write(folder: Path, found: Comparison, *, title: str = "", model: str = "") 
     """Write compare.csv, summary.json, compare.png and report.html."""
     results = found.results
     columns: dict[str, list] = {
-        "method": [one.method for one in results for _ in one.status],
+        "method": [result.method for result in results for _ in result.status],
     }
     kept = ("velocity_m_s", "frequency_hz", "frequency_std_hz", "damping_ratio")
     for key in (*kept, "damping_ratio_std", "status"):
-        columns[key] = [value for one in results for value in np.asarray(one.variables()[key][1])]
+        columns[key] = [
+            value for result in results for value in np.asarray(result.variables()[key][1])
+        ]
     write_table(folder / "compare.csv", {key: np.array(rows) for key, rows in columns.items()})
     write_summary(folder / "summary.json", _summary(found))
     heading = "Backbones and damping"
@@ -81,7 +83,7 @@ def write(folder: Path, found: Comparison, *, title: str = "", model: str = "") 
 
 def headline(found: Comparison) -> list[str]:
     """What each record was taken for, and the result."""
-    return [*found.records, comparison_sentence(found)]
+    return [*map(str, found.records), comparison_sentence(found)]
 
 
 def notes_of(found: Comparison) -> list[str]:
@@ -104,7 +106,7 @@ def _done(found: Comparison) -> list[tuple[str, str]]:
 def methods_figure(results: tuple[MethodResult, ...]) -> Figure:
     """Natural frequency and damping of every method against velocity."""
     figure, grid = panels(COLUMN, 5.6, 2, 1)
-    every = np.concatenate([np.asarray(one.velocity)[one.found] for one in results])
+    every = np.concatenate([np.asarray(result.velocity)[result.found] for result in results])
     unit = unit_for(every, "m/s")
     values: list[list[np.ndarray]] = [[], []]
     for k, one in enumerate(results):
@@ -145,7 +147,9 @@ def comparison_sentence(found: Comparison) -> str:
     results, stopped = found.results, found.stopped
     text = f"{len(results)} of {len(results) + len(stopped)} methods ran"
     own = _reference(found)
-    near = [one for one in _distances(found) if own is not None and one[0] != own.method]
+    near = [
+        distance for distance in _distances(found) if own is not None and distance[0] != own.method
+    ]
     if own is None or not near:
         return f"{text}."
     away = ", ".join(
@@ -160,8 +164,8 @@ def comparison_sentence(found: Comparison) -> str:
 
 def _reference(found: Comparison) -> MethodResult | None:
     """The result from which distances are taken: the inverse SNRM, else the first with points."""
-    results = [one for one in found.results if one.found.any()]
-    own = [one for one in results if one.method == "snrm"]
+    results = [result for result in found.results if result.found.any()]
+    own = [result for result in results if result.method == "snrm"]
     return next(iter([*own, *results]), None)
 
 
@@ -176,34 +180,38 @@ def _distances(found: Comparison) -> list[tuple[str, float, float, int]]:
     has = own.found
     at = np.asarray(own.velocity)[has]
     rows = []
-    for one in found.results:
-        velocity = np.asarray(one.velocity)
-        kept = one.found & (velocity >= at.min()) & (velocity <= at.max())
+    for result in found.results:
+        velocity = np.asarray(result.velocity)
+        kept = result.found & (velocity >= at.min()) & (velocity <= at.max())
         if not kept.any():
             continue
         omega, ratio = (
             np.interp(velocity[kept], at, np.asarray(curve)[has])
             for curve in (own.natural_frequency, own.damping_ratio)
         )
-        hertz = np.abs(np.asarray(one.natural_frequency)[kept] - omega) / HERTZ
-        damping = np.abs(np.asarray(one.damping_ratio)[kept] / ratio - 1)
+        hertz = np.abs(np.asarray(result.natural_frequency)[kept] - omega) / HERTZ
+        damping = np.abs(np.asarray(result.damping_ratio)[kept] / ratio - 1)
         away = float(np.median(hertz)), float(np.median(damping))
-        rows.append((one.method, *away, int(kept.sum())))
+        rows.append((result.method, *away, int(kept.sum())))
     return rows
 
 
 def _notes(found: Comparison) -> list[str]:
     results = found.results
-    own = [f"{_NAMES.get(one.method, one.method)}: {note}" for one in results for note in one.notes]
-    return [*found.records, *notes_of(found), *notes_on_bands(results), *own]
+    own = [
+        f"{_NAMES.get(result.method, result.method)}: {note}"
+        for result in results
+        for note in result.notes
+    ]
+    return [*map(str, found.records), *notes_of(found), *notes_on_bands(results), *own]
 
 
 def notes_on_bands(results: Sequence[MethodResult]) -> list[str]:
     """Sentences on bands that do not hold all errors of their method."""
     banded = [
-        one.method
-        for one in results
-        if np.isfinite(np.asarray(one.natural_frequency_std)[one.found]).any()
+        result.method
+        for result in results
+        if np.isfinite(np.asarray(result.natural_frequency_std)[result.found]).any()
     ]
     noise, polynomial = (
         " and ".join(_NAMES[name] for name in banded if name in kind)
@@ -229,19 +237,21 @@ def _summary(found: Comparison) -> dict:
     own = reference is not None and reference.method == "snrm"
     near = {name: (hertz, ratio) for name, hertz, ratio, _ in _distances(found) if own}
     return {
-        "records": list(found.records),
+        "records": [str(one) for one in found.records],
         "bands": notes_on_bands(results),
         "methods": {
-            one.method: {
-                "points": int(one.found.sum()),
-                "failed": int((~one.found).sum()),
-                "states": one.n_states,
-                "record_s": one.test_seconds,
-                "median_distance_from_snrm_hz": near.get(one.method, (None, None))[0],
-                "median_relative_damping_distance_from_snrm": near.get(one.method, (None, None))[1],
-                "notes": [str(note) for note in one.notes],
+            result.method: {
+                "points": int(result.found.sum()),
+                "failed": int((~result.found).sum()),
+                "states": result.n_states,
+                "record_s": result.test_seconds,
+                "median_distance_from_snrm_hz": near.get(result.method, (None, None))[0],
+                "median_relative_damping_distance_from_snrm": near.get(result.method, (None, None))[
+                    1
+                ],
+                "notes": [str(note) for note in result.notes],
             }
-            for one in results
+            for result in results
         },
         "stopped": stopped,
     }

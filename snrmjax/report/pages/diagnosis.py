@@ -344,7 +344,7 @@ def _value_and_unit(kind: str, name: str, pair: tuple[float, float]) -> tuple[st
 def _description(kind: str) -> str:
     """What an effect is physically and where it shows, as its class states it."""
     shape = shape_of(effect_class(kind))
-    return f"{effect_class(kind).description} {shape.sentence if shape else ''}".strip()
+    return f"{effect_class(kind).description} {shape.fact if shape else ''}".strip()
 
 
 def _unit(kind: str, name: str) -> str:

@@ -147,7 +147,7 @@ def identification_report(
         done=[*(done or {}).items(), ("program", f"snrmjax {version('snrmjax')}")],
         result=identification_sentence(identification, modes),
         summary=identification_summary(identification, modes, words),
-        notes=list(dict.fromkeys([*notes, *identification.notes])),
+        notes=list(dict.fromkeys(map(str, [*notes, *identification.notes]))),
         sections=[
             *sections,
             *further,
@@ -292,10 +292,14 @@ def resonance_table(
 
     Arguments: `forces` that were asked for: those without a resonance get a row that says so.
     """
-    pairs: list[tuple[float, Resonance | None]] = [(one.force, one) for one in resonances]
-    pairs += [(f, None) for f in sorted(set(forces) - {one.force for one in resonances})]
+    pairs: list[tuple[float, Resonance | None]] = [
+        (resonance.force, resonance) for resonance in resonances
+    ]
+    pairs += [
+        (f, None) for f in sorted(set(forces) - {resonance.force for resonance in resonances})
+    ]
     load = unit_for([force for force, _ in pairs], "N")
-    unit = unit_for([one.velocity for one in resonances], "m/s")
+    unit = unit_for([resonance.velocity for resonance in resonances], "m/s")
     header = [f"force ({load.name})", f"velocity ({unit.name})", "frequency (Hz)", "damping (%)"]
     header += ["beyond the data"]
     if simulated:

@@ -31,11 +31,10 @@ def settings_in_words(found: IdentifiedTest) -> dict[str, str]:
     """Which amplitude and which curves, as the summary and the page name them."""
     if found.joint is None:
         asked = found.options
-        anchored = ", anchored at the linear mode" if asked.anchor else ""
-        return {"amplitude": f"{asked.amplitude}, {asked.measure}", "curves": f"smooth{anchored}"}
+        return {"amplitude": f"{asked.amplitude}, {asked.measure}", "curves": "smooth"}
     unknowns = found.joint.fit.unknowns
     pair = (unknowns.squared_frequency, unknowns.modal_damping)
-    curves = " and ".join(joint_results.described(curve) for curve in pair)
+    curves = " and ".join(curve.label for curve in pair)
     return {"amplitude": "displacement, fundamental", "curves": curves}
 
 
@@ -49,12 +48,12 @@ def headline(found: IdentifiedTest) -> list[str]:
         for k in (0, -1)
     ]
     lines = [f"backbone: {ends[0]} to {ends[1]}"]
-    for one in found.predictions:
-        for each in one.resonances:
+    for prediction in found.predictions:
+        for each in prediction.resonances:
             place = f"{each.frequency / HERTZ:.5g} Hz, {each.velocity:.3g} m/s"
             damped = f"{100 * each.damping_ratio:.3g} % of critical damping"
-            lines.append(f"resonance at {one.load}: {place}, {damped}")
-        lines.append(f"resonance at {one.load} {where_in_words(one.further)}")
+            lines.append(f"resonance at {prediction.load}: {place}, {damped}")
+        lines.append(f"resonance at {prediction.load} {where_in_words(prediction.further)}")
     for advised in found.advice or ():
         force, drive = advised.force, advised.drive
         load = f"force {force:.4g} N" if drive is None else f"drive {drive:.4g} V"
@@ -181,34 +180,34 @@ def write(
     """
     shown = SHOWN_AMPLITUDES[axis]
     done = {"data": data, "model": model or found.model.name} | settings_in_words(found)
-    results.write_points(folder / "points.csv", found.identification)
+    added = (shown.column, shown.power)
+    results.write_points(folder / "points.csv", found.identification, added=added)
     if found.predictions:
-        drives = [one.drive for one in found.predictions for _ in one.responses]
-        stds = [b.velocity_std for one in found.predictions for b in one.banded]
+        drives = [
+            prediction.drive for prediction in found.predictions for _ in prediction.responses
+        ]
+        stds = [b.velocity_std for prediction in found.predictions for b in prediction.banded]
         given = (folder / "prediction.csv", found.responses)
         results.write_prediction(*given, drives=drives, velocity_stds=stds)
     summary: dict[str, object] = {"program": "snrmjax", "version": version("snrmjax"), **done}
     if found.joint is None:
-        results.write_backbone(folder / "backbone.csv", found.identification)
+        results.write_backbone(folder / "backbone.csv", found.identification, added=added)
     else:
-        _write_fit(folder, found.joint)
-        banded = [response for one in found.predictions for response in one.banded]
+        _write_fit(folder, found.joint, added)
+        banded = [response for prediction in found.predictions for response in prediction.banded]
         details = found.joint
         summary["joint_fit"] = joint_results.summarise_fit(details.fit, banded, details.shares)
-    for name, of in (("points", "backbone_velocity_m_s"), ("backbone", "velocity_m_s")):
-        if shown.power:
-            added = of.replace(VELOCITY.column, shown.column)
-            results.with_amplitude(folder / f"{name}.csv", of, added, shown.power)
     summary |= results.summarise(found.identification, found.values)
     summary["resonances"] = [
-        results.summarise_resonance(each) | ({} if one.drive is None else {"drive_v": one.drive})
-        for one in found.predictions
-        for each in one.resonances
+        results.summarise_resonance(each)
+        | ({} if prediction.drive is None else {"drive_v": prediction.drive})
+        for prediction in found.predictions
+        for each in prediction.resonances
     ]
     summary["resonance_distributions"] = [
-        results.summarise_distribution(one.further)
-        | ({} if one.drive is None else {"drive_v": one.drive})
-        for one in found.predictions
+        results.summarise_distribution(prediction.further)
+        | ({} if prediction.drive is None else {"drive_v": prediction.drive})
+        for prediction in found.predictions
     ]
     summary["notes"] = [str(note) for note in found.notes]
     write_summary(folder / "summary.json", summary)
@@ -220,9 +219,9 @@ def write(
     return report
 
 
-def _write_fit(folder: Path, details: FitDetails) -> None:
+def _write_fit(folder: Path, details: FitDetails, added: tuple[str, int]) -> None:
     """Write the files that a joint fit adds, and its curves."""
-    joint_results.write_fitted_backbone(folder / "backbone.csv", details.fit)
+    joint_results.write_fitted_backbone(folder / "backbone.csv", details.fit, added=added)
     joint_results.write_joint_fit(folder / "fit.json", details.fit)
     if details.advice is not None:
         joint_results.write_next(folder / "next.csv", details.advice)

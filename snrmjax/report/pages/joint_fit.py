@@ -8,7 +8,6 @@ from matplotlib.figure import Figure
 from snrmjax.identify.inference.contributions import Contribution
 from snrmjax.identify.inference.optimal_design import NextMeasurement
 from snrmjax.identify.joint.joint_fit import JointFit
-from snrmjax.identify.joint.notes import in_words
 from snrmjax.identify.pointwise.backbone_points import BackbonePoints
 from snrmjax.io.joint_results import summarise_fit
 from snrmjax.io.units import DEGREE, HERTZ
@@ -28,6 +27,7 @@ from snrmjax.report.pages.identification import (
     noise_in_words,
 )
 from snrmjax.report.sampling import VELOCITY, ShownAmplitude
+from snrmjax.report.sentences.identify import in_words
 from snrmjax.report.style import PrintedFigure, unit_for
 
 _LISTED = 12  # contributions by name; the rest stands in one row
@@ -220,7 +220,7 @@ def advice_table(advice: Sequence[NextMeasurement]) -> ReportTable:
         (
             *(f"{one.rank}", f"{size / load.size:.4g}", f"{one.frequency / HERTZ:.6g}"),
             *(f"{one.velocity / unit.size:.3g}", minus(f"{round(one.phase / DEGREE):d}")),
-            *(f"{100 * one.expected_band_ratio:.1f}", one.reason),
+            *(f"{100 * one.expected_band_ratio:.1f}", str(one.reason)),
         )
         for one, size in zip(advice, loads, strict=True)
     ]

@@ -78,7 +78,7 @@ def modal_report(of: LinearModesFound) -> Report:
         done = [("decay", f"{len(time)} samples, {time[-1] - time[0]:.4g} s")]
     return Report(
         title=f"Linear modes: {of.name}",
-        done=[*done, ("sensors", ", ".join(modes.sensors)), ("scale", modes.scaled_by)],
+        done=[*done, ("sensors", ", ".join(modes.sensors)), ("scale", str(modes.scaled_by))],
         result=modes_sentence(modes),
         summary=_headline(modes, interest),
         notes=[str(note) for note in of.notes],

@@ -144,8 +144,8 @@ def reduction_summary(reduction: Reduction) -> dict:
         },
         "load_scale_study": None,
         "warnings": [
-            {"kind": one.kind, "message": one.message, "cases": case_list(found.cases, one.cases)}
-            for one in found.warnings
+            {"kind": f.kind, "message": str(f), "cases": case_list(found.cases, f.get("cases", ()))}
+            for f in found.warnings
         ],
         "notes": [str(note) for note in reduction.notes],
     }

@@ -24,7 +24,7 @@ def resonance_rows(rows: Sequence[LevelResponse]) -> list[tuple[str, ...]]:
 
 def velocity_unit(resonances: Iterable[PhaseResonance]) -> Unit:
     """One unit for the velocities of resonances."""
-    velocities = [one.velocity for one in resonances if np.isfinite(one.velocity)]
+    velocities = [resonance.velocity for resonance in resonances if np.isfinite(resonance.velocity)]
     return unit_for(velocities, "m/s")
 
 

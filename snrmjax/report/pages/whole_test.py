@@ -37,7 +37,7 @@ def write(folder: Path, found: WholeTest) -> Report:
         folder / "identify", found.identified, title=found.name, data="measured.csv"
     )
     if found.counts is not None and found.counts.reasons:
-        row = ("steps of the records", found.counts.words)
+        row = ("steps of the records", str(found.counts.fact))
         identified = identified._replace(summary=[*identified.summary, row])
     stages.append(_Stage("Backbone", identified))
     if found.diagnosed is not None:
@@ -55,7 +55,7 @@ def headline(found: WholeTest) -> list[str]:
     """Linear mode, states, check, backbone and diagnosis in a line or two each."""
     return [
         _linear_mode(found),
-        *([] if found.counts is None else [f"steady states: {found.counts.words}"]),
+        *([] if found.counts is None else [f"steady states: {found.counts.fact}"]),
         _check(found.checkup),
         *identified_test.headline(found.identified),
         *([] if found.diagnosed is None else diagnosis.headline(found.diagnosed)[:1]),
@@ -93,8 +93,8 @@ def _report(found: WholeTest, stages: list[_Stage]) -> Report:
     ]
     for name, report in stages:
         sections += [
-            one._replace(heading=f"{name}: {one.heading[0].lower()}{one.heading[1:]}")
-            for one in report.sections
+            section._replace(heading=f"{name}: {section.heading[0].lower()}{section.heading[1:]}")
+            for section in report.sections
         ]
     notes = {str(note): "" for note in found.notes}
     for name, report in stages:  # each note once, of the stage that said it first
@@ -115,7 +115,7 @@ def _result(found: WholeTest, stages: list[_Stage]) -> str:
     said = [f"{_check(found.checkup).capitalize()}."]
     said += [stage.report.result for stage in stages if stage.name == "Backbone"]
     if found.counts is not None and found.counts.reasons:
-        said.append(f"{found.counts.words}.")
+        said.append(f"{found.counts.fact}.")
     said += [stage.report.result for stage in stages if stage.name == "Diagnosis"]
     if found.left_out:
         said.append("The diagnosis was left out: the first note says why.")
@@ -137,8 +137,8 @@ def _files(found: WholeTest) -> Section:
 def _check_section(checkup: Checkup) -> Section:
     header = ("severity", "what", "where", "evidence", "what mends it")
     rows = [
-        (one.severity, one.name, one.where, str(one.evidence), str(one.mend))
-        for one in checkup.findings
+        (finding.severity, finding.name, finding.where, str(finding.evidence), str(finding.mend))
+        for finding in checkup.findings
     ]
     text = [f"{_check(checkup).capitalize()}.", *map(str, checkup.notes)]
     return Section("Check", text, tables=[ReportTable(header, rows)] if rows else ())

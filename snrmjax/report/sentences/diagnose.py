@@ -349,7 +349,7 @@ SENTENCES: dict[str, Wording] = {
     "not_physical_without": (
         "without level {levels} the parameters are none that a structure can have."
     ),
-    "fit_not_converged": "the fit of the answer itself had not converged when it ended.",
+    "answer_not_converged": "the fit of the answer itself had not converged when it ended.",
     "effects_not_fitted": lambda *, effects: (
         f"{', '.join(map(effect_name, effects))} could not be fitted: with no starting point does "
         "the model have the measured motions."

@@ -1,12 +1,7 @@
 """What pipelines have to tell beside what their parts tell."""
 
-from snrmjax.measure.recordings.step_counts import StepCounts
 from snrmjax.numerics.status import Status
 from snrmjax.report.sentences import Wording, enumerated
-
-
-def _steps_used(file: str, counts: StepCounts) -> str:
-    return f"{file}: {counts.words}"
 
 
 def _ended(force: float, status: Status) -> str:
@@ -28,6 +23,10 @@ def _equilibria(sensor: str, displacement: tuple[float, ...], stable: tuple[bool
     )
 
 
+def _load(force: float, drive: float | None) -> str:
+    return f"{force:g} N" if drive is None else f"{drive:.5g} V ({force:.4g} N)"
+
+
 def _load_scale(stated: float, coefficient: str, change: float, chosen: float) -> str:
     return (
         f"with `load_scale` = {stated:g} thicknesses the coefficient {coefficient} differs by "
@@ -37,6 +36,7 @@ def _load_scale(stated: float, coefficient: str, change: float, chosen: float) -
 
 
 SENTENCES: dict[str, Wording] = {
+    "load": _load,
     "level_missed_by_curves": (
         "level {level} has its resonance under {force:.4g} N, measured at {frequency_hz:.5g} Hz, "
         "{velocity:.3g} m/s: the curves miss this level."
@@ -64,7 +64,6 @@ SENTENCES: dict[str, Wording] = {
         "no sensor is named in {files}: taken for the model's only one, {sensor}. A column "
         "`sensor`, or `--sensor` of the import, states it."
     ),
-    "steps_used": _steps_used,
     "no_joint_fit": ("curves go through single points, as a joint fit was not possible: {why}"),
     "isolated_searched": (
         "{n} further branches found at {force:g} N, of {n_starts} starts ({n_failed} failed)"
@@ -79,7 +78,7 @@ SENTENCES: dict[str, Wording] = {
     ),
     "mode_not_followed": _not_followed,
     "curve_ended": _ended,
-    "events_not_located": "force {force:g} N: not located: {kinds}.",
+    "curve_events_not_located": "force {force:g} N: not located: {kinds}.",
     "stability_not_computed": (
         "force {force:g} N: the stability of {n} points could not be computed; response.csv has 0 "
         "there and says so in `event`."

@@ -10,7 +10,7 @@ _UNITS = {"velocity": "m/s", "frequency": "Hz"}
 
 def _recommended(*, measurements: Sequence[object]) -> str:
     """Each measurement once: the one that says most of those that begin alike."""
-    texts = [str(one).rstrip(".") for one in measurements]
+    texts = [str(measurement).rstrip(".") for measurement in measurements]
     texts = list(dict.fromkeys(f"{text[0].upper()}{text[1:]}" for text in texts))
     return " ".join(
         f"{text}."

@@ -1,17 +1,14 @@
 """Figures of a study: distributions, main effects, bands of its curves, where members failed."""
 
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from snrmjax.report.study.bands import Band, BandPanel
-from snrmjax.report.study.failures import Failures, failure_share
-from snrmjax.report.study.main_effects import FEWEST, MainEffect
-from snrmjax.report.study.scalars import Display, Scalar, display_on_axis
+from snrmjax.report.sentences.study import readable
+from snrmjax.report.study.words import Display, display_on_axis
 from snrmjax.report.style import (
     COLUMN,
     IDENTIFIED,
@@ -26,20 +23,17 @@ from snrmjax.report.style import (
     panels,
     plain,
 )
+from snrmjax.study.analysis.bands import Band, CurveBands
+from snrmjax.study.analysis.digest import OutputEffects
+from snrmjax.study.analysis.failures import Failures, failure_share
+from snrmjax.study.analysis.outputs import Scalar
+from snrmjax.study.uncertainty.sensitivity import FEWEST
 
 _BINS = 40
 _ROW = 2.3  # inches: the height of a row of panels
 _ACROSS = 3  # panels beside one another
 _DOTS = 400  # of a scatter: more hide one another
 _PALE, _CLOUD = 0.13, 0.35
-_LONGEST = 28  # letters of a legend's name
-
-
-class EffectPanels(NamedTuple):
-    """One output, for every force, and what it does over some varied quantities."""
-
-    outputs: Sequence[Scalar]  # the same output, one for each force
-    effects: Sequence[dict[str, MainEffect | None]]  # of each of these, by quantity
 
 
 def distributions_figure(outputs: Sequence[Sequence[Scalar]]) -> Figure:
@@ -47,8 +41,8 @@ def distributions_figure(outputs: Sequence[Sequence[Scalar]]) -> Figure:
 
     Arguments: each of `outputs` is one output, for every force.
     """
-    figure, every = _grid(len(outputs), _ROW, 0.3)
-    for axes, output in zip(every, outputs, strict=True):
+    figure, grid = _grid(len(outputs), _ROW, 0.3)
+    for axes, output in zip(grid, outputs, strict=True):
         _histogram(axes, output)
     legend(figure)
     return figure
@@ -79,7 +73,7 @@ def _histogram(axes: Axes, output: Sequence[Scalar]) -> None:
         values = one.values[np.isfinite(one.values)] / shown.size
         if not values.size:
             continue
-        name = one.at_force or "members"
+        name = _force(one.force) or "members"
         low, median, high = np.percentile(values, [2.5, 50.0, 97.5])
         drawn: Style = {"color": colour, "alpha": 0.45, "label": name}
         axes.hist(np.clip(values, edges[0], edges[-1]), edges.tolist(), **drawn)
@@ -90,11 +84,11 @@ def _histogram(axes: Axes, output: Sequence[Scalar]) -> None:
     if not output[0].is_count:
         axes.plot([], [], color="0.3", linewidth=LINE, label="median")
         axes.plot([], [], ":", color="0.3", linewidth=0.9, label="95 % range")
-    name_axes(axes, plain(output[0].label), plain(shown.unit), "Members")
+    name_axes(axes, plain(readable(output[0].name)), plain(shown.unit), "Members")
 
 
 def main_effects_figure(
-    shown: Sequence[EffectPanels],
+    shown: Sequence[OutputEffects],
     quantities: dict[str, Float[np.ndarray, " member"]],
     units: dict[str, str],
 ) -> Figure:
@@ -110,7 +104,7 @@ def main_effects_figure(
             _scatter(axes, one, name, quantities[name], (x, y))
             broken = name.replace(".", ".\n", 1) if len(names) > _ACROSS else name
             below = plain(x.labelled(broken)) if k == len(shown) - 1 else ""
-            beside = plain(y.labelled(one.outputs[0].label)) if j == 0 else ""
+            beside = plain(y.labelled(readable(one.outputs[0].name))) if j == 0 else ""
             name_axes(axes, "", below, beside)
             _share(axes, one, name)
             if j:
@@ -123,7 +117,11 @@ def main_effects_figure(
 
 
 def _scatter(
-    axes: Axes, shown: EffectPanels, name: str, quantity: np.ndarray, units: tuple[Display, Display]
+    axes: Axes,
+    shown: OutputEffects,
+    name: str,
+    quantity: np.ndarray,
+    units: tuple[Display, Display],
 ) -> None:
     x, y = units
     chosen = _thinned(len(quantity))
@@ -134,7 +132,7 @@ def _scatter(
         dots: Style = {"linestyle": "none", "marker": ".", "markersize": size, "alpha": alpha}
         values = output.values[chosen] / y.size
         # Where no mean is drawn, the dots alone tell the forces apart.
-        named = output.at_force if effect is None else ""
+        named = _force(output.force) if effect is None else ""
         axes.plot(
             *(quantity[chosen] / x.size, values),
             **dots,
@@ -147,12 +145,12 @@ def _scatter(
         at, mean, error = effect.at / x.size, effect.mean / y.size, effect.error / y.size
         band: Style = {"color": colour, "alpha": 0.35, "linewidth": 0}
         axes.fill_between(at, mean - error, mean + error, **band)
-        named = f"mean {output.at_force}".rstrip()
+        named = f"mean {_force(output.force)}".rstrip()
         axes.plot(at, mean, color=colour, linewidth=1.6, label=named)
     axes.plot([], [], ".", color="0.4", markersize=4.0, label="members")
 
 
-def _share(axes: Axes, shown: EffectPanels, name: str) -> None:
+def _share(axes: Axes, shown: OutputEffects, name: str) -> None:
     """The share of variance above a panel, of the smallest and the largest force."""
     found = [effects[name] for effects in shown.effects]
     shares = [100 * max(one.share, 0.0) for one in found if one is not None]
@@ -163,18 +161,19 @@ def _share(axes: Axes, shown: EffectPanels, name: str) -> None:
     axes.set_title(text, loc="left", fontsize=SMALL, color="0.25")
 
 
-def bands_figure(shown: Sequence[BandPanel]) -> Figure:
+def bands_figure(shown: Sequence[CurveBands]) -> Figure:
     """Bands of curves over all members, a panel for each force or curve."""
-    figure, every = _grid(len(shown), 2.8, 0.4)
+    figure, grid = _grid(len(shown), 2.8, 0.4)
     several = any(panel.lower is not None for panel in shown)
-    for panel, axes in zip(shown, every, strict=True):
+    for panel, axes in zip(shown, grid, strict=True):
         alike = [one.upper.most for one in shown if one.y == panel.y]
-        y = display_on_axis(np.concatenate(alike), panel.y_unit)
-        x = display_on_axis(panel.upper.at, panel.x_unit)
+        y = display_on_axis(np.concatenate(alike), _unit(panel.y))
+        x = display_on_axis(panel.upper.at, _unit(panel.x))
         _band(axes, panel.upper, (x, y), MEASURED, "highest value" if several else "")
         if panel.lower is not None:
             _band(axes, panel.lower, (x, y), IDENTIFIED, "lowest value")
-        name_axes(axes, plain(panel.title), x.labelled(panel.x), y.labelled(panel.y))
+        words = x.labelled(readable(panel.x)), y.labelled(readable(panel.y))
+        name_axes(axes, _force(panel.force), *words)
     legend(figure)
     return figure
 
@@ -200,11 +199,11 @@ def failures_figure(
     Arguments: `quantities` in the order in which they tell failed members from whole ones.
     """
     names = list(quantities)
-    figure, every = _grid(len(names) + 1, 2.6, 0.5)
-    _map(every[0], failures, [quantities[name] for name in names[:2]])
+    figure, grid = _grid(len(names) + 1, 2.6, 0.5)
+    _map(grid[0], failures, [quantities[name] for name in names[:2]])
     second = plain(_named(names[1], units)) if len(names) > 1 else "Number of the member"
-    name_axes(every[0], "Failed members", plain(_named(names[0], units)), second)
-    for axes, name in zip(every[1:], names, strict=True):
+    name_axes(grid[0], "Failed members", plain(_named(names[0], units)), second)
+    for axes, name in zip(grid[1:], names, strict=True):
         found = failure_share(quantities[name], failures.failed)
         middle = 0.5 * (found.edges[1:] + found.edges[:-1])
         shown: Style = {"color": IDENTIFIED, "alpha": 0.35}
@@ -224,28 +223,40 @@ def _map(axes: Axes, failures: Failures, places: Sequence[np.ndarray]) -> None:
     whole = whole[_thinned(len(whole))]
     dots: Style = {"linestyle": "none", "marker": ".", "markersize": 3.0, "markeredgewidth": 0.0}
     axes.plot(x[whole], y[whole], **dots, color="0.7", label="complete")
-    kinds = failures.kinds
+    kinds = list(failures.failed_counts)
     groups = [(kind, [kind]) for kind in kinds[: len(SERIES) - 1]]
     if len(kinds) >= len(SERIES):
         groups.append(("other statuses", kinds[len(SERIES) - 1 :]))
     for (name, those), colour in zip(groups, SERIES, strict=False):
         mine = np.flatnonzero(failures.failed & np.isin(failures.status, those))
         mine = mine[_thinned(len(mine))]
-        label = name if len(name) <= _LONGEST else f"{name[:_LONGEST]} …"
         cross: Style = {"linestyle": "none", "marker": "x", "markersize": 4.0}
-        axes.plot(x[mine], y[mine], **cross, color=colour, label=plain(label))
+        axes.plot(x[mine], y[mine], **cross, color=colour, label=plain(short_name(name)))
 
 
 def counts_figure(counts: Sequence[tuple[str, dict[str, int]]]) -> Figure:
     """How often each answer was given: one panel a question, such as the verdict."""
     figure, (line,) = panels(PAGE if len(counts) > 1 else COLUMN, 2.8, 1, len(counts))
     for axes, (title, found) in zip(line, counts, strict=True):
-        names = [name if len(name) <= _LONGEST else f"{name[:_LONGEST]} …" for name in found]
+        names = [short_name(name) for name in found]
         axes.barh(np.arange(len(found)), list(found.values()), color=MEASURED, alpha=0.6)
         axes.set_yticks(np.arange(len(found)), [plain(name or "none") for name in names])
         axes.invert_yaxis()
         name_axes(axes, title, "Members", "")
     return figure
+
+
+def short_name(name: str, longest: int = 28) -> str:
+    """A status or an answer of at most so many letters."""
+    return name if len(name) <= longest else f"{name[:longest]} …"
+
+
+def _force(force: float | None) -> str:
+    return "" if force is None else f"{force:.4g} N"
+
+
+def _unit(name: str) -> str:
+    return "Hz" if name.endswith("_hz") else "m/s" if name.endswith("_m_s") else ""
 
 
 def _named(name: str, units: dict[str, str]) -> str:

@@ -1,41 +1,42 @@
 """The report of a study: summary.csv, main_effects.csv, figures and one page with all of it."""
 
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 from matplotlib.figure import Figure
 
 from snrmjax.io.files import write_atomically
 from snrmjax.report.html import Report, ReportFigure, ReportTable, Section, number, write_report
-from snrmjax.report.study.bands import SAMPLED, band_panels
-from snrmjax.report.study.digest import (
-    StudyDigest,
-    digest,
-    digest_notes,
-    effects_frame,
-    effects_table,
-    ranked_effects,
-    sampling_method,
-)
-from snrmjax.report.study.failures import most_telling, status_table
-from snrmjax.report.study.scalars import Scalar, display
+from snrmjax.report.sentences.study import readable
 from snrmjax.report.study.study_figures import (
     bands_figure,
     counts_figure,
     distributions_figure,
     failures_figure,
     main_effects_figure,
+    short_name,
 )
-from snrmjax.report.study.summary import summary_frame, summary_table
+from snrmjax.report.study.words import display
 from snrmjax.report.style import printed
+from snrmjax.study.analysis.bands import SAMPLED, curve_bands
+from snrmjax.study.analysis.digest import StudyDigest, digest, effects_frame, ranked_effects
+from snrmjax.study.analysis.failures import most_telling
+from snrmjax.study.analysis.outputs import ScalarSummary, summary_frame
+from snrmjax.study.computations.base import COMPLETE, FORCE, MEMBER
+from snrmjax.study.uncertainty.sensitivity import MainEffect
 
 if TYPE_CHECKING:
+    import pandas
     import xarray
 
+_RANKS = 3  # quantities that the table of main effects has for each output
+_LONGEST = 120  # letters of a status that a table shows
 _ROWS, _COLUMNS = 4, 4  # panels of a figure of main effects
 _PANELS = 12  # of a figure of distributions
-_SPREAD = ("n_folds", "n_isolated", "n_solved")  # counts whose distribution is worth a panel
+_SPREAD = ("n_folds", "n_solved")  # counts whose distribution is worth a panel
 _ANSWERS, _MOST_ANSWERS = ("verdict", "effects"), 12
 _TELLING = 5  # quantities along which failures are drawn
 
@@ -64,65 +65,132 @@ FAILED = (
 def write_study_report(folder: Path, data: "xarray.Dataset") -> StudyDigest:
     """Write summary.csv, main_effects.csv, the figures (PNG) and report.html of a study.
 
-    Returns the study's numbers. Memory does not grow with the curves of the study: they are read
-    block by block.
+    Returns the study's numbers.
     """
     found = digest(data)
-    notes = digest_notes(found, data)
-    summary = summary_frame(found.summaries)
-    write_atomically(folder / "summary.csv", summary.to_csv(index=False, lineterminator="\n"))
-    if found.estimated:
-        table = effects_frame(found.effects).to_csv(index=False, lineterminator="\n")
-        write_atomically(folder / "main_effects.csv", table)
-    sections = [
-        one
-        for one in (
-            _distributions(folder, found),
-            _effects(folder, found),
-            _bands(folder, data),
-            _answers(folder, data),
-            _failures(folder, found, data),
-        )
-        if one is not None
-    ]
-    versions = [
-        (name, str(data.attrs[f"{name}_version"]))
-        for name in ("snrmjax", "jax", "numpy")
-        if f"{name}_version" in data.attrs
-    ]
-    done = [("computed", str(data.attrs.get("computed", ""))), ("members", str(found.n_members))]
-    done += [
-        ("sampling", sampling_method(data)),
-        ("varied", ", ".join(found.quantities)),
-        *versions,
-    ]
+    _write_table(folder / "summary.csv", summary_frame(found.summaries))
+    effects = effects_frame(found)
+    if len(effects):
+        _write_table(folder / "main_effects.csv", effects)
+    sections = (
+        _distributions(folder, found),
+        _effects(folder, found),
+        _bands(folder, data),
+        _answers(folder, data),
+        _failures(folder, found, data),
+    )
+    stated = {
+        "computed": data.attrs.get("computed"),
+        "members": found.n_members,
+        "sampling": found.sampling,
+        "varied": ", ".join(found.quantities),
+        **{name: data.attrs.get(f"{name}_version") for name in ("snrmjax", "jax", "numpy")},
+    }
     report = Report(
         title=f"Study: {data.attrs.get('title', 'study')}",
-        done=[pair for pair in done if pair[1]],
+        done=[(name, str(value)) for name, value in stated.items() if value],
         result=study_sentence(found),
-        notes=notes,
-        sections=sections,
+        notes=[str(fact) for fact in found.facts],
+        sections=[section for section in sections if section is not None],
     )
     write_report(folder / "report.html", report)
     return found
 
 
+def members_ended(found: StudyDigest) -> str:
+    """How many members failed, or have no peak in the range, in one sentence."""
+    outside = found.failures.n_outside
+    failed = found.failures.n_failed - outside
+    text = f"{found.n_members} members, " + (
+        f"of which {failed} failed" if failed else "none failed"
+    )
+    return text + (f"; {outside} have no peak in the range." if outside else ".")
+
+
 def study_sentence(found: StudyDigest) -> str:
     """What a study found, in one or two plain sentences."""
-    for panel in found.effects:
-        last = panel.outputs[-1]  # of the largest force
-        of_last = (last.name, last.at_force)
-        row = next(s for s in found.summaries if (s.scalar.name, s.scalar.at_force) == of_last)
-        shown = display(row.quantiles, last.unit)
-        low, _, median, _, high = (number(v) for v in row.quantiles / shown.size)
-        unit = f" {shown.unit}" if shown.unit else ""
-        text = f"{last.title}: median {median}{unit}, 95 % of the members {low} to {high}{unit}"
-        order = ranked_effects(panel.effects[-1])
+    if not found.effects:
+        return members_ended(found)
+    last, effects = found.effects[0].outputs[-1], found.effects[0].effects[-1]  # the largest force
+    (row,) = (
+        s for s in found.summaries if (s.scalar.name, s.scalar.force) == (last.name, last.force)
+    )
+    shown = display(row.quantiles, last.unit)
+    low, _, median, _, high = (number(v) for v in row.quantiles / shown.size)
+    unit = f" {shown.unit}" if shown.unit else ""
+    title = readable(last.name, last.force)
+    text = f"{title}: median {median}{unit}, 95 % of the members {low} to {high}{unit}"
+    order = ranked_effects(effects)
+    if order:
+        name, one = order[0]
+        text += f"; {name} alone makes {100 * max(one.share, 0.0):.0f} % of its variance"
+    return f"{members_ended(found)} {text}."
+
+
+def summary_table(rows: Sequence[ScalarSummary], caption: str) -> ReportTable:
+    """Of each output: mean, deviation, median, 95 % range, extremes."""
+    header = ("output", "unit", "mean ± 1σ", "median", "95 % range", "min to max", "without value")
+    return ReportTable(header, [_cells(row) for row in rows], caption)
+
+
+def _cells(row: ScalarSummary) -> tuple[str, ...]:
+    ends = np.array([row.least, row.most])
+    shown = display(ends, row.scalar.unit)
+    title = readable(row.scalar.name, row.scalar.force)
+    if row.missing == row.members:
+        return (title, shown.unit, "", "", "", "", f"all {row.members}")
+    low, _, median, _, high = (number(v) for v in row.quantiles / shown.size)
+    least, most = (number(v) for v in ends / shown.size)
+    return (
+        *(title, shown.unit),
+        f"{number(row.mean / shown.size)} ± {number(row.std / shown.size, 2)}",
+        *(median, f"{low} to {high}", f"{least} to {most}"),
+        str(row.missing) if row.missing else "",
+    )
+
+
+def _effects_table(found: StudyDigest) -> ReportTable:
+    """The strongest quantities of every output, and what none of them explains alone."""
+
+    def cell(name: str, one: MainEffect) -> str:
+        return f"{name}: {100 * max(one.share, 0.0):.0f} ± {100 * one.half_width:.0f} %"
+
+    rows = []
+    for output, effects in found.each_effect:
+        order = ranked_effects(effects)
         if order:
-            name, one = order[0]
-            text += f"; {name} alone makes {100 * max(one.share, 0.0):.0f} % of its variance"
-        return f"{found.headline} {text}."
-    return found.headline
+            rest = 1.0 - sum(max(one.share, 0.0) for _, one in order)
+            cells = [cell(*pair) for pair in order[:_RANKS]]
+            cells += [""] * (_RANKS - len(cells))
+            title = readable(output.name, output.force)
+            rows.append((title, *cells, f"{100 * max(rest, 0.0):.0f} %"))
+    return ReportTable(
+        ("output", *(f"{k + 1}." for k in range(_RANKS)), "not by one alone"),
+        rows,
+        "Share of the output's variance that each quantity makes alone (first-order index, ± 95 %),"
+        " the strongest first. The last column is left to interactions and, in tests, to noise. "
+        "All shares are in main_effects.csv.",
+    )
+
+
+def _status_table(found: StudyDigest, data: "xarray.Dataset") -> ReportTable:
+    """How many members ended in which way."""
+    counts = found.failures.counts
+    share = 100 / sum(counts.values())
+    rows = [
+        (
+            *(short_name(name, _LONGEST), str(count), f"{share * count:.3g} %"),
+            "yes" if name in COMPLETE else "no",
+        )
+        for name, count in counts.items()
+    ]
+    each = "members and forces" if FORCE in data["status"].dims else "members"
+    header = ("status", each, "share", "complete")
+    return ReportTable(header, rows, "How the computations ended.")
+
+
+def _write_table(file: Path, table: "pandas.DataFrame") -> None:
+    write_atomically(file, table.to_csv(index=False, lineterminator="\n"))
 
 
 def _saved(folder: Path, name: str, figure: Figure, caption: str) -> ReportFigure:
@@ -132,7 +200,12 @@ def _saved(folder: Path, name: str, figure: Figure, caption: str) -> ReportFigur
 
 
 def _distributions(folder: Path, found: StudyDigest) -> Section:
-    shown = [one for one in found.outputs if _is_drawn(one)]
+    shown = [
+        output
+        for output in found.outputs
+        if (output[0].name in _SPREAD or not output[0].is_count)
+        and any(one.varies for one in output)
+    ]
     figures = []
     for k in range(0, len(shown), _PANELS):
         name = "distributions" if len(shown) <= _PANELS else f"distributions_{k // _PANELS + 1}"
@@ -145,12 +218,6 @@ def _distributions(folder: Path, found: StudyDigest) -> Section:
         if not row.scalar.is_count or (row.varies and row.scalar.name in _SPREAD)
     ]
     return Section("Distributions", (), figures, [summary_table(rows, caption)])
-
-
-def _is_drawn(output: list[Scalar]) -> bool:
-    if output[0].is_count and output[0].name not in _SPREAD:
-        return False
-    return any(one.varies for one in output)
 
 
 def _effects(folder: Path, found: StudyDigest) -> Section | None:
@@ -169,16 +236,17 @@ def _effects(folder: Path, found: StudyDigest) -> Section | None:
         drawn = {name: found.quantities[name] for name in names}
         figure = main_effects_figure(shown, drawn, found.units)
         figures.append(_saved(folder, name, figure, EFFECTS))
-    tables = [effects_table(found.effects)] if found.estimated else []
+    table = _effects_table(found)
+    tables = [table] if table.rows else []
     return Section("Main effects", (), figures, tables)
 
 
 def _bands(folder: Path, data: "xarray.Dataset") -> Section | None:
-    shown = band_panels(data)
+    shown = curve_bands(data)
     if not shown:
         return None
     caption = BANDS
-    if data.sizes["member"] > SAMPLED:
+    if data.sizes[MEMBER] > SAMPLED:
         caption += f" Medians and 95 % are those of {SAMPLED} members, drawn at random."
     return Section("Bands", (), [_saved(folder, "bands", bands_figure(shown), caption)])
 
@@ -192,15 +260,15 @@ def _answers(folder: Path, data: "xarray.Dataset") -> Section | None:
         (name.capitalize(), dict(Counter(data[name].values.astype(str).tolist()).most_common()))
         for name in names
     ]
-    drawn = [(name, dict(list(found.items())[:_MOST_ANSWERS])) for name, found in counts]
-    n = data.sizes["member"]
+    drawn = [(name, dict(list(answers.items())[:_MOST_ANSWERS])) for name, answers in counts]
+    n = data.sizes[MEMBER]
     tables = [
         ReportTable(
             (name.lower(), "members", "share"),
-            [(text or "none", str(k), f"{100 * k / n:.3g} %") for text, k in found.items()],
+            [(text or "none", str(k), f"{100 * k / n:.3g} %") for text, k in answers.items()],
             folded=f"All answers: {name.lower()}",
         )
-        for name, found in counts
+        for name, answers in counts
     ]
     caption = "How often each answer was given over the members."
     figures = [_saved(folder, "answers", counts_figure(drawn), caption)]
@@ -208,7 +276,7 @@ def _answers(folder: Path, data: "xarray.Dataset") -> Section | None:
 
 
 def _failures(folder: Path, found: StudyDigest, data: "xarray.Dataset") -> Section:
-    table = status_table(found.failures, data)
+    table = _status_table(found, data)
     if not found.failures.n_failed:
         return Section("Failures", ("Every member has its whole result.",), (), [table])
     text = f"{found.failures.n_failed} of {found.n_members} members have no whole result."

@@ -60,6 +60,14 @@ class HarmonicBalance(eqx.Module):
         scaled = coefficients.reshape(-1) / self.displacement_scale
         return jnp.append(scaled, frequency / self.frequency_scale)
 
+    def motions(
+        self, points: Float[np.ndarray, "point unknown"]
+    ) -> tuple[Float[np.ndarray, "point coefficient mode"], Float[np.ndarray, " point"]]:
+        """Coefficients (kg^1/2 m) and frequencies (rad/s) of scaled points (x, λ), on the host."""
+        shape = (len(points), self.n_coefficients, self.model.n_modes)
+        coefficients = points[:, :-1].reshape(shape) * np.asarray(self.displacement_scale)
+        return coefficients, points[:, -1] * np.asarray(self.frequency_scale)
+
     def load(self) -> Float[Array, " equation"]:
         """Scaled force of one newton: the right-hand side for `force` = 1."""
         model = self.model
@@ -258,8 +266,10 @@ def resonance_displacement(model: Structure, force: float) -> float:
     omega = np.sqrt(stiffness[j] / mass[j])
     least_damping = 1e-4 * omega
     load = abs(force * participation[j])
-    own = dict(zip(model.potential.monomials, np.asarray(model.potential.coefficient), strict=True))
-    quartic = max(3.0 * float(own.get((j,) * 4, 0.0)), 0.0)
+    values = dict(
+        zip(model.potential.monomials, np.asarray(model.potential.coefficient), strict=True)
+    )
+    quartic = max(3.0 * float(values.get((j,) * 4, 0.0)), 0.0)
     static = float(np.max(np.abs(force * participation / stiffness)))
     if load == 0:
         return static

@@ -5,7 +5,7 @@ sine of every harmonic of τ = Ωt. The force is a cosine, so phasors are relati
 """
 
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -108,47 +108,42 @@ def alias_free_samples(harmonic_order: int, degree: int) -> int:
 
 
 def displacement_phasors(
-    coefficients: Float[Array, "*batch coefficient mode"],
+    coefficients: Float[Array | np.ndarray, "*batch coefficient mode"],
 ) -> Complex[Array, "*batch harmonic mode"]:
     """Phasors X_h of q = Re Σ X_h e^{ihΩt}, h = 0…H, from the real coefficients."""
-    coefficients = jnp.asarray(coefficients)
-    mean = coefficients[..., :1, :].astype(jnp.complex128)
-    return jnp.concatenate(
-        [mean, coefficients[..., 1::2, :] - 1j * coefficients[..., 2::2, :]], axis=-2
-    )
+    xp = _namespace(coefficients)
+    mean, pairs = coefficients[..., :1, :] + 0j, coefficients[..., 2::2, :] * 1j
+    return xp.concatenate([mean, coefficients[..., 1::2, :] - pairs], axis=-2)
 
 
 def velocity_phasors(
-    coefficients: Float[Array, "*batch coefficient mode"],
-    frequency: Float[Array, "*batch"],
-    mode_shape: Float[Array, "sensor mode"],
+    coefficients: Float[Array | np.ndarray, "*batch coefficient mode"],
+    frequency: Float[Array | np.ndarray, "*batch"],
+    mode_shape: Float[Array | np.ndarray, "sensor mode"],
 ) -> Complex[Array, "*batch harmonic sensor"]:
-    """Velocity phasors ihΩ Φ X_h at the sensors, h = 0…H, in m/s."""
-    displacement = displacement_phasors(coefficients)
-    order = jnp.arange(displacement.shape[-2])
-    rate = 1j * order * jnp.asarray(frequency)[..., None]
-    return jnp.einsum("...h,...hm,sm->...hs", rate, displacement, mode_shape)
+    """Velocity phasors ihΩ Φ X_h at the sensors, h = 0…H, in m/s.
 
-
-def velocity_along(
-    coefficients: Float[np.ndarray, "point coefficient mode"],
-    frequency: Float[np.ndarray, " point"],
-    mode_shape: Float[np.ndarray, "sensor mode"],
-) -> Complex[np.ndarray, "point harmonic sensor"]:
-    """`velocity_phasors` along a curve, on the host.
-
-    There a curve is done before a program has its arguments, and no number of points compiles.
+    Of NumPy's arrays on the host: a curve is done there before a program has its arguments, and no
+    number of points compiles.
     """
-    mean, pairs = coefficients[:, :1] + 0j, coefficients[:, 1::2] - 1j * coefficients[:, 2::2]
-    phasors = np.concatenate([mean, pairs], axis=1) @ mode_shape.T
-    return 1j * np.arange(phasors.shape[1])[:, None] * frequency[:, None, None] * phasors
+    displacement = displacement_phasors(coefficients)
+    rate = (
+        1j * np.arange(displacement.shape[-2]) * _namespace(frequency).asarray(frequency)[..., None]
+    )
+    return rate[..., None] * (displacement @ mode_shape.T)
 
 
 def with_sines(
-    cosines: Float[Array, "point order mode"],
-) -> Float[Array, "point coefficient mode"]:
+    cosines: Float[Array | np.ndarray, "*batch order mode"],
+) -> Float[Array, "*batch coefficient mode"]:
     """Mean and cosines with zero sines in between."""
-    pairs = jnp.stack([cosines[:, 1:], jnp.zeros_like(cosines[:, 1:])], axis=2)
-    n_points, n_coefficients, n_modes = cosines.shape
-    flat = pairs.reshape(n_points, 2 * (n_coefficients - 1), n_modes)
-    return jnp.concatenate([cosines[:, :1], flat], axis=1)
+    xp = _namespace(cosines)
+    orders, modes = cosines.shape[-2:]
+    pairs = xp.stack([cosines[..., 1:, :], xp.zeros_like(cosines[..., 1:, :])], axis=-2)
+    flat = pairs.reshape(*cosines.shape[:-2], 2 * (orders - 1), modes)
+    return xp.concatenate([cosines[..., :1, :], flat], axis=-2)
+
+
+def _namespace(values: object) -> Any:
+    """NumPy of values on the host, JAX of others."""
+    return np if isinstance(values, np.ndarray) else jnp

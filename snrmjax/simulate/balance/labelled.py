@@ -1,10 +1,7 @@
-"""Quantities of periodic motions as results label them: names, units, and lines of text."""
-
-from collections import Counter
-from collections.abc import Iterable
+"""Quantities of periodic motions as results label them."""
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Array, Complex
 
 from snrmjax.measure.signals import peak_amplitude
 from snrmjax.numerics.blocks import by_blocks
@@ -12,45 +9,41 @@ from snrmjax.numerics.result import Variable
 
 HERTZ = 2 * np.pi
 _BLOCK = 256  # points whose peaks are found at a time: one size compiles once
+_IN_PHASE, _AHEAD = "in phase with the force", "a quarter period ahead of the force"
 
 
-def motion_variables(
-    frequency: Float[np.ndarray, " point"],
+def fundamental_variables(
     velocity: Complex[np.ndarray, "point harmonic sensor"],
-    sensors: tuple[str, ...],
 ) -> dict[str, Variable]:
-    """Frequency (rad/s) and velocities (m/s) along a curve, by the names of the files' columns."""
-    seen = np.asarray(velocity)
-    fundamental, at = seen[:, 1], ("point", "sensor")
+    """Velocities (m/s) along a curve, by the names of the files' columns."""
+    at, fundamental = ("point", "sensor"), velocity[:, 1]
     return {
-        "point": Variable(("point",), np.arange(len(seen)), "1", "number of the point"),
-        "sensor": Variable(("sensor",), np.array(sensors), "", "sensor"),
-        "frequency_hz": Variable(("point",), np.asarray(frequency) / HERTZ, "Hz", "frequency"),
         "velocity_h1_re_m_s": Variable(
-            at, fundamental.real, "m/s", "velocity fundamental, in phase with the force"
+            at, fundamental.real, "m/s", f"velocity fundamental, {_IN_PHASE}"
         ),
         "velocity_h1_im_m_s": Variable(
-            at, fundamental.imag, "m/s", "velocity fundamental, a quarter period ahead of the force"
+            at, fundamental.imag, "m/s", f"velocity fundamental, {_AHEAD}"
         ),
-        "velocity_peak_m_s": Variable(at, _peaks(seen), "m/s", "largest velocity over a period"),
+        "velocity_peak_m_s": Variable(at, _peaks(velocity), "m/s", "largest over a period"),
     }
 
 
-def range_text(values: Float[np.ndarray, " point"], unit: str, size: float = 1.0) -> str:
-    """The smallest and the largest of some values, in words."""
-    known = np.asarray(values)[np.isfinite(values)] / size
-    if not known.size:
-        return "none"
-    low, high = known.min(), known.max()
-    return f"{low:.4g} {unit}" if low == high else f"{low:.4g} to {high:.4g} {unit}"
+def batch_variables(
+    velocity: Complex[Array, "*batch harmonic sensor"], **others: tuple[object, str, str]
+) -> dict[str, Variable]:
+    """Velocities (m/s) of motions one by one, and other quantities of each: values, unit, meaning.
 
-
-def counted(kinds: Iterable[str]) -> str:
-    """How often each kind comes: "2 folds, 1 peak"."""
-    each = Counter(kinds)
-    return ", ".join(
-        f"{n} {kind.replace('_', ' ')}{'' if n == 1 else 's'}" for kind, n in each.items()
-    )
+    One axis is called `motion`; of several each has a number.
+    """
+    phasors = np.asarray(velocity)
+    axes = tuple(f"batch_{k}" for k in range(phasors.ndim - 2))
+    axes = ("motion",) if len(axes) == 1 else axes
+    wide = (*axes, "harmonic", "sensor_number")
+    return {
+        **{name: Variable(axes, np.asarray(v), *said) for name, (v, *said) in others.items()},
+        "velocity_re_m_s": Variable(wide, phasors.real, "m/s", _IN_PHASE),
+        "velocity_im_m_s": Variable(wide, phasors.imag, "m/s", _AHEAD),
+    }
 
 
 def _peaks(velocity: Complex[np.ndarray, "point harmonic sensor"]) -> np.ndarray:

@@ -1,20 +1,18 @@
 """Bifurcations along curves of periodic motions: where a multiplier crosses the unit circle."""
 
 import itertools
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Complex
+from scipy.optimize import elementwise
 
 from snrmjax.numerics.blocks import taken
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance
-from snrmjax.simulate.continuation.continuation import StepControl
+from snrmjax.simulate.continuation.continuation import StepControl, TracedCurve
 from snrmjax.simulate.continuation.events import (
-    CurvePoints,
     NewPoint,
     inserted,
     points_between,
-    with_missed,
 )
 from snrmjax.simulate.continuation.stability import MARGIN, floquet_multipliers
 
@@ -25,10 +23,10 @@ _CROSSING = 5e-7  # of a step, to which the crossing of the circle is located
 
 def with_bifurcations(
     balance: HarmonicBalance,
-    curve: CurvePoints,
+    curve: TracedCurve,
     multipliers: Complex[np.ndarray, "point multiplier"],
     steps: StepControl,
-) -> CurvePoints:
+) -> TracedCurve:
     """The curve with the points inserted where a multiplier crosses the unit circle.
 
     A real multiplier through −1 is a period doubling, a complex pair a Neimark-Sacker
@@ -48,12 +46,12 @@ def with_bifurcations(
             crossings += [k] if outside[k] != outside[following] else []
             continue
         # At a fold one multiplier crosses +1 anyway; others may cross elsewhere beside it.
-        own = abs(int(beyond_one[following]) - int(beyond_one[k]))
-        if own == 0:
+        of_the_fold = abs(int(beyond_one[following]) - int(beyond_one[k]))
+        if of_the_fold == 0:
             quiet_folds.append(k + 1)
         beside = [m for m in range(k, following) if rest[m] != rest[m + 1]]
         beside_fold += beside
-        crossings += beside or ([following - 1] if own > 1 else [])
+        crossings += beside or ([following - 1] if of_the_fold > 1 else [])
     # Truncated harmonics turn the curve a little beside the place where the motion loses its
     # stability: a crossing of +1 next to a fold without one is the fold's own.
     for fold in quiet_folds:
@@ -76,16 +74,16 @@ def _real_plus(multipliers: np.ndarray, k: int) -> bool:
 
 def _located_bifurcations(
     balance: HarmonicBalance,
-    curve: CurvePoints,
+    curve: TracedCurve,
     crossings: list[int],
     without_one: Bool[np.ndarray, " crossing"],
     steps: StepControl,
-) -> CurvePoints:
+) -> TracedCurve:
     """Where the last multiplier that crosses is on the circle, to a millionth of a step.
 
-    Its modulus is interpolated by secants within the bracket, and two points, one on either side of
-    where it should cross, make the next one. Where it is to be found `without_one`, crossings of
-    +1 do not count.
+    Where it is to be found `without_one`, crossings of +1 do not count.
+    Reference: T. R. Chandrupatla, Adv. Eng. Softw. 28 (1997) 145,
+    doi:10.1016/S0965-9978(96)00051-8.
     """
     member, known = taken(balance, 0), np.asarray(curve.multipliers)
     ends = np.stack([known[crossings], known[np.array(crossings) + 1]])
@@ -98,103 +96,39 @@ def _located_bifurcations(
         radius = np.sort(np.where(free, 0.0, np.abs(rows)), axis=1)
         return radius[np.arange(len(rows)), -last[which]] - (1.0 + MARGIN)
 
-    def trials(shares: np.ndarray, which: np.ndarray) -> list[_Trial]:
+    numbers = np.arange(len(crossings))
+    begin, end = (heights(rows, numbers) for rows in ends)
+
+    def motions(share: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, ...]:
         position = [crossings[e] for e in which.tolist()]
-        owner = [0] * len(position)
-        found, tangents, ok = points_between(
-            balance, [curve], owner, position, shares.tolist(), steps
+        points, tangents, ok = points_between(
+            balance, [curve], [0] * len(position), position, share.tolist(), steps
         )
-        rows = _multipliers_of(member, found)
-        values = heights(rows, which)
-        ok = ok & np.isfinite(values)
-        values = np.where(ok, values, np.nan)
-        parts = zip(shares.tolist(), values.tolist(), ok.tolist(), strict=True)
-        return [_Trial(*part, found[k], tangents[k], rows[k]) for k, part in enumerate(parts)]
+        rows = floquet_multipliers(member.model, *member.motions(points))
+        return points, tangents, rows, ok & np.all(np.isfinite(rows), axis=1)
 
-    every = np.arange(len(crossings))
-    brackets = [
-        _Bracket(_Trial(0.0, float(first)), _Trial(1.0, float(second)))
-        for first, second in zip(*(heights(rows, every) for rows in ends), strict=True)
-    ]
-    while any(bracket.width > _CROSSING for bracket in brackets):
-        open_ones = [e for e, bracket in enumerate(brackets) if bracket.width > _CROSSING]
-        shares = np.array([share for e in open_ones for share in brackets[e].next_shares()])
-        found = trials(shares, np.repeat(open_ones, 2))
-        for k, e in enumerate(open_ones):
-            brackets[e] = brackets[e].narrowed(found[2 * k], found[2 * k + 1])
+    def height(share: np.ndarray, which: np.ndarray) -> np.ndarray:
+        values, inner = np.where(share > 0, end[which], begin[which]), (share > 0) & (share < 1)
+        if inner.any():
+            *_, rows, ok = motions(share[inner], which[inner])
+            # A point that is not found counts as one before the crossing.
+            values[inner] = np.where(ok, heights(rows, which[inner]), begin[which[inner]])
+        return values
+
+    found = elementwise.find_root(
+        *(height, (np.zeros(len(numbers)), np.ones(len(numbers)))),
+        args=(numbers,),
+        tolerances={"xatol": _CROSSING, "xrtol": 0.0, "fatol": 0.0, "frtol": 0.0},
+    )
+    points, tangents, rows, ok = motions(found.x, numbers)
     new = []
-    for k, bracket in zip(crossings, brackets, strict=True):
-        best = min((bracket.low, bracket.high), key=lambda t: (not t.ok, abs(t.height)))
-        if best.ok:
-            kind = _crossing_kind(best.multipliers)
-            new.append(NewPoint(0, k, best.point, best.tangent, kind, best.multipliers))
+    for e, k in enumerate(crossings):
+        if ok[e] and found.success[e]:
+            kind = _crossing_kind(rows[e])
+            new.append(NewPoint(0, k, points[e], tangents[e], kind, rows[e]))
         else:
-            curve = with_missed(curve, "bifurcation")
+            curve = curve._replace(not_located=(*curve.not_located, "bifurcation"))
     return inserted([curve], new)[0]
-
-
-class _Trial(NamedTuple):
-    """A point of an interval, and how far a multiplier is beyond the circle there."""
-
-    share: float  # of the way through the interval
-    height: float
-    ok: bool = False  # whether the point was found
-    point: np.ndarray = np.zeros(0)
-    tangent: np.ndarray = np.zeros(0)
-    multipliers: np.ndarray = np.zeros(0)
-
-
-class _Bracket(NamedTuple):
-    """Two points between which a multiplier crosses the circle, and the nearest one outside."""
-
-    low: _Trial
-    high: _Trial
-    beside: _Trial | None = None
-    slow: bool = False  # whether the last estimate hardly narrowed it
-
-    @property
-    def width(self) -> float:
-        """Share of the interval between both."""
-        return self.high.share - self.low.share
-
-    def next_shares(self) -> tuple[float, float]:
-        """Where to look next: on both sides of the estimate, or at thirds."""
-        low, high, width = self.low.share, self.high.share, self.width
-        if self.slow or not np.isfinite(self.high.height - self.low.height):
-            return low + width / 3, high - width / 3
-        middle, reach = self._estimate(), max(0.05 * width**2, 0.45 * _CROSSING)
-        middle = min(max(middle, low + 2 * reach), high - 2 * reach)
-        return middle - reach, middle + reach
-
-    def _estimate(self) -> float:
-        """The zero of the secant, or of the parabola through three heights, in the share."""
-        x0, f0, x1, f1 = *self.low[:2], *self.high[:2]
-        secant = x0 - f0 * (x1 - x0) / (f1 - f0)
-        if self.beside is None:
-            return secant
-        x2, f2 = self.beside[:2]
-        slope = (f1 - f0) / (x1 - x0)
-        bend = ((f2 - f1) / (x2 - x1) - slope) / (x2 - x0)
-        # Newton's form: f0 + (x − x0)(slope + bend (x − x1)); one step from the secant's zero.
-        value = f0 + (secant - x0) * (slope + bend * (secant - x1))
-        steep = slope + bend * (2 * secant - x0 - x1)
-        better = secant - value / steep if steep != 0 else secant
-        return better if x0 < better < x1 else secant
-
-    def narrowed(self, first: _Trial, second: _Trial) -> "_Bracket":
-        """The part of the three in which the sign changes first; unknown points count as low."""
-        below = self.low.height <= 0
-        row = [self.low, first, second, self.high]
-        over = [t.ok and (t.height <= 0) != below for t in row[1:3]] + [True]
-        k = over.index(True)
-        low, high = row[k], row[k + 1]
-        others = [t for t in row if t is not low and t is not high and np.isfinite(t.height)]
-        if self.beside is not None:
-            others.append(self.beside)
-        middle = 0.5 * (low.share + high.share)
-        beside = min(others, key=lambda t: abs(t.share - middle))
-        slow = not self.slow and high.share - low.share > 0.25 * self.width
-        return _Bracket(low, high, beside, slow)
 
 
 def _outside(multipliers: np.ndarray) -> np.ndarray:
@@ -209,14 +143,6 @@ def _beyond_one(multipliers: np.ndarray) -> np.ndarray:
 def _is_beyond_one(multipliers: np.ndarray) -> np.ndarray:
     real = np.abs(multipliers.imag) < 1e-9 * np.abs(multipliers)
     return real & (multipliers.real > 1.0 + MARGIN)
-
-
-def _multipliers_of(balance: HarmonicBalance, points: np.ndarray) -> np.ndarray:
-    size = (balance.n_coefficients, balance.model.n_modes)
-    x = points[:, :-1].reshape(-1, *size) * np.asarray(balance.displacement_scale)
-    return floquet_multipliers(
-        balance.model, x, points[:, -1] * np.asarray(balance.frequency_scale)
-    )
 
 
 def _crossing_kind(multipliers: Complex[np.ndarray, " multiplier"]) -> str:

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Complex, Float, Int
 
 from snrmjax.numerics.status import Status
 
@@ -80,6 +80,33 @@ class Curve(NamedTuple):
     n_points: Int[Array, ""]
     status: Int[Array, ""]
     n_solves: Int[Array, ""]  # linear systems factorised on the way
+
+
+class TracedCurve(NamedTuple):
+    """Points along one curve and what was found at them, on the host."""
+
+    points: Float[np.ndarray, "point unknown"]
+    tangents: Float[np.ndarray, "point unknown"]
+    status: CurveStatus = CurveStatus.UPPER_END
+    n_solves: int = 0
+    labels: tuple[str, ...] = ()  # events at the points; none before they were looked for
+    not_located: tuple[str, ...] = ()  # kinds of the events whose place was not found
+    multipliers: Complex[np.ndarray, "point multiplier"] | None = None
+
+    def reversed(self) -> "TracedCurve":
+        """The same curve in the opposite order, without its events."""
+        end = {
+            CurveStatus.LOWER_END: CurveStatus.UPPER_END,
+            CurveStatus.UPPER_END: CurveStatus.LOWER_END,
+        }.get(self.status, self.status)
+        return TracedCurve(self.points[::-1], -self.tangents[::-1], end, self.n_solves)
+
+
+def on_host(curve: Curve) -> TracedCurve:
+    """A curve without its unused rows."""
+    n = int(curve.n_points)
+    points, tangents = (np.asarray(rows)[:n].copy() for rows in (curve.points, curve.tangents))
+    return TracedCurve(points, tangents, CurveStatus(int(curve.status)), int(curve.n_solves))
 
 
 class Correction(NamedTuple):

@@ -22,9 +22,10 @@ from snrmjax.simulate.continuation.continuation import (
     CurveRange,
     CurveStatus,
     StepControl,
+    TracedCurve,
+    on_host,
     trace_curve,
 )
-from snrmjax.simulate.continuation.response_curve import TracedCurve
 
 _BLOCK = 8  # curves that one program traces
 
@@ -103,16 +104,8 @@ def trace_through(
 
 def _trimmed(curve: Curve, count: int) -> list[TracedCurve]:
     """The first `count` curves without their unused rows, on the host."""
-    points, tangents, n_points, status, n_solves = (np.asarray(a) for a in curve)
-    return [
-        TracedCurve(
-            points[k, : n_points[k]].copy(),
-            tangents[k, : n_points[k]].copy(),
-            CurveStatus(int(status[k])),
-            int(n_solves[k]),
-        )
-        for k in range(count)
-    ]
+    rows = [np.asarray(part) for part in curve]
+    return [on_host(Curve(*(part[k] for part in rows))) for k in range(count)]
 
 
 @compiled
@@ -121,7 +114,7 @@ def _ramped(
 ) -> tuple[Float[Array, "member unknown"], Bool[Array, " member"]]:
     """Starts from the response at the lower frequency to a force that rises from zero."""
 
-    def one(balance: HarmonicBalance) -> tuple[Array, Array]:
+    def ramped(balance: HarmonicBalance) -> tuple[Array, Array]:
         load = balance.force * balance.load()
         frequency = ends[0] / balance.frequency_scale
 
@@ -137,7 +130,7 @@ def _ramped(
         last = curve.points[jnp.maximum(curve.n_points - 1, 0)]
         return last.at[-1].set(frequency), curve.status == int(CurveStatus.UPPER_END)
 
-    return mapped(one, balances)
+    return mapped(ramped, balances)
 
 
 @compiled
@@ -154,7 +147,7 @@ def _trace(
     Those not wanted do not start.
     """
 
-    def one(balance: HarmonicBalance, wanted: Array, start: Array | None = None) -> Curve:
+    def traced(balance: HarmonicBalance, wanted: Array, start: Array | None = None) -> Curve:
         if start is None:
             begin = jnp.where(downward, ends[1], ends[0])
             order = balance.harmonic_order
@@ -171,4 +164,4 @@ def _trace(
             groups=(balance.n_coefficients, balance.model.n_modes),
         )
 
-    return mapped(one, balances, wanted, *(() if starts is None else (starts,)))
+    return mapped(traced, balances, wanted, *(() if starts is None else (starts,)))

@@ -1,17 +1,16 @@
 """Folds, peaks and phase resonances along curves of periodic motions."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Float
+from jaxtyping import Array, Bool, Float
 
 from snrmjax.numerics.blocks import mapped, taken
 from snrmjax.numerics.compiled import compiled
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance
-from snrmjax.simulate.continuation.continuation import StepControl, correct
+from snrmjax.simulate.continuation.continuation import StepControl, TracedCurve, correct
 from snrmjax.simulate.continuation.event_location import LocatedEvent, locate_event
 
 EVENT_KINDS = ("fold", "peak", "phase_resonance")
@@ -19,36 +18,35 @@ _BLOCK = 8  # intervals that one call works on
 _INSIDE = 7  # points inside an interval that is looked at more closely
 
 
-class CurvePoints(NamedTuple):
-    """Points along one curve and what was found at them, on the host."""
+def velocities_along(
+    balance: HarmonicBalance,
+    points: Float[Array | np.ndarray, "*point unknown"],
+    tangents: Float[Array | np.ndarray, "*point unknown"],
+) -> tuple[Float[Array, "*point 4"], Float[Array, "*point 4"]]:
+    """What events are told by, and its slopes in arclength: of one point or of many.
 
-    points: Float[np.ndarray, "point unknown"]
-    tangents: Float[np.ndarray, "point unknown"]
-    labels: tuple[str, ...]
-    not_located: tuple[str, ...] = ()  # kinds of the events whose place was not found
-    multipliers: Complex[np.ndarray, "point multiplier"] | None = None
-
-
-def mode_velocity(balance: HarmonicBalance, point: Array) -> Complex[Array, ""]:
-    """Phasor of the velocity fundamental of the mode of interest, scaled."""
-    modes = balance.model.modes
-    x = point[:-1].reshape(balance.n_coefficients, -1)[:, modes.mode_of_interest]
+    λ, |velocity fundamental|² at the first sensor, and of the mode of interest its parts a quarter
+    period ahead of the force and in phase with it, all scaled. Of NumPy's arrays on the host: for a
+    few hundred points that is done before a program would have its arguments.
+    """
+    xp: Any = np if isinstance(points, np.ndarray) else jnp
+    modes, j = balance.model.modes, balance.model.modes.mode_of_interest
+    shape = modes.mode_shape[0] / xp.max(xp.abs(modes.mode_shape[0]))
+    sign = xp.sign(modes.participation[j])
+    size = (*points.shape[:-1], balance.n_coefficients, balance.model.n_modes)
+    pairs, turns = (rows[..., :-1].reshape(size)[..., 1:3, :] for rows in (points, tangents))
+    omega, faster = points[..., -1], tangents[..., -1]
+    seen, change = pairs @ shape, turns @ shape
+    square = xp.sum(seen**2, axis=-1)
+    growth = 2 * omega * (faster * square + omega * xp.sum(seen * change, axis=-1))
+    # The velocity is Ω (sine + i cosine).
+    modal, rate = sign * pairs[..., j], sign * turns[..., j]
+    parts = omega[..., None] * modal
+    slopes = faster[..., None] * modal + omega[..., None] * rate
     return (
-        1j * point[-1] * (x[1] - 1j * x[2]) * jnp.sign(modes.participation[modes.mode_of_interest])
+        xp.concatenate([xp.stack([omega, omega**2 * square], axis=-1), parts], axis=-1),
+        xp.concatenate([xp.stack([faster, growth], axis=-1), slopes], axis=-1),
     )
-
-
-def sensor_velocity(balance: HarmonicBalance, point: Array) -> Float[Array, ""]:
-    """|velocity fundamental|² at the first sensor, scaled."""
-    shape = balance.model.modes.mode_shape[0]
-    x = point[:-1].reshape(balance.n_coefficients, -1) @ shape
-    return point[-1] ** 2 * (x[1] ** 2 + x[2] ** 2) / jnp.max(jnp.abs(shape)) ** 2
-
-
-def test_values(balance: HarmonicBalance, point: Array, tangent: Array) -> Float[Array, " kind"]:
-    """Functions that vanish at a fold, at a peak and at a phase resonance."""
-    slope = jax.jvp(lambda p: sensor_velocity(balance, p), (point,), (tangent,))[1]
-    return jnp.stack([tangent[-1], slope, mode_velocity(balance, point).imag])
 
 
 @compiled
@@ -61,15 +59,16 @@ def _locate(
     wanted: Array,
     steps: StepControl,
 ) -> LocatedEvent:
-    def one(balance: HarmonicBalance, *row: Array) -> LocatedEvent:
+    def located(balance: HarmonicBalance, *row: Array) -> LocatedEvent:
         kind, here, tangent, there, wanted = row
 
         def test(point: Array, direction: Array) -> Array:
-            return test_values(balance, point, direction)[kind]
+            heights, slopes = velocities_along(balance, point, direction)
+            return jnp.stack([slopes[0], slopes[1], heights[2]])[kind]
 
         return locate_event(balance.linearised, test, here, tangent, there, steps, wanted)
 
-    return mapped(one, balances, kind, here, tangent, there, wanted)
+    return mapped(located, balances, kind, here, tangent, there, wanted)
 
 
 @compiled
@@ -88,7 +87,7 @@ def _between(
     Guessed by the cubic through both neighbours with their tangents.
     """
 
-    def one(balance: HarmonicBalance, *row: Array) -> tuple:
+    def corrected(balance: HarmonicBalance, *row: Array) -> tuple:
         here, tangent, there, arriving, share, wanted = row
         length = tangent @ (there - here)
         chord = there - here
@@ -100,7 +99,7 @@ def _between(
         found = correct(balance.linearised, guess, tangent, steps.tolerance, patience)
         return found.point, found.tangent, found.converged
 
-    return mapped(one, balances, here, tangent, there, arriving, share, wanted)
+    return mapped(corrected, balances, here, tangent, there, arriving, share, wanted)
 
 
 def _in_blocks(
@@ -124,8 +123,8 @@ def _in_blocks(
 
 
 def with_events(
-    balances: HarmonicBalance, curves: list[CurvePoints], steps: StepControl
-) -> list[CurvePoints]:
+    balances: HarmonicBalance, curves: list[TracedCurve], steps: StepControl
+) -> list[TracedCurve]:
     """The curves with their folds, peaks and phase resonances inserted.
 
     Those that could not be located are named in `not_located`.
@@ -135,14 +134,18 @@ def with_events(
     A peak is a maximum of the velocity fundamental at the first sensor; a phase resonance has
     the velocity in phase with the force.
     """
-    known = [_heights(balances, number, curve) for number, curve in enumerate(curves)]
+
+    def heights_of(number: int, curve: TracedCurve) -> tuple:
+        return velocities_along(taken(balances, number), curve.points, curve.tangents)
+
+    known = [heights_of(number, curve) for number, curve in enumerate(curves)]
     divided = _divided(balances, curves, known, steps)
     owner, kind, position = [], [], []
     for number, curve in enumerate(divided):
         if len(curve.points) < 2:
             continue
         same = curve is curves[number]
-        heights, slopes = known[number] if same else _heights(balances, number, curve)
+        heights, slopes = known[number] if same else heights_of(number, curve)
         values = np.stack([slopes[:, 0], slopes[:, 1], heights[:, 2]], axis=1)
         change = np.signbit(values[:-1]) != np.signbit(values[1:])
         # A peak is a maximum: the slope falls through zero. A phase resonance has Re V > 0.
@@ -154,13 +157,13 @@ def with_events(
         position += where.tolist()
     if not owner:
         return divided
-    here = np.stack([divided[o].points[k] for o, k in zip(owner, position, strict=True)])
-    ahead = np.stack([divided[o].tangents[k] for o, k in zip(owner, position, strict=True)])
-    there = np.stack([divided[o].points[k + 1] for o, k in zip(owner, position, strict=True)])
+    here, ahead, there, _ = _neighbours(divided, owner, position)
     rows = (np.array(kind), here, ahead, there)
     found, tangents, resolved, missed = _in_blocks(_locate, balances, np.array(owner), rows, steps)
     for e in np.flatnonzero(missed).tolist():
-        divided[owner[e]] = with_missed(divided[owner[e]], EVENT_KINDS[kind[e]])
+        curve = divided[owner[e]]
+        missed_too = (*curve.not_located, EVENT_KINDS[kind[e]])
+        divided[owner[e]] = curve._replace(not_located=missed_too)
     new = [
         NewPoint(owner[e], position[e], found[e], tangents[e], EVENT_KINDS[kind[e]])
         for e in np.flatnonzero(resolved).tolist()
@@ -168,37 +171,9 @@ def with_events(
     return inserted(divided, new)
 
 
-def _heights(
-    balances: HarmonicBalance, number: int, curve: CurvePoints
-) -> tuple[np.ndarray, np.ndarray]:
-    """λ, sensor velocity and both parts of the mode's velocity, and their slopes in arclength.
-
-    What `sensor_velocity` and `mode_velocity` say, on the host: for a few hundred points that is
-    done before a program would have its arguments.
-    """
-    modes, j = balances.model.modes, balances.model.modes.mode_of_interest
-    shape = np.asarray(modes.mode_shape)[number, 0]
-    sign = np.sign(np.asarray(modes.participation)[number, j])
-    size = (len(curve.points), balances.n_coefficients, len(shape))
-    x, dx = (a[:, :-1].reshape(size) for a in (curve.points, curve.tangents))
-    omega, domega = curve.points[:, -1], curve.tangents[:, -1]
-    shape = shape / np.max(np.abs(shape))
-    (a, b), (da, db) = ((part[:, 1:3] @ shape).T for part in (x, dx))
-    own, down = sign * x[:, 1:3, j], sign * dx[:, 1:3, j]  # the velocity is Ω(sine + i cosine)
-    square = a**2 + b**2
-    heights = (omega, omega**2 * square, omega * own[:, 0], omega * own[:, 1])
-    slopes = (
-        domega,
-        2 * omega * domega * square + 2 * omega**2 * (a * da + b * db),
-        domega * own[:, 0] + omega * down[:, 0],
-        domega * own[:, 1] + omega * down[:, 1],
-    )
-    return np.stack(heights, axis=1), np.stack(slopes, axis=1)
-
-
 def _divided(
-    balances: HarmonicBalance, curves: list[CurvePoints], known: list[tuple], steps: StepControl
-) -> list[CurvePoints]:
+    balances: HarmonicBalance, curves: list[TracedCurve], known: list[tuple], steps: StepControl
+) -> list[TracedCurve]:
     """The curves with points added where two events may lie between neighbours."""
     owner, position, share = [], [], []
     for number, curve in enumerate(curves):
@@ -225,22 +200,28 @@ def _divided(
 
 def points_between(
     balances: HarmonicBalance,
-    curves: list[CurvePoints],
+    curves: list[TracedCurve],
     owner: list,
     position: list,
     share: list,
     steps: StepControl,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points at shares of the way to the next one, their tangents, and whether they were found."""
-    pairs = list(zip(owner, position, strict=True))
-    here = np.stack([curves[o].points[k] for o, k in pairs])
-    ahead = np.stack([curves[o].tangents[k] for o, k in pairs])
-    there = np.stack([curves[o].points[k + 1] for o, k in pairs])
-    arriving = np.stack([curves[o].tangents[k + 1] for o, k in pairs])
-    rows = (here, ahead, there, arriving, np.array(share))
+    neighbours = _neighbours(curves, owner, position)
+    ahead, rows = neighbours[1], (*neighbours, np.array(share))
     found, tangents, ok = _in_blocks(_between, balances, np.array(owner), rows, steps)
     turned = np.einsum("ku,ku->k", tangents, ahead) < 0
     return found, np.where(turned[:, None], -tangents, tangents), ok
+
+
+def _neighbours(curves: list[TracedCurve], owner: list, position: list) -> tuple[np.ndarray, ...]:
+    """Points and tangents at positions on curves, then those behind them."""
+    pairs = list(zip(owner, position, strict=True))
+    return tuple(
+        np.stack([(curves[o].points, curves[o].tangents)[which][k + ahead] for o, k in pairs])
+        for ahead in (0, 1)
+        for which in (0, 1)
+    )
 
 
 def _slope_may_vanish_twice(
@@ -286,7 +267,7 @@ class NewPoint(NamedTuple):
     multipliers: np.ndarray | None = None
 
 
-def inserted(curves: list[CurvePoints], new: list[NewPoint]) -> list[CurvePoints]:
+def inserted(curves: list[TracedCurve], new: list[NewPoint]) -> list[TracedCurve]:
     """The curves with new points put in their places, in order along each step."""
     result = list(curves)
     for number in sorted({e.owner for e in new}):
@@ -310,8 +291,3 @@ def inserted(curves: list[CurvePoints], new: list[NewPoint]) -> list[CurvePoints
             multipliers=multipliers,
         )
     return result
-
-
-def with_missed(curve: CurvePoints, kind: str) -> CurvePoints:
-    """The curve with one more event that was not located."""
-    return curve._replace(not_located=(*curve.not_located, kind))

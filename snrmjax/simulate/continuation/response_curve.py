@@ -1,7 +1,8 @@
-"""One forced response as a curve, with its events, multipliers and how it ended."""
+"""Curves of periodic motions as results: nonlinear modes, forced responses and their events."""
 
-from collections.abc import Sequence
-from typing import ClassVar, NamedTuple
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -10,23 +11,51 @@ from jaxtyping import Bool, Complex, Float, Int
 
 from snrmjax.numerics.blocks import by_blocks, over_cores, taken
 from snrmjax.numerics.compiled import compiled
-from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, truncation_error
-from snrmjax.simulate.balance.harmonics import velocity_along
-from snrmjax.simulate.balance.labelled import HERTZ, counted, motion_variables, range_text
+from snrmjax.simulate.balance.harmonics import velocity_phasors, with_sines
+from snrmjax.simulate.balance.labelled import HERTZ, fundamental_variables
 from snrmjax.simulate.continuation.bifurcations import with_bifurcations
-from snrmjax.simulate.continuation.continuation import CurveStatus, StepControl
-from snrmjax.simulate.continuation.events import CurvePoints, with_events
+from snrmjax.simulate.continuation.continuation import CurveStatus, StepControl, TracedCurve
+from snrmjax.simulate.continuation.events import with_events
 from snrmjax.simulate.continuation.stability import (
     Stability,
-    StabilityLoss,
     floquet_multipliers,
-    stability_loss,
     stability_of,
 )
 
 
-class ResponseCurve(AbstractResult):
+class MotionCurve(AbstractResult):
+    """Periodic motions in order along a curve."""
+
+    coordinates: ClassVar[tuple[str, ...]] = ("sensor", "frequency_hz")
+
+    coefficients: Float[np.ndarray, "point coefficient mode"]  # kg^1/2 m
+    velocity: Complex[np.ndarray, "point harmonic sensor"]  # m/s, h = 0…H
+    frequency: Float[np.ndarray, " point"] = quantity("point", "Hz", "frequency")
+    status: CurveStatus = setting()
+    sensors: tuple[str, ...] = quantity("sensor", "", "sensor", name="sensor", static=True)
+
+    def variables(self) -> dict[str, Variable]:
+        """The quantities of the curve, and its velocities by the names of the files' columns."""
+        return {**super().variables(), **fundamental_variables(self.velocity)}
+
+    def point(self, k: int) -> tuple[np.ndarray, np.ndarray]:
+        """Coefficients (kg^1/2 m) and frequency (rad/s) of a point: a start for other solvers."""
+        return self.coefficients[k], self.frequency[k]
+
+
+def motions_of(balance: HarmonicBalance, points: Float[np.ndarray, "point unknown"]) -> dict:
+    """What a `MotionCurve` has of scaled points: frequency, coefficients, velocity, sensors."""
+    coefficients, frequency = balance.motions(points)
+    modes = balance.model.modes
+    whole = with_sines(coefficients) if balance.cosine_only else coefficients
+    velocity = velocity_phasors(whole, frequency, np.asarray(modes.mode_shape))
+    named = {"frequency": frequency, "coefficients": coefficients, "velocity": velocity}
+    return {**named, "sensors": modes.sensors}
+
+
+class ResponseCurve(MotionCurve):
     """One forced response in order along the curve, unstable parts included.
 
     `truncation` estimates the share of the velocity that the harmonics left out would have: a
@@ -34,20 +63,16 @@ class ResponseCurve(AbstractResult):
     `multipliers` and `truncation` are None, and the stability of every point is `NOT_COMPUTED`.
     """
 
-    coordinates: ClassVar[tuple[str, ...]] = ("point", "sensor", "frequency_hz")
-
-    force: float  # N
-    frequency: Float[np.ndarray, " point"]  # rad/s
-    coefficients: Float[np.ndarray, "point coefficient mode"]  # kg^1/2 m
-    velocity: Complex[np.ndarray, "point harmonic sensor"]  # m/s, h = 0…H
-    event: tuple[str, ...]  # "" or what happens at the point; see `forced_response`
-    status: CurveStatus
-    sensors: tuple[str, ...]
+    force: float = setting()  # N
+    event: tuple[str, ...] = quantity(  # "" or what happens at the point; see `forced_response`
+        "point", "", "what happens there", static=True
+    )
     multipliers: Complex[np.ndarray, "point multiplier"] | None = None  # None: not asked for
     truncation: Float[np.ndarray, " point"] | None = None  # estimated, like `multipliers`
-    not_located: tuple[str, ...] = ()  # kinds of events that are there but were not located
-    branch: str = "main"  # "main", or how an isolated one was reached
-    n_solves: int = 0  # linear systems factorised to trace the curve
+    # Kinds of events that are there but were not located.
+    not_located: tuple[str, ...] = setting(default=())
+    branch: str = setting(default="main")  # or how an isolated one was reached
+    n_solves: int = setting(default=0)  # linear systems factorised to trace the curve
 
     @property
     def stability(self) -> Int[np.ndarray, " point"]:
@@ -66,20 +91,9 @@ class ResponseCurve(AbstractResult):
         """Which points are known to be unstable."""
         return self.stability == int(Stability.UNSTABLE)
 
-    @property
-    def stability_loss(self) -> tuple[StabilityLoss, ...]:
-        """By which kind of multiplier each point is unstable."""
-        if self.multipliers is None:
-            return (StabilityLoss.NOT_COMPUTED,) * len(self.frequency)
-        return stability_loss(self.multipliers)
-
     def at_events(self, kind: str) -> np.ndarray:
         """Indices of the points at which an event of this kind was located."""
         return np.array([k for k, e in enumerate(self.event) if kind in e.split("+")], dtype=int)
-
-    def point(self, k: int) -> tuple[np.ndarray, np.ndarray]:
-        """Coefficients (kg^1/2 m) and frequency (rad/s) of a point: a start for other solvers."""
-        return self.coefficients[k], self.frequency[k]
 
     def summary(self) -> tuple[str, ...]:
         """Force, range, largest velocity, stability, events and status."""
@@ -89,62 +103,35 @@ class ResponseCurve(AbstractResult):
         if n:
             height = np.abs(self.velocity[:, 1])
             k, r = np.unravel_index(np.argmax(height), height.shape)
-            events = counted(kind for e in self.event for kind in e.split("+") if kind)
+            hertz = self.frequency / HERTZ
+            events = _counted(kind for e in self.event for kind in e.split("+") if kind)
             lines += [
-                f"frequency {range_text(self.frequency, 'Hz', HERTZ)}",
+                f"frequency {hertz.min():.4g} to {hertz.max():.4g} Hz",
                 f"velocity fundamental up to {height[k, r]:.4g} m/s at"
-                f" {self.frequency[k] / HERTZ:.5g} Hz, sensor {self.sensors[r]}",
-                f"stability: {_stability_text(self.stability)}",
+                f" {hertz[k]:.5g} Hz, sensor {self.sensors[r]}",
+                f"stability: {_counted(Stability(s).name.lower() for s in self.stability)}",
                 f"events: {events or 'none'}",
             ]
         if self.not_located:
-            lines.append(f"not located: {counted(self.not_located)}")
+            lines.append(f"not located: {_counted(self.not_located)}")
         return (*lines, f"status: {self.status.message}")
 
     def variables(self) -> dict[str, Variable]:
-        """Frequency, velocity, stability and events, by the names of `response.csv`."""
-        at = ("point",)
-        named = motion_variables(self.frequency, self.velocity, self.sensors)
+        """Those of the curve, stability and truncation."""
+        at, named = ("point",), super().variables()
         named["stability"] = Variable(
             at, self.stability, "1", "1 stable, 0 unstable, -1 not computed"
         )
-        named["event"] = Variable(at, np.array(self.event, dtype=str), "", "what happens there")
         if self.truncation is not None:
             text = "estimated share of the velocity in harmonics left out"
             named["truncation"] = Variable(at, self.truncation, "1", text)
         return named
 
-    def attributes(self) -> dict[str, str | float | int]:
-        """Force, branch and status."""
-        return {
-            "force_n": self.force,
-            "branch": self.branch,
-            "status": self.status.name.lower(),
-            "not_located": counted(self.not_located),
-        }
 
-
-def _stability_text(stability: Int[np.ndarray, " point"]) -> str:
-    """How many points are stable, unstable and not computed."""
-    counts = [(kind, int(np.sum(stability == int(kind)))) for kind in reversed(Stability)]
-    return ", ".join(f"{n} {kind.name.lower().replace('_', ' ')}" for kind, n in counts if n)
-
-
-class TracedCurve(NamedTuple):
-    """A curve as the continuation left it, trimmed, on the host."""
-
-    points: Float[np.ndarray, "point unknown"]
-    tangents: Float[np.ndarray, "point unknown"]
-    status: CurveStatus
-    n_solves: int
-
-    def reversed(self) -> "TracedCurve":
-        """The same curve in the opposite order."""
-        end = {
-            CurveStatus.LOWER_END: CurveStatus.UPPER_END,
-            CurveStatus.UPPER_END: CurveStatus.LOWER_END,
-        }.get(self.status, self.status)
-        return TracedCurve(self.points[::-1], -self.tangents[::-1], end, self.n_solves)
+def _counted(kinds: Iterable[str]) -> str:
+    """How often each kind comes, once for many and once for one: "2 folds, 1 peak"."""
+    each = [(kind.replace("_", " "), n) for kind, n in Counter(kinds).items()]
+    return ", ".join(f"{n} {kind}" for kind, n in each)
 
 
 def assembled(
@@ -159,57 +146,35 @@ def assembled(
 
     Arguments: `balances` stacked, one for every curve; `steps` with which they were traced.
     """
-    labelled = [CurvePoints(c.points, c.tangents, ("",) * len(c.points)) for c in curves]
-    labelled = with_events(balances, labelled, steps)
+    labelled = with_events(
+        balances, [c._replace(labels=("",) * len(c.points)) for c in curves], steps
+    )
 
     def finished(number: int) -> ResponseCurve:
-        balance = taken(balances, number)
-        curve = labelled[number]
+        balance, curve, truncation = taken(balances, number), labelled[number], None
         if stability:
-            multipliers = _multipliers(balance, curve)
-            one = jax.tree.map(lambda a: np.asarray(a)[None] if eqx.is_array(a) else a, balance)
-            curve = with_bifurcations(one, curve, multipliers, steps)
-        return _response(balance, curve, curves[number], branch)
+            multipliers = floquet_multipliers(balance.model, *balance.motions(curve.points))
+            stacked = jax.tree.map(lambda a: np.asarray(a)[None] if eqx.is_array(a) else a, balance)
+            curve = with_bifurcations(stacked, curve, multipliers, steps)
+        motions = motions_of(balance, curve.points)
+        if stability:
+            (truncation,) = by_blocks(
+                lambda x, w: (_truncation(balance, x, w),),
+                *(32, motions["coefficients"], motions["frequency"]),
+            )
+        return ResponseCurve(
+            **motions,
+            force=float(balance.force),
+            event=curve.labels,
+            status=curve.status,
+            multipliers=curve.multipliers,
+            truncation=truncation,
+            not_located=curve.not_located,
+            branch=branch,
+            n_solves=curve.n_solves,
+        )
 
     return over_cores(finished, range(len(curves)))
-
-
-def _multipliers(balance: HarmonicBalance, curve: CurvePoints) -> Complex[np.ndarray, "point _"]:
-    shape = (len(curve.points), balance.n_coefficients, balance.model.n_modes)
-    x = curve.points[:, :-1].reshape(shape) * np.asarray(balance.displacement_scale)
-    omega = curve.points[:, -1] * np.asarray(balance.frequency_scale)
-    return floquet_multipliers(balance.model, x, omega)
-
-
-def _response(
-    balance: HarmonicBalance,
-    curve: CurvePoints,
-    traced: TracedCurve,
-    branch: str,
-) -> ResponseCurve:
-    model, n = balance.model, len(curve.points)
-    x = curve.points[:, :-1].reshape(n, balance.n_coefficients, model.n_modes)
-    coefficients = x * np.asarray(balance.displacement_scale)
-    frequency = curve.points[:, -1] * np.asarray(balance.frequency_scale)
-    truncation = None
-    if curve.multipliers is not None:
-        (truncation,) = by_blocks(
-            lambda x, w: (_truncation(balance, x, w),), 32, coefficients, frequency
-        )
-    return ResponseCurve(
-        force=float(balance.force),
-        frequency=frequency,
-        coefficients=coefficients,
-        velocity=velocity_along(coefficients, frequency, np.asarray(model.modes.mode_shape)),
-        event=curve.labels,
-        status=traced.status,
-        sensors=model.modes.sensors,
-        multipliers=curve.multipliers,
-        truncation=truncation,
-        not_located=curve.not_located,
-        branch=branch,
-        n_solves=traced.n_solves,
-    )
 
 
 _truncation = compiled(truncation_error)

@@ -6,100 +6,51 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Float
 
 from snrmjax.model.averaging import averaged_effect
 from snrmjax.model.effect_base import AbstractForce
 from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.numerics.compiled import compiled
-from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.result import quantity
+from snrmjax.simulate.balance.given_numbers import frequency_range, positive
 from snrmjax.simulate.balance.harmonic_balance import (
     HarmonicBalance,
     harmonic_balance,
     linear_coefficients,
     resonance_displacement,
 )
-from snrmjax.simulate.balance.harmonics import harmonic_basis, velocity_along, velocity_phasors
-from snrmjax.simulate.balance.labelled import HERTZ, motion_variables, range_text
+from snrmjax.simulate.balance.harmonics import harmonic_basis, velocity_phasors
 from snrmjax.simulate.continuation.continuation import (
     Curve,
     CurveRange,
     CurveStatus,
     StepControl,
+    on_host,
     trace_curve,
 )
+from snrmjax.simulate.continuation.response_curve import MotionCurve, motions_of
 
 DEFAULT_STEPS = StepControl(max_points=2000)
 
 
-class DampedModeBranch(AbstractResult):
+class DampedModeBranch(MotionCurve):
     """A damped nonlinear mode as a curve of extended periodic motions."""
 
-    coordinates: ClassVar[tuple[str, ...]] = ("point", "sensor")
+    coordinates: ClassVar[tuple[str, ...]] = ("sensor",)
 
-    frequency: Float[np.ndarray, " point"]  # rad/s
-    damping_ratio: Float[np.ndarray, " point"]
-    coefficients: Float[np.ndarray, "point coefficient mode"]  # kg^1/2 m
-    velocity: Complex[np.ndarray, "point harmonic sensor"]  # m/s, h = 0…H
-    status: CurveStatus
-    sensors: tuple[str, ...]
-
-    def summary(self) -> tuple[str, ...]:
-        """How many points, the ranges and the status."""
-        velocity = np.abs(self.velocity[:, 1, 0])
-        return (
-            f"damped nonlinear normal mode: {len(self.frequency)} points",
-            f"natural frequency {range_text(self.frequency, 'Hz', HERTZ)}",
-            f"damping ratio {range_text(self.damping_ratio, 'of critical')}",
-            f"velocity fundamental {range_text(velocity, 'm/s')}, sensor {self.sensors[0]}",
-            f"status: {self.status.message}",
-        )
-
-    def variables(self) -> dict[str, Variable]:
-        """Natural frequency, damping ratio and velocities."""
-        named = motion_variables(self.frequency, self.velocity, self.sensors)
-        frequency = named.pop("frequency_hz")._replace(meaning="natural frequency")
-        text = "damping ratio, as a fraction of critical"
-        damping = Variable(("point",), self.damping_ratio, "1", text)
-        return {"natural_frequency_hz": frequency, "damping_ratio": damping, **named}
-
-    def attributes(self) -> dict[str, str | float | int]:
-        """How the curve ended."""
-        return {"status": self.status.name.lower()}
+    frequency: Float[np.ndarray, " point"] = quantity(
+        "point", "Hz", "natural frequency", name="natural_frequency_hz"
+    )
+    damping_ratio: Float[np.ndarray, " point"] = quantity(
+        "point", "1", "damping ratio, as a fraction of critical"
+    )
 
 
-class ControlledCurve(AbstractResult):
+class ControlledCurve(MotionCurve):
     """Steady states under a controller: the force is an unknown."""
 
-    coordinates: ClassVar[tuple[str, ...]] = ("point", "sensor", "frequency_hz")
-
-    force: Float[np.ndarray, " point"]  # N
-    frequency: Float[np.ndarray, " point"]  # rad/s
-    coefficients: Float[np.ndarray, "point coefficient mode"]  # kg^1/2 m
-    velocity: Complex[np.ndarray, "point harmonic sensor"]  # m/s, h = 0…H
-    status: CurveStatus
-    sensors: tuple[str, ...]
-
-    def summary(self) -> tuple[str, ...]:
-        """How many points, the ranges and the status."""
-        velocity = np.abs(self.velocity[:, 1, 0])
-        return (
-            f"steady states under a controller: {len(self.frequency)} points",
-            f"force {range_text(self.force, 'N')}",
-            f"frequency {range_text(self.frequency, 'Hz', HERTZ)}",
-            f"velocity fundamental {range_text(velocity, 'm/s')}, sensor {self.sensors[0]}",
-            f"status: {self.status.message}",
-        )
-
-    def variables(self) -> dict[str, Variable]:
-        """Force, frequency and velocities."""
-        force = Variable(("point",), self.force, "N", "force amplitude")
-        named = motion_variables(self.frequency, self.velocity, self.sensors)
-        return {"force_n": force, **named}
-
-    def attributes(self) -> dict[str, str | float | int]:
-        """How the curve ended."""
-        return {"status": self.status.name.lower()}
+    force: Float[np.ndarray, " point"] = quantity("point", "N", "force amplitude")
 
 
 def damped_normal_mode(
@@ -122,7 +73,7 @@ def damped_normal_mode(
     Raises `ValueError` for a velocity that is not positive and finite.
     Reference: Krack, Comput. Struct. 154 (2015) 59, doi:10.1016/j.compstruc.2015.03.008.
     """
-    _require_positive("largest_velocity", largest_velocity)
+    positive("largest_velocity", largest_velocity)
     model = simulated_structure(model)
     j = model.modes.mode_of_interest
     omega = float(model.modes.natural_frequency[j])
@@ -130,19 +81,12 @@ def damped_normal_mode(
     balance = harmonic_balance(
         model, 0.0, scale, harmonic_order=harmonic_order, n_samples=n_samples
     )
-    curve = _trace_damped(balance, steps)
-    n = int(curve.n_points)
-    points = np.asarray(curve.points)[:n]
-    motion = np.delete(points, -2, axis=1)
-    frequency, coefficients, velocity = _motion(balance, motion)
-    excitation = points[:, -2] * float(balance.frequency_scale)
+    curve = on_host(_trace_damped(balance, steps))
+    # ξ/(2Ω), both over the same natural frequency.
     return DampedModeBranch(
-        frequency,
-        excitation / (2 * frequency),
-        coefficients,
-        velocity,
-        CurveStatus(int(curve.status)),
-        model.modes.sensors,
+        **motions_of(balance, np.delete(curve.points, -2, axis=1)),
+        status=curve.status,
+        damping_ratio=curve.points[:, -2] / (2 * curve.points[:, -1]),
     )
 
 
@@ -202,7 +146,7 @@ def phase_controlled(
     Reference: Peeters, Kerschen & Golinval, J. Sound Vib. 330 (2011) 486,
     doi:10.1016/j.jsv.2010.08.028.
     """
-    _require_positive("largest_force", largest_force)
+    positive("largest_force", largest_force)
     if not abs(phase) < np.pi / 2:
         raise ValueError(f"`phase` must lie between -π/2 and π/2, but is {phase:g} rad.")
     model = simulated_structure(model)
@@ -213,10 +157,12 @@ def phase_controlled(
         harmonic_order=harmonic_order,
         n_samples=n_samples,
     )
-    curve = _trace_phase(balance, float(phase), steps)
-    n = int(curve.n_points)
-    points = np.asarray(curve.points)[:n]
-    return _controlled(balance, points[:, :-1], points[:, -1] * largest_force, curve)
+    curve = on_host(_trace_phase(balance, float(phase), steps))
+    return ControlledCurve(
+        **motions_of(balance, curve.points[:, :-1]),
+        status=curve.status,
+        force=curve.points[:, -1] * largest_force,
+    )
 
 
 @compiled
@@ -238,9 +184,9 @@ def _trace_phase(
 
     share = 0.01
     terms = model.linear_terms()
-    own = jnp.sqrt(terms.stiffness[j] / terms.mass[j])
+    natural = jnp.sqrt(terms.stiffness[j] / terms.mass[j])
     # Off resonance by the phase: tan φ = (ω² − Ω²)/(2ζωΩ), to first order in the damping.
-    begin = own - 0.5 * terms.damping[j] / terms.mass[j] * jnp.tan(phase)
+    begin = natural - 0.5 * terms.damping[j] / terms.mass[j] * jnp.tan(phase)
     x = linear_coefficients(model, share * balance.force, begin, balance.harmonic_order)
     start = jnp.append(balance.point(x, begin), share)
     rising = jnp.zeros_like(start).at[-1].set(1.0)
@@ -269,12 +215,8 @@ def response_controlled(
     Reference: Karaağaçlı & Özgüven, Mech. Syst. Signal Process. 144 (2020) 107023,
     doi:10.1016/j.ymssp.2020.107023.
     """
-    _require_positive("velocity", velocity)
-    if not 0 < from_frequency < to_frequency < np.inf:
-        raise ValueError(
-            "`from_frequency` must be positive and below a finite `to_frequency`, but they are "
-            f"{float(from_frequency):g} and {float(to_frequency):g} rad/s."
-        )
+    positive("velocity", velocity)
+    ends = frequency_range(from_frequency, to_frequency)
     model = simulated_structure(model)
     shape = np.asarray(model.modes.mode_shape[0])
     j = model.modes.mode_of_interest
@@ -288,16 +230,16 @@ def response_controlled(
     balance = harmonic_balance(
         model, unit, scale, harmonic_order=harmonic_order, n_samples=n_samples
     )
-    ends = np.array([from_frequency, to_frequency], dtype=np.float64)
-    curve = _trace_response(balance, float(velocity), ends, np.array(False), steps)
-    points = np.asarray(curve.points)[: int(curve.n_points)]
-    if int(curve.status) == CurveStatus.NO_START:
+    curve = on_host(_trace_response(balance, float(velocity), ends, np.array(False), steps))
+    if curve.status == CurveStatus.NO_START:
         # Far below a resonance the linear response may be no start where far above it is one.
-        curve = _trace_response(balance, float(velocity), ends, np.array(True), steps)
-        points = np.asarray(curve.points)[: int(curve.n_points)][::-1]
-        if int(curve.status) == CurveStatus.LOWER_END:
-            curve = curve._replace(status=jnp.array(int(CurveStatus.UPPER_END)))
-    return _controlled(balance, np.delete(points, -2, axis=1), points[:, -2] * unit, curve)
+        downward = _trace_response(balance, float(velocity), ends, np.array(True), steps)
+        curve = on_host(downward).reversed()
+    return ControlledCurve(
+        **motions_of(balance, np.delete(curve.points, -2, axis=1)),
+        status=curve.status,
+        force=curve.points[:, -2] * unit,
+    )
 
 
 @compiled
@@ -324,10 +266,10 @@ def _trace_response(
         return jnp.append(residual, value), jnp.concatenate([jacobian, slope[None]])
 
     begin = jnp.where(downward, ends[1], ends[0])
-    one = linear_coefficients(model, balance.force, begin, balance.harmonic_order)
-    linear = jnp.abs(velocity_phasors(one, begin, model.modes.mode_shape)[1, 0])
+    per_unit = linear_coefficients(model, balance.force, begin, balance.harmonic_order)
+    linear = jnp.abs(velocity_phasors(per_unit, begin, model.modes.mode_shape)[1, 0])
     share = velocity / linear
-    start = balance.point(share * one, begin)
+    start = balance.point(share * per_unit, begin)
     start = jnp.concatenate([start[:-1], jnp.stack([share, start[-1]])])
     onward = jnp.zeros_like(start).at[-1].set(jnp.where(downward, -1.0, 1.0))
     lower, upper = ends / balance.frequency_scale
@@ -342,28 +284,3 @@ def _with_force(
     residual, jacobian = now.linearised(point)
     column = -balance.force * balance.load()
     return residual, jnp.concatenate([jacobian, column[:, None]], axis=1)
-
-
-def _controlled(
-    balance: HarmonicBalance, points: np.ndarray, force: np.ndarray, curve: Curve
-) -> ControlledCurve:
-    frequency, coefficients, velocity = _motion(balance, points)
-    status = CurveStatus(int(curve.status))
-    sensors = balance.model.modes.sensors
-    return ControlledCurve(force, frequency, coefficients, velocity, status, sensors)
-
-
-def _motion(
-    balance: HarmonicBalance, points: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Frequency, coefficients and velocity of points (x, Ω), on the host."""
-    shape = (len(points), balance.n_coefficients, balance.model.n_modes)
-    coefficients = points[:, :-1].reshape(shape) * float(balance.displacement_scale)
-    frequency = points[:, -1] * float(balance.frequency_scale)
-    velocity = velocity_along(coefficients, frequency, np.asarray(balance.model.modes.mode_shape))
-    return frequency, coefficients, velocity
-
-
-def _require_positive(name: str, value: float) -> None:
-    if not 0 < value < np.inf:
-        raise ValueError(f"`{name}` must be positive and finite, but is {value!r}.")

@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -13,23 +12,17 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.numerics.blocks import mapped, over_cores, taken
 from snrmjax.numerics.compiled import compiled
-from snrmjax.numerics.result import AbstractResult, Variable
-from snrmjax.simulate.balance.harmonic_balance import (
-    HarmonicBalance,
-    harmonic_balance,
-)
-from snrmjax.simulate.balance.labelled import HERTZ, range_text
+from snrmjax.numerics.result import AbstractResult, quantity
+from snrmjax.simulate.balance.given_numbers import frequency_range, positive
+from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, harmonic_balance
 from snrmjax.simulate.continuation.continuation import (
     CurveStatus,
     StepControl,
+    TracedCurve,
     correct,
 )
 from snrmjax.simulate.continuation.curve_tracing import response_balances, trace_from_rest
-from snrmjax.simulate.continuation.response_curve import (
-    ResponseCurve,
-    TracedCurve,
-    assembled,
-)
+from snrmjax.simulate.continuation.response_curve import ResponseCurve, assembled
 
 DEFAULT_STEPS = StepControl()
 _BLOCK = 8  # curves that one job completes
@@ -87,71 +80,32 @@ def forced_response(
     >>> curve.status.name, curve.at_events("phase_resonance").size
     ('UPPER_END', 1)
     """
-    loads = positive_values("force", forces, "N")
+    loads = positive("forces", forces)
     settings = ResponseSettings(harmonic_order, n_samples, steps, stability)
     ends = (from_frequency, to_frequency)
     batch = forced_response_batch([model] * len(loads), loads, *ends, settings=settings)
     return [part for parts in batch.curves for part in parts]
 
 
-def positive_values(
-    name: str, values: float | Sequence[float] | Float[ArrayLike, "..."], unit: str
-) -> Float[np.ndarray, " value"]:
-    """One or many values as a vector. Raises `ValueError` for one that is not positive."""
-    vector = np.atleast_1d(np.asarray(values, dtype=np.float64)).ravel()
-    for value in vector.tolist():
-        if not 0 < value < np.inf:
-            raise ValueError(f"every {name} must be positive, but one is {value!r} {unit}.")
-    return vector
-
-
 class ResponseBatch(AbstractResult):
     """Forced responses of many members; NaN where a member has no such point."""
 
-    coordinates: ClassVar[tuple[str, ...]] = ("member",)
-
-    status: Int[np.ndarray, " member"]  # a `CurveStatus` for every member
-    n_points: Int[np.ndarray, " member"]
-    peak_frequency: Float[np.ndarray, " member"]  # rad/s, of the highest peak
-    peak_velocity: Float[np.ndarray, " member"]  # m/s, fundamental at the first sensor
-    resonance_frequency: Float[np.ndarray, " member"]  # rad/s, of the strongest phase resonance
-    resonance_velocity: Float[np.ndarray, " member"]  # m/s
-    n_folds: Int[np.ndarray, " member"]
-    n_not_located: Int[np.ndarray, " member"]  # events that are there but were not located
     curves: tuple[tuple[ResponseCurve, ...], ...]  # empty without `keep_curves`
-
-    def summary(self) -> tuple[str, ...]:
-        """How many members, where their peaks are and how they ended."""
-        kinds, counts = np.unique(np.asarray(self.status, dtype=int), return_counts=True)
-        each = zip(kinds.tolist(), counts.tolist(), strict=True)
-        ends = ", ".join(f"{n} {CurveStatus(k).name.lower()}" for k, n in each)
-        lines = [
-            f"forced responses of {len(self.status)} members",
-            f"highest peaks: {range_text(self.peak_frequency, 'Hz', HERTZ)},"
-            f" {range_text(self.peak_velocity, 'm/s')}",
-            f"folds: {int(np.sum(self.n_folds))} in all",
-            f"status: {ends or 'none'}",
-        ]
-        missed = int(np.sum(self.n_not_located))
-        return (*lines, f"events not located: {missed}") if missed else tuple(lines)
-
-    def variables(self) -> dict[str, Variable]:
-        """Peaks and phase resonances of every member, and how its curve ended."""
-        at, names = ("member",), [CurveStatus(int(k)).name.lower() for k in self.status]
-        resonance = "strongest phase resonance"
-        return {
-            "member": Variable(at, np.arange(len(self.status)), "1", "number of the member"),
-            "status": Variable(at, np.array(names, dtype=str), "", "how the curve ended"),
-            "n_points": Variable(at, self.n_points, "1", "points of the curve"),
-            "peak_frequency_hz": Variable(at, self.peak_frequency / HERTZ, "Hz", "highest peak"),
-            "peak_velocity_m_s": Variable(at, self.peak_velocity, "m/s", "highest peak"),
-            "resonance_frequency_hz": Variable(
-                at, self.resonance_frequency / HERTZ, "Hz", resonance
-            ),
-            "resonance_velocity_m_s": Variable(at, self.resonance_velocity, "m/s", resonance),
-            "n_folds": Variable(at, self.n_folds, "1", "folds"),
-            "n_not_located": Variable(at, self.n_not_located, "1", "events not located"),
-        }
+    status: Int[np.ndarray, " member"] = quantity(
+        "member", "", "how the curve ended", of=CurveStatus
+    )
+    n_points: Int[np.ndarray, " member"] = quantity("member", "1", "points of the curve")
+    peak_frequency: Float[np.ndarray, " member"] = quantity("member", "Hz", "highest peak")
+    # Fundamentals at the first sensor.
+    peak_velocity: Float[np.ndarray, " member"] = quantity("member", "m/s", "highest peak")
+    resonance_frequency: Float[np.ndarray, " member"] = quantity(
+        "member", "Hz", "strongest phase resonance"
+    )
+    resonance_velocity: Float[np.ndarray, " member"] = quantity(
+        "member", "m/s", "strongest phase resonance"
+    )
+    n_folds: Int[np.ndarray, " member"] = quantity("member", "1", "folds")
+    n_not_located: Int[np.ndarray, " member"] = quantity("member", "1", "events not located")
 
 
 def forced_response_batch(
@@ -191,19 +145,9 @@ def forced_response_batch(
         rows += found if keep_curves else []
         if progress is not None:
             progress(min(begin + chunk, len(members)), len(members))
-    names = [one.name for one in dataclasses.fields(ResponseBatch)][:-1]
-    columns = {name: np.array([one[name] for one in summaries]) for name in names}
+    names = [field.name for field in dataclasses.fields(ResponseBatch)][1:]
+    columns = {name: np.array([summary[name] for summary in summaries]) for name in names}
     return ResponseBatch(**columns, curves=tuple(rows))
-
-
-def frequency_range(from_frequency: float, to_frequency: float) -> Float[np.ndarray, " end"]:
-    """Both ends in rad/s. Raises `ValueError` when they are no range."""
-    if not 0 < from_frequency < to_frequency < np.inf:
-        raise ValueError(
-            "`from_frequency` must be positive and below a finite `to_frequency`, but they are "
-            f"{float(from_frequency):g} and {float(to_frequency):g} rad/s."
-        )
-    return np.array([from_frequency, to_frequency], dtype=np.float64)
 
 
 def _paired(
@@ -255,7 +199,7 @@ def _chunk_of_curves(
     good = np.flatnonzero(valid).tolist()
     results: list[list[ResponseCurve]] = [[] for _ in models]
     for k in np.flatnonzero(~valid).tolist():
-        results[k].append(_no_curve(models[k], float(forces[k]), settings))
+        results[k].append(_no_curve(models[k], float(forces[k]), settings.harmonic_order))
     if not good:
         return [tuple(curves) for curves in results]
     balances = response_balances(
@@ -295,9 +239,9 @@ def _chunk_of_curves(
     jobs = [np.arange(b, min(b + _BLOCK, len(parts))) for b in range(0, len(parts), _BLOCK)]
 
     def finished(job: np.ndarray) -> list[ResponseCurve]:
-        own = taken(balances, np.array([owner[e] for e in job]))
+        mine = taken(balances, np.array([owner[e] for e in job]))
         some = [parts[e] for e in job]
-        return assembled(own, some, settings.steps, stability=settings.stability)
+        return assembled(mine, some, settings.steps, stability=settings.stability)
 
     for job, responses in zip(jobs, over_cores(finished, jobs), strict=True):
         for e, response in zip(job, responses, strict=True):
@@ -314,9 +258,9 @@ def _ends_near_rest(balances: HarmonicBalance, member: int, curve: TracedCurve) 
     model, j = balances.model, balances.model.modes.mode_of_interest
     omega = float(curve.points[-1, -1])  # over the natural frequency
     damping = float(np.asarray(model.modes.damping_ratio)[member, j])
-    own = float(np.asarray(model.modes.natural_frequency)[member, j])
+    natural = float(np.asarray(model.modes.natural_frequency)[member, j])
     load = float(balances.force[member]) * float(np.asarray(model.modes.participation)[member, j])
-    linear = load / (own**2 * (1 - omega**2 + 2j * damping * omega))
+    linear = load / (natural**2 * (1 - omega**2 + 2j * damping * omega))
     x = curve.points[-1, :-1].reshape(balances.n_coefficients, -1)[1:3, j]
     last = complex(x[0], -x[1]) * float(balances.displacement_scale[member])
     return abs(last - linear) < 0.5 * abs(linear)
@@ -326,17 +270,16 @@ def _same_point(first: np.ndarray, second: np.ndarray) -> bool:
     return bool(np.max(np.abs(first - second)) < 1e-5)
 
 
-def _no_curve(model: Structure, force: float, settings: ResponseSettings) -> ResponseCurve:
-    order = settings.harmonic_order
+def _no_curve(model: Structure, force: float, harmonic_order: int) -> ResponseCurve:
     sensors = model.modes.sensors
     return ResponseCurve(
-        force=force,
         frequency=np.zeros(0),
-        coefficients=np.zeros((0, 2 * order + 1, model.n_modes)),
-        velocity=np.zeros((0, order + 1, len(sensors)), dtype=np.complex128),
-        event=(),
+        coefficients=np.zeros((0, 2 * harmonic_order + 1, model.n_modes)),
+        velocity=np.zeros((0, harmonic_order + 1, len(sensors)), dtype=np.complex128),
         status=CurveStatus.INVALID,
         sensors=sensors,
+        force=force,
+        event=(),
     )
 
 
@@ -372,7 +315,7 @@ def _solve_batch(
 ) -> tuple:
     harmonic_order = (start.shape[1] - 1) // 2
 
-    def one(force: Array, frequency: Array, start: Array) -> tuple[Array, Array]:
+    def solved(force: Array, frequency: Array, start: Array) -> tuple[Array, Array]:
         # A guess of zero is allowed: the static displacement keeps the unknowns of order one.
         static = force * model.modes.participation / model.modes.natural_frequency**2
         scale = jnp.maximum(jnp.max(jnp.abs(start)), jnp.max(jnp.abs(static)))
@@ -384,4 +327,4 @@ def _solve_batch(
         found = correct(balance.linearised, guess, fixed, 1e-10, 30)
         return balance.coefficients(found.point), found.converged
 
-    return mapped(one, force, frequency, start)
+    return mapped(solved, force, frequency, start)

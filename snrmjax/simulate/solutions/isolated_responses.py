@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Iterator, Sequence
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,19 +11,18 @@ from jaxtyping import Array, Float
 
 from snrmjax.model.structures import Structure, equilibria, simulated_structure
 from snrmjax.numerics.blocks import as_arrays, padded, taken
-from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.result import AbstractResult, Variable, setting
+from snrmjax.simulate.balance.given_numbers import frequency_range, positive
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, linear_coefficients
-from snrmjax.simulate.balance.labelled import HERTZ, range_text
-from snrmjax.simulate.continuation.continuation import CurveStatus, StepControl
+from snrmjax.simulate.balance.labelled import HERTZ
+from snrmjax.simulate.continuation.continuation import CurveStatus, StepControl, TracedCurve
 from snrmjax.simulate.continuation.curve_tracing import response_balances, trace_through
-from snrmjax.simulate.continuation.response_curve import ResponseCurve, TracedCurve, assembled
+from snrmjax.simulate.continuation.response_curve import ResponseCurve, assembled
 from snrmjax.simulate.solutions.controlled import phase_controlled
 from snrmjax.simulate.solutions.forced_response import (
     DEFAULT_SETTINGS,
     ResponseSettings,
     forced_response_batch,
-    frequency_range,
-    positive_values,
     solve_at_frequency,
 )
 
@@ -48,15 +47,16 @@ class IsolatedResponses(AbstractResult):
     A sequence of the curves: it has a length, and indices and loops give its curves.
     """
 
-    coordinates: ClassVar[tuple[str, ...]] = ("curve",)
-
     curves: tuple[ResponseCurve, ...]
-    force: float  # N
-    n_starts: int
-    n_failed: int  # starts from which Newton's method did not converge
-    n_known: int  # motions outside the frequency range, or on a curve that is known already
-    n_not_traced: int  # motions apart from known curves through which no curve was traced
-    backbone_status: CurveStatus  # of the force-appropriated backbone; UPPER_END when it is whole
+    force: float = setting()  # N
+    n_starts: int = setting()
+    n_failed: int = setting()  # starts from which Newton's method did not converge
+    n_known: int = setting()  # motions out of the range, or on a curve that is known already
+    n_not_traced: int = (
+        setting()
+    )  # motions apart from known curves that no curve was traced through
+    # Of the force-appropriated backbone; UPPER_END when it is whole.
+    backbone_status: CurveStatus = setting()
 
     def __len__(self) -> int:
         return len(self.curves)
@@ -67,48 +67,28 @@ class IsolatedResponses(AbstractResult):
     def __getitem__(self, k: int) -> ResponseCurve:
         return self.curves[k]
 
-    def summary(self) -> tuple[str, ...]:
-        """How many curves, each with its status, and what became of the starts."""
-        number = f"{len(self.curves)} curve{'' if len(self.curves) == 1 else 's'}"
-        lines = [f"isolated responses at {self.force:.4g} N: {number}"]
-        for curve in self.curves:
-            span = range_text(curve.frequency, "Hz", HERTZ)
-            points = f"{len(curve.frequency)} points, {span}"
-            lines.append(f"{curve.branch}: {points}, {curve.status.message}")
-        lines.append(
-            f"starts: {self.n_starts}, of which {self.n_failed} did not converge, {self.n_known}"
-            f" led to known motions or out of the range, {self.n_not_traced} to motions through"
-            " which no curve was traced"
-        )
-        whole = self.backbone_status == CurveStatus.UPPER_END
-        text = f"force-appropriated backbone: {self.backbone_status.message}"
-        return tuple(lines) if whole else (*lines, text)
-
     def variables(self) -> dict[str, Variable]:
         """One row a curve: how it was found, its range and status."""
-        at, every = ("curve",), self.curves
-        ends = [(c.frequency.min(), c.frequency.max()) for c in every]
-        low, high = np.array(ends, dtype=np.float64).reshape(-1, 2).T / HERTZ
-        height = np.array([np.abs(c.velocity[:, 1, 0]).max() for c in every], dtype=np.float64)
-        text = {
-            "branch": (np.array([c.branch for c in every], dtype=str), "how the curve was found"),
-            "status": (np.array([c.status.name.lower() for c in every], dtype=str), "how it ended"),
+        rows = [
+            (
+                *(c.branch, c.status.name.lower(), len(c.frequency)),
+                *(c.frequency.min() / HERTZ, c.frequency.max() / HERTZ),
+                np.abs(c.velocity[:, 1, 0]).max(),
+            )
+            for c in self.curves
+        ]
+        columns = {
+            "branch": ("", "how the curve was found", str),
+            "status": ("", "how it ended", str),
+            "n_points": ("1", "points", int),
+            "lowest_frequency_hz": ("Hz", "lowest frequency", float),
+            "highest_frequency_hz": ("Hz", "highest frequency", float),
+            "velocity_m_s": ("m/s", "largest velocity, at the first sensor", float),
         }
         return {
-            "curve": Variable(at, np.arange(len(every)), "1", "number of the curve"),
-            **{name: Variable(at, values, "", meaning) for name, (values, meaning) in text.items()},
-            "n_points": Variable(at, np.array([len(c.frequency) for c in every]), "1", "points"),
-            "lowest_frequency_hz": Variable(at, low, "Hz", "lowest frequency"),
-            "highest_frequency_hz": Variable(at, high, "Hz", "highest frequency"),
-            "velocity_m_s": Variable(at, height, "m/s", "largest velocity, at the first sensor"),
+            name: Variable(("curve",), np.array([row[k] for row in rows], dtype=kind), unit, text)
+            for k, (name, (unit, text, kind)) in enumerate(columns.items())
         }
-
-    def attributes(self) -> dict[str, str | float | int]:
-        """Force and what became of the starts."""
-        counts = {name: getattr(self, name) for name in ("n_starts", "n_failed", "n_known")}
-        status = self.backbone_status.name.lower()
-        last = {"n_not_traced": self.n_not_traced, "backbone_status": status}
-        return {"force_n": self.force, **counts, **last}
 
 
 def isolated_responses(
@@ -140,7 +120,7 @@ def isolated_responses(
     other harmonics than `harmonic_order`.
     """
     model = simulated_structure(model)
-    (load,) = positive_values("force", force, "N").tolist()
+    (load,) = positive("force", force).tolist()
     ends = frequency_range(from_frequency, to_frequency)
     if known is None:
         plain = dataclasses.replace(settings, stability=False)

@@ -1,32 +1,28 @@
 """Nonlinear normal modes: periodic motions of the conservative structure."""
 
 import dataclasses
-from typing import ClassVar, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Float
 
 from snrmjax.model.effect_base import AbstractHysteresis
 from snrmjax.model.structures import Structure, displacement_scale, simulated_structure
 from snrmjax.numerics.blocks import by_blocks
 from snrmjax.numerics.compiled import compiled
-from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.result import quantity
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, harmonic_balance
-from snrmjax.simulate.balance.harmonics import velocity_phasors, with_sines
-from snrmjax.simulate.balance.labelled import HERTZ, motion_variables, range_text
 from snrmjax.simulate.continuation.continuation import (
     Curve,
     CurveRange,
-    CurveStatus,
     StepControl,
+    on_host,
     trace_curve,
 )
+from snrmjax.simulate.continuation.response_curve import MotionCurve, motions_of
 
 DEFAULT_STEPS = StepControl(first=1e-3, largest=0.02, angle=0.06)
-
-
 _TONGUE_SHARE = 0.05  # of the energy, in a harmonic of another mode: an internal resonance
 
 
@@ -42,44 +38,14 @@ class Tongue(NamedTuple):
     last: int  # index of its last point; with "skip", of the last one before it
 
 
-class NormalModeBranch(AbstractResult):
-    """A nonlinear normal mode as a curve of periodic motions, from small amplitude on."""
+class NormalModeBranch(MotionCurve):
+    """A nonlinear normal mode as a curve of periodic motions, from small amplitude on.
 
-    coordinates: ClassVar[tuple[str, ...]] = ("point", "sensor", "frequency_hz")
+    Its motions start from rest: the coefficients are those of the mean and of cosines.
+    """
 
-    frequency: Float[np.ndarray, " point"]  # rad/s
-    coefficients: Float[np.ndarray, "point coefficient mode"]  # mean and cosines, kg^1/2 m
-    velocity: Complex[np.ndarray, "point harmonic sensor"]  # m/s, h = 0…H
-    energy: Float[np.ndarray, " point"]  # J
-    status: CurveStatus
-    sensors: tuple[str, ...]
+    energy: Float[np.ndarray, " point"] = quantity("point", "J", "energy of the motion")
     tongues: tuple[Tongue, ...] = ()
-
-    def summary(self) -> tuple[str, ...]:
-        """How many points, the ranges, internal resonances and the status."""
-        velocity = np.abs(self.velocity[:, 1, 0])
-        return (
-            f"nonlinear normal mode: {len(self.frequency)} points",
-            f"frequency {range_text(self.frequency, 'Hz', HERTZ)}",
-            f"velocity fundamental {range_text(velocity, 'm/s')}, sensor {self.sensors[0]}",
-            f"energy {range_text(self.energy, 'J')}",
-            *(
-                f"1:{one.harmonic} internal resonance with mode {one.mode + 1} from"
-                f" {one.from_frequency / HERTZ:.4g} to {one.to_frequency / HERTZ:.4g} Hz"
-                for one in self.tongues
-            ),
-            f"status: {self.status.message}",
-        )
-
-    def variables(self) -> dict[str, Variable]:
-        """Frequency, velocities and energy."""
-        energy = Variable(("point",), self.energy, "J", "energy of the motion")
-        named = motion_variables(self.frequency, self.velocity, self.sensors)
-        return {**named, "energy_j": energy}
-
-    def attributes(self) -> dict[str, str | float | int]:
-        """How the curve ended, and how many internal resonances it has."""
-        return {"status": self.status.name.lower(), "internal_resonances": len(self.tongues)}
 
 
 def nonlinear_normal_mode(
@@ -130,7 +96,16 @@ def nonlinear_normal_mode(
     lower, upper = (omega / 10, to_frequency) if upward else (to_frequency, omega * 10)
     limit = 30.0 if largest_amplitude is None else largest_amplitude / scale
     ends = jnp.asarray([lower, upper, limit])
-    branch = _assemble(balance, _trace(balance, ends, steps))
+    curve = on_host(_trace(balance, ends, steps))
+    cosines, frequency = balance.motions(curve.points)
+    at_rest = np.sum(cosines, axis=1)  # q(0), where the velocity vanishes
+    (energy,) = by_blocks(lambda rows: (_energy(model, rows),), 128, at_rest)
+    branch = NormalModeBranch(
+        **motions_of(balance, curve.points),
+        status=curve.status,
+        energy=energy,
+        tongues=_tongues(balance, frequency, cosines),
+    )
     return _without_tongues(branch) if tongues == "skip" else branch
 
 
@@ -150,22 +125,6 @@ def _trace(balance: HarmonicBalance, ends: Array, steps: StepControl) -> Curve:
         CurveRange(lower, upper, largest_amplitude=ends[2]),
         steps,
         start_across=direction,
-    )
-
-
-def _assemble(balance: HarmonicBalance, curve: Curve) -> NormalModeBranch:
-    points = np.asarray(curve.points)[: int(curve.n_points)]
-    frequency, coefficients, velocity, energy = by_blocks(
-        lambda block: _motion(balance, block), 128, points
-    )
-    return NormalModeBranch(
-        frequency=frequency,
-        coefficients=coefficients,
-        velocity=velocity,
-        energy=energy,
-        status=CurveStatus(int(curve.status)),
-        sensors=balance.model.modes.sensors,
-        tongues=_tongues(balance, frequency, coefficients),
     )
 
 
@@ -221,12 +180,5 @@ def _without_tongues(branch: NormalModeBranch) -> NormalModeBranch:
 
 
 @compiled
-def _motion(balance: HarmonicBalance, points: Array) -> tuple[Array, Array, Array, Array]:
-    """Frequency, coefficients, velocity and energy along a curve."""
-    model = balance.model
-    coefficients = jax.vmap(balance.coefficients)(points)
-    frequency = points[:, -1] * balance.frequency_scale
-    full = with_sines(coefficients)
-    velocity = velocity_phasors(full, frequency, model.modes.mode_shape)
-    at_rest = jnp.sum(coefficients, axis=1)  # q(0), where the velocity vanishes
-    return frequency, coefficients, velocity, model.potential_energy(at_rest)
+def _energy(model: Structure, displacement: Array) -> Array:
+    return model.potential_energy(displacement)

@@ -14,9 +14,9 @@ from snrmjax.numerics.compiled import jitted
 from snrmjax.numerics.result import AbstractResult, Variable
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, harmonic_balance
 from snrmjax.simulate.balance.harmonics import velocity_phasors
-from snrmjax.simulate.balance.labelled import HERTZ, range_text
+from snrmjax.simulate.balance.labelled import HERTZ, batch_variables
 from snrmjax.simulate.continuation.continuation import Linearised, Point
-from snrmjax.simulate.continuation.events import mode_velocity, sensor_velocity
+from snrmjax.simulate.continuation.events import velocities_along
 from snrmjax.simulate.continuation.response_curve import ResponseCurve
 
 Condition = Literal["frequency", "velocity", "fold", "peak", "phase_resonance"]
@@ -39,29 +39,14 @@ class PeriodicMotion(AbstractResult):
         phasor = jnp.where(self.converged, self.velocity[..., 1, 0], 1.0)
         return jnp.where(self.converged, jnp.abs(phasor), jnp.nan)
 
-    def summary(self) -> tuple[str, ...]:
-        """How many motions were found, where, and how large they are."""
-        found = np.asarray(self.converged)
-        return (
-            f"periodic motions: {found.size}, of which {int(np.sum(~found))} were not found",
-            f"frequency {range_text(np.asarray(self.frequency), 'Hz', HERTZ)}",
-            f"velocity fundamental {range_text(np.asarray(self.amplitude), 'm/s')}, first sensor",
-        )
-
     def variables(self) -> dict[str, Variable]:
         """Frequency and velocities of every motion."""
-        at = {0: (), 1: ("motion",)}.get(
-            np.ndim(self.frequency), tuple(f"batch_{k}" for k in range(np.ndim(self.frequency)))
+        hertz = np.asarray(self.frequency) / HERTZ
+        return batch_variables(
+            self.velocity,
+            frequency_hz=(hertz, "Hz", "frequency"),
+            converged=(self.converged, "1", "whether the motion was found"),
         )
-        velocity, axes = np.asarray(self.velocity), (*at, "harmonic", "sensor_number")
-        return {
-            "frequency_hz": Variable(at, np.asarray(self.frequency) / HERTZ, "Hz", "frequency"),
-            "velocity_re_m_s": Variable(axes, velocity.real, "m/s", "in phase with the force"),
-            "velocity_im_m_s": Variable(
-                axes, velocity.imag, "m/s", "a quarter period ahead of the force"
-            ),
-            "converged": Variable(at, self.converged, "1", "whether the motion was found"),
-        }
 
 
 def periodic_motion(
@@ -143,27 +128,6 @@ def _periodic_motion(
     )
 
 
-def turning(
-    model: Structure, force: Float[Array, ""], motion: PeriodicMotion, condition: Condition
-) -> Float[Array, ""]:
-    """Which way the response curve turns at a fold or a peak; 1 for the other conditions.
-
-    The second derivative along the curve, scaled: of Ω at a fold (negative where the curve turns
-    back from higher frequencies), of |V₁|² at a peak (negative at a maximum).
-    """
-    if condition not in ("fold", "peak"):
-        return jnp.ones(())
-    model = simulated_structure(model)
-    scale = jnp.max(jnp.abs(motion.coefficients))
-    order = (motion.coefficients.shape[0] - 1) // 2
-    balance = harmonic_balance(model, force, scale, harmonic_order=order)
-    point = balance.point(motion.coefficients, motion.frequency)
-    border = _generic(point.shape[0])
-    tangent = _tangent_near(balance.linearised, point, border)
-    zero = jnp.zeros(())
-    return jax.jvp(lambda p: _test(balance, condition, zero, border, p), (point,), (tangent,))[1]
-
-
 def response_at_velocities(
     model: Structure,
     curve: ResponseCurve,
@@ -196,13 +160,13 @@ def motions_at_velocities(
     differentiable as `periodic_motion` is.
     """
 
-    def one(coefficients: Array, frequency: Array, value: Array) -> PeriodicMotion:
+    def motion_near(coefficients: Array, frequency: Array, value: Array) -> PeriodicMotion:
         start = (coefficients, frequency)
         return periodic_motion(model, force, start, condition="velocity", value=value)
 
     coefficients, frequency = (jnp.asarray(part, dtype=jnp.float64) for part in starts)
     values = jnp.broadcast_to(jnp.asarray(velocities, dtype=jnp.float64), frequency.shape)
-    return mapped(one, coefficients, frequency, values)
+    return mapped(motion_near, coefficients, frequency, values)
 
 
 def _crossings(
@@ -288,13 +252,17 @@ def _test(
         shape = balance.model.modes.mode_shape[0]
         top = jnp.max(jnp.abs(shape)) ** 2
         unit = balance.displacement_scale * balance.frequency_scale
-        return sensor_velocity(balance, point) - (target / unit) ** 2 / top
+        return _seen(balance, point)[1] - (target / unit) ** 2 / top
     if condition == "phase_resonance":
-        return mode_velocity(balance, point).imag
+        return _seen(balance, point)[2]
     tangent = _tangent_near(balance.linearised, point, border)
     if condition == "fold":
         return tangent[-1]
-    return jax.jvp(lambda p: sensor_velocity(balance, p), (point,), (tangent,))[1]
+    return velocities_along(balance, point, tangent)[1][1]
+
+
+def _seen(balance: HarmonicBalance, point: Point) -> Float[Array, "4"]:
+    return velocities_along(balance, point, jnp.zeros_like(point))[0]
 
 
 def _tangent_near(linearised: Linearised, point: Point, border: Point) -> Point:

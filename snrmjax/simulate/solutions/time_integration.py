@@ -15,8 +15,9 @@ from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.numerics.compiled import jitted
 from snrmjax.numerics.result import AbstractResult, Variable
 from snrmjax.numerics.status import Status
+from snrmjax.simulate.balance.given_numbers import positive
 from snrmjax.simulate.balance.harmonics import harmonic_basis, velocity_phasors
-from snrmjax.simulate.balance.labelled import HERTZ, range_text
+from snrmjax.simulate.balance.labelled import HERTZ, batch_variables
 from snrmjax.simulate.solutions.hysteresis_cycles import (
     CyclePoint,
     integrated_cycle,
@@ -45,7 +46,7 @@ class MotionStatus(Status):
 class IntegratedMotion(AbstractResult):
     """Motions at the end of an integration in time, over the last cycle of the force."""
 
-    coordinates: ClassVar[tuple[str, ...]] = ("frequency_hz", "harmonic", "sensor_number")
+    coordinates: ClassVar[tuple[str, ...]] = ("frequency_hz",)
 
     force: Float[Array, "*batch"]  # N
     frequency: Float[Array, "*batch"]  # rad/s
@@ -56,40 +57,19 @@ class IntegratedMotion(AbstractResult):
     distance: Float[Array, "*batch"]  # estimated, from the settled motion, relative
     n_cycles: Int[Array, "*batch"]
 
-    def summary(self) -> tuple[str, ...]:
-        """How many motions, their ranges and how they ended."""
-        status = np.ravel(self.status)
-        ends = [(kind, int(np.sum(status == int(kind)))) for kind in MotionStatus]
-        velocity = np.abs(np.asarray(self.velocity)[..., 1, 0])
-        return (
-            f"motions by time integration: {status.size}",
-            f"force {range_text(np.asarray(self.force), 'N')}",
-            f"frequency {range_text(np.asarray(self.frequency), 'Hz', HERTZ)}",
-            f"velocity fundamental {range_text(velocity, 'm/s')}, first sensor",
-            f"cycles {range_text(np.asarray(self.n_cycles), 'of the force')}",
-            *(f"status: {n} {kind.message}" for kind, n in ends if n),
-        )
-
     def variables(self) -> dict[str, Variable]:
         """Force, frequency, velocities and how every motion ended."""
-        at = tuple(f"batch_{k}" for k in range(np.ndim(self.status)))
-        at = ("motion",) if len(at) == 1 else at
         names = [MotionStatus(int(k)).name.lower() for k in np.ravel(self.status)]
         status = np.array(names, dtype=str).reshape(np.shape(self.status))
-        velocity = np.asarray(self.velocity)
-        axes = (*at, "harmonic", "sensor_number")
-        orders, sensors = np.arange(velocity.shape[-2]), np.arange(velocity.shape[-1])
-        return {
-            "force_n": Variable(at, self.force, "N", "force amplitude"),
-            "frequency_hz": Variable(at, np.asarray(self.frequency) / HERTZ, "Hz", "frequency"),
-            "harmonic": Variable(("harmonic",), orders, "1", "harmonic order"),
-            "sensor_number": Variable(("sensor_number",), sensors, "1", "sensor, from zero"),
-            "velocity_re_m_s": Variable(axes, velocity.real, "m/s", "in phase with the force"),
-            "velocity_im_m_s": Variable(axes, velocity.imag, "m/s", "ahead of the force"),
-            "status": Variable(at, status, "", "how the integration ended"),
-            "distance": Variable(at, self.distance, "1", "estimated, from the settled motion"),
-            "n_cycles": Variable(at, self.n_cycles, "1", "cycles of the force"),
-        }
+        hertz = np.asarray(self.frequency) / HERTZ
+        return batch_variables(
+            self.velocity,
+            force_n=(self.force, "N", "force amplitude"),
+            frequency_hz=(hertz, "Hz", "frequency"),
+            status=(status, "", "how the integration ended"),
+            distance=(self.distance, "1", "estimated, from the settled motion"),
+            n_cycles=(self.n_cycles, "1", "cycles of the force"),
+        )
 
     @property
     def converged(self) -> Bool[Array, "*batch"]:
@@ -145,17 +125,13 @@ def settled_motion(
     >>> bool(motion.converged), bool(abs(motion.velocity[1] / exact - 1).max() < 1e-4)
     (True, True)
     """
-    _require_positive("force", force)
-    _require_positive("frequency", frequency)
-    frequency = jnp.asarray(frequency, dtype=jnp.float64)
-    motions = _stepped(
-        simulated_structure(model),
-        jnp.asarray(force, dtype=jnp.float64),
-        frequency[None],
-        jnp.asarray(model.test_order)[None],
-        _start_state(model, start),
-        harmonic_order,
-        _settings(max_cycles, accuracy),
+    positive("frequency", frequency)
+    motions = stepped_sine(
+        *(model, force, jnp.asarray(frequency, dtype=jnp.float64)[None]),
+        cycles_per_step=max_cycles,
+        start=start,
+        harmonic_order=harmonic_order,
+        accuracy=accuracy,
     )
     return jax.tree.map(lambda part: part[0], motions)
 
@@ -183,10 +159,14 @@ def stepped_sine(
     Returns an `IntegratedMotion` whose arrays lead with the step. Another number of steps
     compiles anew. Raises as `settled_motion` does.
     """
-    _require_positive("force", force)
-    _require_positive("frequencies", frequencies)
+    positive("force", force)
+    positive("frequencies", frequencies)
+    if cycles_per_step < LEAST_CYCLES:
+        raise ValueError(
+            f"a motion needs {LEAST_CYCLES} cycles or more to settle, but gets {cycles_per_step}."
+        )
     frequencies = jnp.asarray(frequencies, dtype=jnp.float64)
-    if frequencies.ndim != 1 or not frequencies.size:
+    if frequencies.ndim != 1:
         raise ValueError(
             f"`frequencies` must be a vector of steps, but has shape {frequencies.shape}."
         )
@@ -204,7 +184,7 @@ def stepped_sine(
         test_orders,
         _start_state(model, start),
         harmonic_order,
-        _settings(cycles_per_step, accuracy),
+        _Settings(jnp.asarray(cycles_per_step), *(jnp.asarray(part) for part in accuracy)),
     )
 
 
@@ -212,23 +192,6 @@ class _Settings(NamedTuple):
     max_cycles: Int[Array, ""]
     tolerance: Float[Array, ""]
     rtol: Float[Array, ""]
-
-
-def _settings(max_cycles: int, accuracy: IntegrationAccuracy) -> _Settings:
-    if max_cycles < LEAST_CYCLES:
-        raise ValueError(
-            f"a motion needs {LEAST_CYCLES} cycles or more to settle, but gets {max_cycles}."
-        )
-    return _Settings(jnp.asarray(max_cycles), *(jnp.asarray(part) for part in accuracy))
-
-
-def _require_positive(name: str, value: Any) -> None:
-    if isinstance(value, jax.core.Tracer):
-        return
-    values = np.ravel(np.asarray(value, dtype=np.float64))
-    wrong = values[~((values > 0) & np.isfinite(values))]
-    if wrong.size:
-        raise ValueError(f"`{name}` must be positive and finite, but is {wrong[0]!r}.")
 
 
 def _start_state(model: Structure, start: Any) -> Float[Array, "2 mode"]:

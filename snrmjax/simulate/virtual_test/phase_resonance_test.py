@@ -1,7 +1,7 @@
 """A virtual phase-resonance test: steady states near resonance, with measurement errors."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import ClassVar, Literal, NamedTuple, get_args
 
 import jax.numpy as jnp
@@ -10,23 +10,18 @@ from jaxtyping import ArrayLike, Float
 
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.structures import Structure
-from snrmjax.numerics.result import AbstractResult, Variable
-from snrmjax.simulate.balance.labelled import HERTZ, range_text
+from snrmjax.numerics.result import AbstractResult, Variable, setting
+from snrmjax.simulate.balance.given_numbers import frequency_range, positive
 from snrmjax.simulate.continuation.response_curve import ResponseCurve
 from snrmjax.simulate.solutions.controlled import ControlledCurve
-from snrmjax.simulate.solutions.forced_response import (
-    ResponseSettings,
-    forced_response_batch,
-    frequency_range,
-    positive_values,
-)
+from snrmjax.simulate.solutions.forced_response import ResponseSettings, forced_response_batch
 from snrmjax.simulate.virtual_test.appropriation import (
     around,
     between,
     mode_phase,
     phase_limits,
     spread_in_phase,
-    states_at_phases,
+    states_near,
 )
 from snrmjax.simulate.virtual_test.integrated_test import stepped_states
 from snrmjax.simulate.virtual_test.recording import (
@@ -41,18 +36,12 @@ Means = Literal["harmonic_balance", "time_integration"]
 
 
 class SweepSimulation(NamedTuple):
-    """How the motions of a phase-resonance test are computed.
+    """How the motions of a phase-resonance test are computed."""
 
-    `by` is "harmonic_balance", where the frequency is stepped infinitely slowly, or
-    "time_integration", where each sweep has `steps_per_sweep` equal steps of frequency, each held
-    for at most `cycles_per_step` cycles of the force. `harmonic_order` is the highest harmonic of
-    the motion, a multiple of the frequency of the force.
-    """
-
-    by: Means = "harmonic_balance"
-    harmonic_order: int = 9
-    steps_per_sweep: int = 100  # of a time integration
-    cycles_per_step: int = 200  # of a time integration
+    by: Means = "harmonic_balance"  # as if the frequency were stepped infinitely slowly
+    harmonic_order: int = 9  # highest of the motion
+    steps_per_sweep: int = 100  # of a time integration: equal steps of frequency
+    cycles_per_step: int = 200  # of a time integration, at most
 
 
 BY_HARMONIC_BALANCE = SweepSimulation()
@@ -61,54 +50,19 @@ BY_HARMONIC_BALANCE = SweepSimulation()
 class VirtualTest(AbstractResult):
     """What a virtual test recorded."""
 
-    coordinates: ClassVar[tuple[str, ...]] = ("state", "sensor")
+    coordinates: ClassVar[tuple[str, ...]] = SteadyStates.coordinates
 
     steady_states: SteadyStates
     jumps: tuple[tuple[int, float], ...]  # (level, frequency in rad/s) where a branch ended
     curves: tuple[ResponseCurve | ControlledCurve, ...]  # the exact responses behind the test
-    n_missing: int = 0  # states aimed at that the test did not reach, or that were not found
-    n_unsettled: int = 0  # steps of a time integration that had not settled: none is recorded
+    # States aimed at that the test did not reach, or that were not found.
+    n_missing: int = setting(default=0)
+    # Steps of a time integration that had not settled: none is recorded.
+    n_unsettled: int = setting(default=0)
 
-    def summary(self) -> tuple[str, ...]:
-        """How many states, levels and jumps, and the ranges."""
-        states = self.steady_states
-        levels = len(np.unique(np.asarray(states.level)))
-        velocity = np.abs(np.asarray(states.velocity)[:, 0])
-        lines = [
-            f"virtual test: {states.n_states} steady states on {levels} level{'s' * (levels != 1)}",
-            f"force {range_text(np.asarray(states.force), 'N')}",
-            f"frequency {range_text(np.asarray(states.frequency), 'Hz', HERTZ)}",
-            f"velocity fundamental {range_text(velocity, 'm/s')}, sensor {states.sensors[0]}",
-            f"jumps: {len(self.jumps)}; exact responses: {len(self.curves)}",
-        ]
-        if self.n_missing:
-            lines.append(f"states not reached: {self.n_missing}")
-        if self.n_unsettled:
-            lines.append(f"steps that had not settled: {self.n_unsettled}")
-        return tuple(lines)
-
-    def variables(self) -> dict[str, Variable]:
+    def variables(self) -> Mapping[str, Variable]:
         """The steady states, by the names of their file's columns."""
-        states = self.steady_states
-        at, wide = ("state",), ("state", "sensor")
-        velocity = np.asarray(states.velocity)
-        frequency = np.asarray(states.frequency) / HERTZ
-        return {
-            "state": Variable(at, np.arange(states.n_states), "1", "number of the state"),
-            "sensor": Variable(("sensor",), np.array(states.sensors), "", "sensor"),
-            "level": Variable(at, np.asarray(states.level), "1", "level"),
-            "frequency_hz": Variable(at, frequency, "Hz", "frequency"),
-            "force_n": Variable(at, np.asarray(states.force), "N", "force amplitude"),
-            "velocity_re_m_s": Variable(wide, velocity.real, "m/s", "in phase with the force"),
-            "velocity_im_m_s": Variable(
-                wide, velocity.imag, "m/s", "a quarter period ahead of the force"
-            ),
-        }
-
-    def attributes(self) -> dict[str, str | float | int]:
-        """How often the test jumped, and how many states it missed."""
-        counts = {"states_not_reached": self.n_missing, "steps_not_settled": self.n_unsettled}
-        return {"jumps": len(self.jumps), **counts}
+        return self.steady_states.variables()
 
 
 def phase_resonance_test(
@@ -157,7 +111,7 @@ def phase_resonance_test(
         raise ValueError(f"`by` must be one of {get_args(Means)}, but is {by!r}.")
     if steps_per_sweep < 2:
         raise ValueError(f"`steps_per_sweep` must be 2 or more, but is {steps_per_sweep}.")
-    loads = positive_values("force", forces, "N").tolist()
+    loads = positive("forces", forces).tolist()
     low, high = frequency_range(from_frequency, to_frequency).tolist()
     if by == "harmonic_balance":
         found = _along_curves(model, loads, (low, high), limits, points_per_level, harmonic_order)
@@ -219,10 +173,7 @@ def _along_curves(
     if not rows:
         nothing = VisitedStates(*(np.zeros(0),) * 4, np.zeros((0, 2 * harmonic_order + 1, 1)))
         return _Visited(nothing, jumps, curves, 0)
-    number, load, frequency, motion, wanted = (np.array(c) for c in zip(*rows, strict=True))
-    order = np.linspace(0.0, 1.0, len(rows))
-    states = VisitedStates(number, order, load, frequency, motion)
-    exact = states_at_phases(model, states, wanted)
+    exact = states_near(model, rows)
     return _Visited(exact, jumps, curves, len(rows) - len(exact.level))
 
 

@@ -54,7 +54,6 @@ class AbstractComputation(eqx.Module):
 
     kind: ClassVar[str]
     members_a_chunk: ClassVar[int]  # small enough to lose, large enough to be worth a file
-    driven: ClassVar[bool]  # by forces: `forces_n` is needed, or `force_n` varies
 
     @abc.abstractmethod
     def outputs(self) -> dict[str, Output]:
@@ -99,18 +98,23 @@ class OfForces(eqx.Module):
         return values.reshape(-1, len(np.asarray(self.values)), *values.shape[1:])
 
 
+def of_forces(values: OfForces | Sequence[float] | np.ndarray | None) -> OfForces:
+    """The forces of a study from their values in N."""
+    if isinstance(values, OfForces):
+        return values
+    return OfForces(None if values is None else np.asarray(values, dtype=np.float64))
+
+
 def blank_rows(outputs: dict[str, Output], sizes: dict[str, int], status: str) -> dict[str, Any]:
     """Rows of members for which there is nothing but a status."""
-    found = {}
-    for name, one in outputs.items():
-        shape = tuple(sizes.get(dimension, 0) for dimension in one.dimensions)
-        if one.kind == TEXT:
-            found[name] = np.full(shape, status if name == "status" else "")
-        elif one.kind.startswith("f"):
-            found[name] = np.full(shape, np.nan)
+    rows = {}
+    for name, output in outputs.items():
+        shape = tuple(sizes.get(dimension, 0) for dimension in output.dimensions)
+        if output.kind == TEXT:
+            rows[name] = np.full(shape, status if name == "status" else "")
         else:
-            found[name] = np.zeros(shape, dtype=one.kind)
-    return found
+            rows[name] = np.full(shape, np.nan if output.kind == "f8" else 0, output.kind)
+    return rows
 
 
 def with_refused(
@@ -141,12 +145,11 @@ def joined(parts: Sequence[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
 
 
 def one_by_one(
-    members: Members, compute: Callable[[Structure, np.ndarray | None, int], dict], **failed: Any
+    computation: AbstractComputation,
+    members: Members,
+    compute: Callable[[Structure, np.ndarray | None, int], dict],
 ) -> dict[str, np.ndarray]:
-    """Rows of members that are computed singly; a `ValueError` becomes the member's status.
-
-    `failed` are the rows of a member that could not be computed, without its status.
-    """
+    """Rows of members that are computed singly; a `ValueError` becomes the member's status."""
     parts = []
     for k, model in enumerate(members.models):
         force = None if members.forces is None else members.forces[k]
@@ -154,5 +157,5 @@ def one_by_one(
             parts.append(compute(jax.device_put(model), force, members.seeds[k]))
         except ValueError as error:
             reason = str(error).splitlines()[0]
-            parts.append({**failed, "status": np.array([f"refused: {reason}"])})
+            parts.append(with_refused(computation, None, {0: f"refused: {reason}"}))
     return joined(parts)

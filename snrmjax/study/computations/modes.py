@@ -35,7 +35,6 @@ class AbstractModes(AbstractComputation):
     """A nonlinear mode of every member, point by point."""
 
     members_a_chunk: ClassVar[int] = 32
-    driven: ClassVar[bool] = False
     further: ClassVar[tuple[str, str, str]]  # what a point has beside frequency and velocity
 
     def outputs(self) -> dict[str, Output]:
@@ -45,8 +44,7 @@ class AbstractModes(AbstractComputation):
 
     def rows(self, members: Members) -> dict[str, np.ndarray]:
         """See `AbstractComputation.rows`."""
-        none = _rows(CurveStatus.INVALID, np.zeros(0), np.zeros(0))
-        return one_by_one(members, self._one, **none, **{self.further[0]: np.zeros(0)})
+        return one_by_one(self, members, self._one)
 
     @abc.abstractmethod
     def _one(self, model: Structure, force: np.ndarray | None, seed: int) -> dict:

@@ -25,9 +25,9 @@ from snrmjax.study.computations.base import (
 )
 from snrmjax.study.computations.responses import ResponseRange
 
-_SHARE = "relative_amplitude"
+SHARE = "relative_amplitude"
 _POINTS = 11  # of a curve over the measured range
-_CURVE = (MEMBER, _SHARE)
+_CURVE = (MEMBER, SHARE)
 _FOUND = {
     "status": Output((MEMBER,), TEXT, "", "solved, or why not"),
     "n_states": Output((MEMBER,), "i4", "1", "steady states of the test"),
@@ -50,7 +50,7 @@ class AbstractIdentified(AbstractComputation):
     def axes(self) -> dict[str, Axis]:
         """See `AbstractComputation.axes`."""
         text = "place between the smallest (0) and the largest (1) measured amplitude"
-        return {_SHARE: Axis(np.linspace(0.0, 1.0, _POINTS), "1", text)}
+        return {SHARE: Axis(np.linspace(0.0, 1.0, _POINTS), "1", text)}
 
     def identified(self, data: SteadyStates, model: Structure) -> dict[str, np.ndarray]:
         """One member's row."""
@@ -71,12 +71,6 @@ class AbstractIdentified(AbstractComputation):
             **{name: np.asarray(one)[None] for name, one in row.items()},
         }
 
-    def failed(self) -> dict[str, np.ndarray]:
-        """The row of a member for which nothing is found."""
-        counts = {name: np.zeros(1, dtype="i4") for name in ("n_states", "n_solved")}
-        curves = {k: np.full((1, _POINTS), np.nan) for k in _FOUND if _SHARE in _FOUND[k][0]}
-        return {**counts, **curves}
-
 
 class VirtualTests(AbstractIdentified):
     """A virtual near-resonance test of every member with its own noise, then its identification.
@@ -86,7 +80,6 @@ class VirtualTests(AbstractIdentified):
 
     kind: ClassVar[str] = "virtual_test"
     members_a_chunk: ClassVar[int] = 8
-    driven: ClassVar[bool] = True
 
     within: ResponseRange
     levels: Float[np.ndarray, " level"]
@@ -95,7 +88,7 @@ class VirtualTests(AbstractIdentified):
 
     def rows(self, members: Members) -> dict[str, np.ndarray]:
         """See `AbstractComputation.rows`."""
-        return one_by_one(members, self._one, **self.failed())
+        return one_by_one(self, members, self._one)
 
     def _one(self, model: Structure, force: np.ndarray | None, seed: int) -> dict:
         test = phase_resonance_test(
@@ -111,13 +104,12 @@ class Identifications(AbstractIdentified):
 
     kind: ClassVar[str] = "identify"
     members_a_chunk: ClassVar[int] = 16
-    driven: ClassVar[bool] = False
 
     data: SteadyStates
 
     def rows(self, members: Members) -> dict[str, np.ndarray]:
         """See `AbstractComputation.rows`."""
-        return one_by_one(members, self._one, **self.failed())
+        return one_by_one(self, members, self._one)
 
     def _one(self, model: Structure, force: np.ndarray | None, seed: int) -> dict:
         return self.identified(self.data, model)
@@ -128,7 +120,6 @@ class Diagnoses(AbstractComputation):
 
     kind: ClassVar[str] = "diagnose"
     members_a_chunk: ClassVar[int] = 4
-    driven: ClassVar[bool] = False
 
     data: SteadyStates
 
@@ -146,9 +137,7 @@ class Diagnoses(AbstractComputation):
 
     def rows(self, members: Members) -> dict[str, np.ndarray]:
         """See `AbstractComputation.rows`."""
-        numbers = {name: np.full(1, np.nan) for name, o in self.outputs().items() if o.kind == "f8"}
-        texts = {name: np.array([""]) for name in ("verdict", "effects")}
-        return one_by_one(members, self._one, **numbers, **texts)
+        return one_by_one(self, members, self._one)
 
     def _one(self, model: Structure, force: np.ndarray | None, seed: int) -> dict:
         found = diagnose_model(model, self.data)

@@ -2,23 +2,23 @@
 
 from typing import ClassVar
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
+from scipy import optimize, stats
 
-from snrmjax.numerics.result import AbstractResult, Variable
-from snrmjax.study.uncertainty.moments import (
-    ERRORS,
-    STATISTICS,
-    first_order,
-    first_order_error,
-    scatter_limit,
-    second_order,
-)
+from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
 from snrmjax.study.uncertainty.quantities import Quantities
 
 METHOD_NAMES = ("first order", "second order")
+STATISTICS = ("mean", "std", "lower", "upper")  # lower, upper: 2.5 and 97.5 % points
+ERRORS = ("mean", "std", "range")
+_TAILS = (0.025, 0.975)
+_MEMBERS = 2**14  # of a quadratic, whose percentage points are read from them
+_SCALES = np.geomspace(1e-3, 1e3, 121)
 _WRONG = 0.1  # error of first order that is worth a note
+
+Statistics = Float[np.ndarray, "statistic quantity"]
 
 
 class Propagation(AbstractResult):
@@ -33,10 +33,16 @@ class Propagation(AbstractResult):
     coordinates: ClassVar[tuple[str, ...]] = ("quantity", "approach", "statistic", "error")
 
     quantities: Quantities
-    statistics: Float[np.ndarray, "method statistic quantity"]
-    first_order_error: Float[np.ndarray, "error quantity"]
-    scatter_limit: Float[np.ndarray, "error quantity"]
-    notes: tuple[str, ...] = eqx.field(static=True)
+    statistics: Float[np.ndarray, "method statistic quantity"] = quantity(
+        "approach statistic quantity", "SI", "statistic", name="value"
+    )
+    first_order_error: Float[np.ndarray, "error quantity"] = quantity(
+        "error quantity", "1", "error of first order"
+    )
+    scatter_limit: Float[np.ndarray, "error quantity"] = quantity(
+        "error quantity", "1", "scatter of a 10 % error"
+    )
+    notes: tuple[Fact, ...] = setting()
 
     def summary(self) -> tuple[str, ...]:
         """A line a quantity and method, then what is wrong."""
@@ -46,33 +52,27 @@ class Propagation(AbstractResult):
         ]
         for q, name in enumerate(about.names):
             lines.append(f"{name}: {about.value[q]:.6g} at the medians")
-            for m, method in enumerate(METHOD_NAMES):
-                mean, std, lower, upper = self.statistics[m, :, q]
+            for method, (mean, std, lower, upper) in zip(
+                METHOD_NAMES, self.statistics[:, :, q], strict=True
+            ):
                 lines.append(
                     f"  {method}: {mean:.6g} ± {std:.3g} (1σ), 95 % from {lower:.6g} to {upper:.6g}"
                 )
         return (*lines, *(f"note: {note}" for note in self.notes))
 
     def variables(self) -> dict[str, Variable]:
-        """Statistics by method, and what first order lacks."""
-        of, names = ("error", "quantity"), np.array(self.quantities.names)
-        methods = np.array([name.replace(" ", "_") for name in METHOD_NAMES])
-        return {
-            "quantity": Variable(("quantity",), names, "", "quantity"),
-            "approach": Variable(("approach",), methods, "", "method"),
-            "statistic": Variable(("statistic",), np.array(STATISTICS), "", "statistic"),
-            "error": Variable(("error",), np.array(ERRORS), "", "in which first order errs"),
-            "nominal": Variable(("quantity",), self.quantities.value, "SI", "at the medians"),
-            "value": Variable(
-                ("approach", "statistic", "quantity"), self.statistics, "SI", "statistic"
-            ),
-            "first_order_error": Variable(of, self.first_order_error, "1", "error of first order"),
-            "scatter_limit": Variable(of, self.scatter_limit, "1", "scatter of a 10 % error"),
+        """Statistics by method, what first order lacks, and the values at the medians."""
+        labels = {
+            "quantity": (self.quantities.names, "quantity"),
+            "approach": ([name.replace(" ", "_") for name in METHOD_NAMES], "method"),
+            "statistic": (STATISTICS, "statistic"),
+            "error": (ERRORS, "in which first order errs"),
         }
-
-    def attributes(self) -> dict[str, str | float | int]:
-        """The notes."""
-        return {"notes": "\n".join(self.notes)}
+        return {
+            **{k: Variable((k,), np.array(names), "", text) for k, (names, text) in labels.items()},
+            "nominal": Variable(("quantity",), self.quantities.value, "SI", "at the medians"),
+            **super().variables(),
+        }
 
 
 def propagate_uncertainty(quantities: Quantities) -> Propagation:
@@ -90,22 +90,26 @@ def propagate_uncertainty(quantities: Quantities) -> Propagation:
     doi:10.1115/1.1446068.
 
     >>> from snrmjax.study.uncertainty.quantities import function_quantities
-    >>> from snrmjax.study.variations import normal
-    >>> square = function_quantities(lambda x: x**2, [normal("x", 1.0, 0.2)], ["y"])
+    >>> from snrmjax.study.variations import Normal
+    >>> square = function_quantities(lambda x: x**2, [Normal("x", 1.0, 0.2)], ["y"])
     >>> found = propagate_uncertainty(square)
     >>> found.statistics[:, 0, 0].round(6).tolist()
     [1.0, 1.04]
     """
     first, second = first_order(quantities), second_order(quantities)
     error, limit = first_order_error(first, second), scatter_limit(quantities)
+    worst = np.nanmax(error, axis=0, initial=0.0)
     notes = [
-        f"first order is wrong for {name} by {100 * worst:.0f} %: its 95 % range is"
-        f" {first[2, q]:.6g} to {first[3, q]:.6g}, by second order {second[2, q]:.6g} to"
-        f" {second[3, q]:.6g}; it errs by 10 % from {limit[:, q].min():.2g} times this scatter on"
-        for q, (name, worst) in enumerate(
-            zip(quantities.names, np.nanmax(error, axis=0, initial=0.0).tolist(), strict=True)
+        Fact(
+            "first_order_wrong",
+            quantity=name,
+            error=float(worst[q]),
+            first=tuple(first[2:, q].tolist()),
+            second=tuple(second[2:, q].tolist()),
+            limit=float(limit[:, q].min()),
         )
-        if worst > _WRONG
+        for q, name in enumerate(quantities.names)
+        if worst[q] > _WRONG
     ]
     return Propagation(
         quantities=quantities,
@@ -114,3 +118,84 @@ def propagate_uncertainty(quantities: Quantities) -> Propagation:
         scatter_limit=limit,
         notes=(*quantities.notes, *notes),
     )
+
+
+def first_order(about: Quantities, scale: float = 1.0) -> Statistics:
+    """Statistics of f₀ + gᵀz, z standard normal numbers times `scale`: normal."""
+    spread = scale * np.linalg.norm(about.gradient, axis=1)
+    reach = float(stats.norm.ppf(_TAILS[1])) * spread
+    return np.stack([about.value, spread, about.value - reach, about.value + reach])
+
+
+def second_order(about: Quantities) -> Statistics:
+    """Statistics of f₀ + gᵀz + ½ zᵀHz, z standard normal numbers.
+
+    The mean f₀ + ½ tr H and the variance gᵀg + ½ tr H² are exact; the percentage points are
+    those of 2^14 members of a Sobol' sequence.
+    """
+    linear, quadratic = _members(about)
+    ends = about.value + np.quantile(linear + quadratic, _TAILS, axis=0)
+    return np.stack([*_exact(about, 1.0), *ends])
+
+
+def first_order_error(first: Statistics, reference: Statistics) -> Float[np.ndarray, "error q"]:
+    """By how much first order errs, relative to the reference's spread; a row of `ERRORS` each.
+
+    Its mean in reference standard deviations; its standard deviation; and the farther end of its
+    95 % range in half widths of the reference range.
+    """
+    spread, half_width = reference[1], 0.5 * (reference[3] - reference[2])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ends = np.max(np.abs(first[2:] - reference[2:]), axis=0) / half_width
+        mean = np.abs(first[0] - reference[0]) / spread
+        return np.stack([mean, np.abs(first[1] / spread - 1), ends])
+
+
+def scatter_limit(about: Quantities, error: float = 0.1) -> Float[np.ndarray, "error q"]:
+    """The scale of all inputs' scatter from which first order errs by `error`, by second order.
+
+    1 is the stated scatter; a row of `ERRORS` each. Found by Brent's method where the error first
+    passes the value; infinite where it does not up to a scale of 1000.
+    """
+    linear, quadratic = _members(about)
+
+    def excess(scale: float) -> Float[np.ndarray, "error q"]:
+        mine = first_order(about, scale)
+        # First order is sampled with the same members, so that the sequence's own error does not
+        # count.
+        ends = mine[2:] - np.quantile(scale * linear, _TAILS, axis=0)
+        ends = ends + np.quantile(scale * linear + scale**2 * quadratic, _TAILS, axis=0)
+        return first_order_error(mine, np.stack([*_exact(about, scale), *ends])) - error
+
+    above = np.array([excess(float(scale)) for scale in _SCALES]) > 0
+    result = np.full(above.shape[1:], np.inf)
+    for row, q in np.argwhere(above.any(axis=0)).tolist():
+        k = int(np.argmax(above[:, row, q]))
+        if k == 0:
+            result[row, q] = 0.0  # no gradient: first order errs at any scatter
+            continue
+        root = optimize.brentq(
+            lambda log_scale, row=row, q=q: excess(float(np.exp(log_scale)))[row, q],
+            *np.log(_SCALES[k - 1 : k + 1]).tolist(),
+            xtol=1e-4,
+        )
+        result[row, q] = np.exp(root)
+    return result
+
+
+def _exact(about: Quantities, scale: float) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and standard deviation of the quadratic."""
+    curvature = scale**2 * about.hessian
+    mean = about.value + 0.5 * np.trace(curvature, axis1=1, axis2=2)
+    square = scale**2 * np.sum(about.gradient**2, axis=1) + 0.5 * np.sum(curvature**2, axis=(1, 2))
+    return mean, np.sqrt(square)
+
+
+def _members(about: Quantities) -> tuple[np.ndarray, np.ndarray]:
+    """Linear and quadratic part of members of the quadratic, of unit scatter."""
+    n = about.gradient.shape[1]
+    (seed,) = np.random.SeedSequence([0, 1]).spawn(1)
+    sequence = stats.qmc.Sobol(n, rng=np.random.default_rng(seed))
+    z = stats.qmc.MultivariateNormalQMC(np.zeros(n), engine=sequence).random(_MEMBERS)
+    bends = [0.5 * np.einsum("mi,ij,mj->m", z, h, z, optimize=True) for h in about.hessian]
+    return z @ about.gradient.T, np.stack(bends, axis=1)

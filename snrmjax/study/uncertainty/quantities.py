@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from snrmjax.model.parameters import checked_names, with_parameters
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.facts import Fact
 from snrmjax.simulate.balance.labelled import HERTZ
 from snrmjax.simulate.continuation.response_curve import ResponseCurve
 from snrmjax.simulate.solutions.forced_response import ResponseSettings, forced_response_batch
@@ -34,7 +35,7 @@ class Quantities(eqx.Module):
     gradient: Float[np.ndarray, "quantity input"] = eqx.field(converter=np.asarray)
     hessian: Float[np.ndarray, "quantity input input"] = eqx.field(converter=np.asarray)
     names: tuple[str, ...] = eqx.field(static=True)
-    notes: tuple[str, ...] = eqx.field(static=True, default=())
+    notes: tuple[Fact, ...] = eqx.field(static=True, default=())
 
 
 def function_quantities(
@@ -44,8 +45,8 @@ def function_quantities(
 ) -> Quantities:
     """The results of a JAX function of a vector of the uncertain numbers.
 
-    >>> from snrmjax.study.variations import normal
-    >>> varied = normal("a", 1.0, 0.1), normal("b", 2.0, 0.2)
+    >>> from snrmjax.study.variations import Normal
+    >>> varied = Normal("a", 1.0, 0.1), Normal("b", 2.0, 0.2)
     >>> area = function_quantities(lambda x: x[:1] * x[1], varied, ["area_m2"])
     >>> area.gradient.round(12).tolist()
     [[0.2, 0.2]]
@@ -83,8 +84,8 @@ def response_quantities(
     another peak that becomes the highest): a `Study` of the same `varied` does.
 
     >>> from snrmjax.model import flat_beam
-    >>> from snrmjax.study.variations import normal
-    >>> beam, varied = flat_beam(), [normal("mode_1.damping_ratio", 0.05, 0.005)]
+    >>> from snrmjax.study.variations import Normal
+    >>> beam, varied = flat_beam(), [Normal("mode_1.damping_ratio", 0.05, 0.005)]
     >>> found = response_quantities(beam, varied, 480.0, 520.0, force=2e-4, harmonic_order=1)
     >>> found.names[:2]
     ('peak_frequency_hz', 'peak_velocity_m_s')
@@ -109,34 +110,34 @@ def response_quantities(
     (curves,) = forced_response_batch(
         middle, float(middle_force), from_frequency, to_frequency, settings=settings
     ).curves
-    parts, names, notes = [], [], []
+    parts: list[list] = []
+    names: list[str] = []
+    notes: list[Fact] = []
     for kind in dict.fromkeys(kinds):
         events = _events(curves, kind)
         if not events:
-            notes.append(
-                f"the nominal response has no {kind.replace('_', ' ')} from"
-                f" {from_frequency / HERTZ:.5g} to {to_frequency / HERTZ:.5g} Hz"
-            )
+            ends = {"low_hz": from_frequency / HERTZ, "high_hz": to_frequency / HERTZ}
+            notes.append(Fact("no_event_in_response", event=kind, **ends))
         for number, (curve, k) in enumerate(events, 1):
             name = {"phase_resonance": "resonance", "fold": f"fold_{number}"}.get(kind, kind)
             *part, converged = _of_event(nominal, inputs, kind, curve.point(k))
             if not bool(converged):
-                notes.append(f"{name} was not found again from the curve and is left out")
+                notes.append(Fact("event_not_found_again", event=name))
                 continue
             parts.append(part)
             names += [f"{name}_frequency_hz", f"{name}_velocity_m_s"]
     if not parts:
-        raise ValueError(f"nothing to propagate to: {'; '.join(notes) or 'no kinds'}.")
+        raise ValueError(f"nothing to propagate to: {'; '.join(map(str, notes)) or 'no kinds'}.")
     value, gradient, hessian = (np.concatenate(column) for column in zip(*parts, strict=True))
     return Quantities(value, gradient, hessian, tuple(names), tuple(notes))
 
 
 def _events(curves: Sequence[ResponseCurve], kind: EventKind) -> list[tuple[ResponseCurve, int]]:
     """Where the events are: folds in order, of others the one with the largest velocity."""
-    every = [(curve, int(k)) for curve in curves for k in curve.at_events(kind)]
-    if kind == "fold" or not every:
-        return every
-    return [max(every, key=lambda at: float(np.abs(at[0].velocity[at[1], 1, 0])))]
+    places = [(curve, int(k)) for curve in curves for k in curve.at_events(kind)]
+    if kind == "fold" or not places:
+        return places
+    return [max(places, key=lambda at: float(np.abs(at[0].velocity[at[1], 1, 0])))]
 
 
 class _Inputs(NamedTuple):
@@ -180,18 +181,19 @@ class _Series(NamedTuple):
 class _Nominal(NamedTuple):
     """Model and force as functions of z."""
 
-    own: Structure
+    model: Structure
     force: Float[np.ndarray, ""]  # N, where it is not uncertain
     series: _Series | None  # where what is uncertain are no numbers of the model
 
     def at(self, inputs: _Inputs, z: Float[Array, " input"]) -> tuple[Structure, Float[Array, ""]]:
         """Model and force at standard normal numbers."""
-        values, model = inputs.values(z), self.own
-        own = [k for k, name in enumerate(inputs.names) if name != FORCE]
+        values, model = inputs.values(z), self.model
+        of_model = [k for k, name in enumerate(inputs.names) if name != FORCE]
         if self.series is not None:
             model = self.series.model(z)
-        elif own:
-            model = with_parameters(model, [inputs.names[k] for k in own], values[np.array(own)])
+        elif of_model:
+            names = [inputs.names[k] for k in of_model]
+            model = with_parameters(model, names, values[np.array(of_model)])
         if FORCE in inputs.names:
             return model, values[inputs.names.index(FORCE)]
         return model, jnp.asarray(self.force)
@@ -212,16 +214,17 @@ def _derivatives(
     """Value, gradient and Hessian at z = 0 of the first result, then the second as it is."""
 
     def value(z: Array) -> tuple[Array, tuple[Array, Any]]:
-        found, rest = function(z)
-        return found, (found, rest)
+        first, rest = function(z)
+        return first, (first, rest)
 
     def slopes(z: Array) -> tuple[Array, tuple]:
-        gradient, (found, rest) = jax.jacfwd(value, has_aux=True)(z)
-        return gradient, (found, gradient, rest)
+        gradient, (first, rest) = jax.jacfwd(value, has_aux=True)(z)
+        return gradient, (first, gradient, rest)
 
-    hessian, known = jax.jacfwd(slopes, has_aux=True)(jnp.zeros(len(inputs.names)))
-    found, gradient, rest = known
-    return found, gradient, hessian, rest
+    hessian, (first, gradient, rest) = jax.jacfwd(slopes, has_aux=True)(
+        jnp.zeros(len(inputs.names))
+    )
+    return first, gradient, hessian, rest
 
 
 @compiled

@@ -1,41 +1,72 @@
-"""Which varied quantities make a study's outputs vary: Sobol' indices."""
+"""Which varied quantities make a study's outputs vary: main effects and Sobol' indices.
+
+The first-order index S = Var(E[y | x])/Var(y) is by how much the variance of the output y would
+fall on average if x were known. `main_effect` reads it off the members of any sample, as the
+variance of a curve; `sobol_indices` off the pairs of Saltelli's scheme, together with the total
+index, which such a curve cannot give.
+"""
 
 import json
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.result import AbstractResult, quantity, setting
 
 if TYPE_CHECKING:
     import xarray
 
+FEWEST = 50  # members from which shares are estimated
+_FEW_VALUES = 12  # a quantity that takes no more than these has a mean for each
+_PIECES, _MEMBERS_A_PIECE = 7, 64
+_DEGREE = 3
+_GROUPS = 20  # of the jackknife
+_SHOWN = 101
 _RESAMPLES = 200
 _FEWEST_ROWS = 16
 _FEW = 0.05  # share of the rows beyond which what is left out is worth a note
 _NORMAL_95 = 1.959964  # half width of the 95 % interval, in 1σ
 
 
+class MainEffect(NamedTuple):
+    """What one varied quantity alone does to an output."""
+
+    share: float  # first-order index
+    half_width: float  # of its 95 % interval
+    at: Float[np.ndarray, " place"]  # values of the quantity
+    mean: Float[np.ndarray, " place"]  # conditional mean of the output
+    error: Float[np.ndarray, " place"]  # half width of the 95 % band of that mean
+
+
 class SobolIndices(AbstractResult):
     """Shares of an output's variance by varied quantity: alone (first), with interactions (total).
 
-    Quantities that vary together are one input.
+    Quantities that vary together are one input. Half widths are of 95 % intervals, by bootstrap.
     """
 
     coordinates: ClassVar[tuple[str, ...]] = ("quantity", "input")
 
-    first: Float[np.ndarray, "quantity input"]
-    first_half_width: Float[np.ndarray, "quantity input"]  # of the 95 % interval, by bootstrap
-    total: Float[np.ndarray, "quantity input"]
-    total_half_width: Float[np.ndarray, "quantity input"]
-    variance: Float[np.ndarray, " quantity"]
-    rows: np.ndarray  # of Saltelli's scheme that were used of each quantity
-    names: tuple[str, ...] = eqx.field(static=True)
-    input_names: tuple[str, ...] = eqx.field(static=True)
     units: tuple[str, ...] = eqx.field(static=True)
-    notes: tuple[str, ...] = eqx.field(static=True)
+    first: Float[np.ndarray, "quantity input"] = quantity(
+        "quantity input", "1", "first-order index"
+    )
+    first_half_width: Float[np.ndarray, "quantity input"] = quantity(
+        "quantity input", "1", "half width of the 95 % interval"
+    )
+    total: Float[np.ndarray, "quantity input"] = quantity("quantity input", "1", "total index")
+    total_half_width: Float[np.ndarray, "quantity input"] = quantity(
+        "quantity input", "1", "half width of the 95 % interval"
+    )
+    variance: Float[np.ndarray, " quantity"] = quantity("quantity", "SI", "variance")
+    rows: np.ndarray = quantity("quantity", "1", "rows of Saltelli's scheme used")
+    names: tuple[str, ...] = quantity("quantity", "", "output", name="quantity", static=True)
+    input_names: tuple[str, ...] = quantity(
+        "input", "", "varied quantity", name="input", static=True
+    )
+    notes: tuple[Fact, ...] = setting()
 
     def summary(self) -> tuple[str, ...]:
         """Inputs of every quantity by their total index."""
@@ -50,23 +81,53 @@ class SobolIndices(AbstractResult):
                 )
         return (*lines, *(f"note: {note}" for note in self.notes))
 
-    def variables(self) -> dict[str, Variable]:
-        """Indices with their 95 % intervals, by quantity and input."""
-        at, text = ("quantity", "input"), "half width of the 95 % interval"
-        return {
-            "quantity": Variable(("quantity",), np.array(self.names), "", "output"),
-            "input": Variable(("input",), np.array(self.input_names), "", "varied quantity"),
-            "first": Variable(at, self.first, "1", "first-order index"),
-            "first_half_width": Variable(at, self.first_half_width, "1", text),
-            "total": Variable(at, self.total, "1", "total index"),
-            "total_half_width": Variable(at, self.total_half_width, "1", text),
-            "variance": Variable(("quantity",), self.variance, "SI", "variance"),
-            "rows": Variable(("quantity",), self.rows, "1", "rows used"),
-        }
 
-    def attributes(self) -> dict[str, str | float | int]:
-        """The notes."""
-        return {"notes": "\n".join(self.notes)}
+def main_effect(
+    quantity: Float[np.ndarray, " member"], output: Float[np.ndarray, " member"]
+) -> MainEffect | None:
+    """Share of variance and conditional mean of an output over one quantity.
+
+    The conditional mean is a cubic regression spline, or the mean of each value where the quantity
+    takes few. Members without an output are left out. The share is corrected for the freedom of
+    the curve (adjusted R²), its interval is by the jackknife over twenty groups of members.
+    Returns None with fewer than `FEWEST` members, or where one of the two does not vary.
+    """
+    known = np.isfinite(output) & np.isfinite(quantity)
+    x, y = quantity[known], output[known]
+    if len(y) < FEWEST or not np.ptp(x) > 0 or not np.ptp(y) > 0:
+        return None
+    values = np.unique(x)
+    listed = len(values) <= _FEW_VALUES
+    low, high = np.quantile(x, [0.005, 0.995]).tolist()
+    at = values if listed else np.linspace(low, high, _SHOWN)
+    knots = values if listed else _knots(x)
+    basis = _levels if listed else _splines
+    scale = y.std()
+    centred = (y - y.mean()) / scale
+    # Sums over members from which a fit follows: products of the basis, the output and one.
+    table = np.column_stack([basis(x, knots), centred, np.ones(len(y))])
+    groups = [table[k::_GROUPS].T @ table[k::_GROUPS] for k in range(_GROUPS)]
+    total = np.sum(groups, axis=0)
+    coefficients, covariance, share = _fit(total)
+    without = np.array([_fit(total - one)[2] for one in groups])
+    std = np.sqrt((_GROUPS - 1) / _GROUPS * np.sum((without - without.mean()) ** 2))
+    rows = basis(at, knots)
+    error = np.sqrt(np.maximum(np.sum((rows @ covariance) * rows, axis=1), 0.0))
+    mean = y.mean() + scale * (rows @ coefficients)
+    return MainEffect(share, _NORMAL_95 * float(std), at, mean, _NORMAL_95 * scale * error)
+
+
+def correlated_pairs(quantities: dict[str, Float[np.ndarray, " member"]]) -> list[tuple[str, str]]:
+    """Varied quantities whose ranks are correlated: shares then overlap."""
+    from scipy.stats import rankdata
+
+    names = [name for name, values in quantities.items() if np.ptp(values) > 0]
+    if len(names) < 2 or len(quantities[names[0]]) < FEWEST:
+        return []
+    ranks = np.array([rankdata(quantities[name]) for name in names])
+    limit = max(0.1, 4 / np.sqrt(ranks.shape[1]))
+    alike = np.abs(np.corrcoef(ranks)) > limit
+    return [(names[i], names[j]) for i, j in zip(*np.nonzero(np.triu(alike, 1)), strict=True)]
 
 
 def sobol_indices(data: "xarray.Dataset", *, seed: int = 0) -> SobolIndices:
@@ -93,16 +154,16 @@ def sobol_indices(data: "xarray.Dataset", *, seed: int = 0) -> SobolIndices:
     inputs = [", ".join(one["names"]) for one in study["variations"]]
     columns, units = _outputs(data)
     a_row = len(inputs) + 2
-    every, variance, rows = [], [], []
+    indices, variance, rows = [], [], []
     for values in columns.values():
         table = values.reshape(-1, a_row)
         kept = table[np.isfinite(table).all(axis=1)]
         rows.append(len(kept))
         variance.append(float(np.var(kept)) if len(kept) else np.nan)
         known = len(kept) >= _FEWEST_ROWS and variance[-1] > 0
-        every.append(_indices(kept, seed) if known else np.full((4, len(inputs)), np.nan))
+        indices.append(_indices(kept, seed) if known else np.full((4, len(inputs)), np.nan))
     missing = 1 - a_row * np.array(rows) / data.sizes["member"]
-    first, first_half_width, total, total_half_width = np.stack(every, axis=1)
+    first, first_half_width, total, total_half_width = np.stack(indices, axis=1)
     return SobolIndices(
         first=first,
         first_half_width=first_half_width,
@@ -114,8 +175,7 @@ def sobol_indices(data: "xarray.Dataset", *, seed: int = 0) -> SobolIndices:
         input_names=tuple(inputs),
         units=units,
         notes=tuple(
-            f"{name}: {100 * share:.2g} % of the rows are left out, because there it does not"
-            " exist: these are the numbers of the others"
+            Fact("rows_without_value", output=name, share=share)
             for name, share in zip(columns, missing.tolist(), strict=True)
             if share > _FEW
         ),
@@ -139,10 +199,10 @@ def _indices(values: Float[np.ndarray, "row member"], seed: int) -> Float[np.nda
     """First and total indices, each followed by its half width by the bootstrap over rows."""
 
     def of(rows: np.ndarray) -> np.ndarray:
-        own, mixed, other = rows[..., :1], rows[..., 1:-1], rows[..., -1:]
-        variance = np.var(np.concatenate([own, other], axis=-2), axis=-2)
-        first = np.mean(other * (mixed - own), axis=-2) / variance
-        return np.stack([first, np.mean((own - mixed) ** 2, axis=-2) / (2 * variance)])
+        base, mixed, other = rows[..., :1], rows[..., 1:-1], rows[..., -1:]
+        variance = np.var(np.concatenate([base, other], axis=-2), axis=-2)
+        first = np.mean(other * (mixed - base), axis=-2) / variance
+        return np.stack([first, np.mean((base - mixed) ** 2, axis=-2) / (2 * variance)])
 
     # Centred: the product of the first index loses digits to a mean.
     centred = values - values.mean()
@@ -150,3 +210,34 @@ def _indices(values: Float[np.ndarray, "row member"], seed: int) -> Float[np.nda
     with np.errstate(invalid="ignore"):  # rows drawn again and again may not vary
         half_width = _NORMAL_95 * np.nanstd(of(centred[drawn]), axis=1, ddof=1)
     return np.stack([of(centred), half_width], axis=1).reshape(4, -1)
+
+
+def _fit(sums: Float[np.ndarray, "sum sum"]) -> tuple[np.ndarray, np.ndarray, float]:
+    """Coefficients, their covariance and the adjusted R²; a place without members has neither."""
+    basis, with_output, n = sums[:-2, :-2], sums[:-2, -2], sums[-1, -1]
+    inverse = np.linalg.pinv(basis, rcond=1e-10, hermitian=True)
+    coefficients = inverse @ with_output
+    left = max(sums[-2, -2] - coefficients @ with_output, 0.0) / max(n - len(coefficients), 1)
+    variance = (sums[-2, -2] - sums[-2, -1] ** 2 / n) / (n - 1)
+    return coefficients, inverse * left, float(1.0 - left / variance)
+
+
+def _knots(x: Float[np.ndarray, " member"]) -> Float[np.ndarray, " knot"]:
+    """Knots of a clamped spline: as many members lie in every piece."""
+    pieces = int(np.clip(len(x) // _MEMBERS_A_PIECE, 1, _PIECES))
+    inner = np.unique(np.quantile(x, np.linspace(0, 1, pieces + 1)))
+    return np.concatenate([[inner[0]] * _DEGREE, inner, [inner[-1]] * _DEGREE])
+
+
+def _splines(
+    x: Float[np.ndarray, " member"], knots: Float[np.ndarray, " knot"]
+) -> Float[np.ndarray, "member place"]:
+    from scipy.interpolate import BSpline
+
+    return BSpline.design_matrix(x, knots, _DEGREE).toarray()
+
+
+def _levels(
+    x: Float[np.ndarray, " member"], values: Float[np.ndarray, " value"]
+) -> Float[np.ndarray, "member value"]:
+    return (x[:, None] == values[None, :]).astype(np.float64)

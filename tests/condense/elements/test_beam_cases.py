@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from snrmjax.condense.elements.beam import Beam, PointMass, Support, rise_of_radius
-from snrmjax.condense.elements.beam_cases import static_cases
 from snrmjax.condense.elements.beam_modes import beam_modes
+from snrmjax.condense.elements.statics import static_cases
 from snrmjax.condense.load_set import modal_loads
 from snrmjax.condense.potential_fit import fit_potential
 from snrmjax.model.arches import ArchSettings, shallow_arch

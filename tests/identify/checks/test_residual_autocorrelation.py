@@ -72,7 +72,7 @@ def test_bands_cover_curves_whose_neighbouring_residuals_are_correlated():
         found = np.stack([values.natural_frequency, values.modal_damping])
         std = np.stack([values.natural_frequency_std, values.modal_damping_std])
         scores.append(np.abs(found - want) / std)
-        notes += any("neighbouring points" in note for note in fit.notes)
+        notes += any(note.kind == "residuals_correlated" for note in fit.notes)
     assert notes == tests
     # As if every state were apart, 85 % would be inside, for all that the fits take for levels
     # that differ.

@@ -6,9 +6,8 @@ from truths.exact_states import CONSTANT, NOISE, OMEGA, TRUE, modes, noisy, stat
 from truths.joint_fits import noisy_fit
 
 import snrmjax as sj
-from snrmjax.identify.inference import refits
 from snrmjax.identify.inference.contributions import contributions
-from snrmjax.identify.inference.refits import IntervalEnd, bootstrap, profile
+from snrmjax.identify.inference.refits import bootstrap
 
 
 @pytest.fixture(scope="module")
@@ -57,43 +56,6 @@ def test_contributions_near_resonance_of_a_linear_mode_are_known():
 
 
 @pytest.mark.long
-def test_a_profile_of_a_quadratic_unknown_is_its_standard_deviation(fit):
-    found = profile(fit, "damping.viscous")
-    std = np.sqrt(fit.covariance[2, 2])
-    value = float(fit.vector()[0][2])
-    assert found.lower == pytest.approx(value - 1.96 * std, abs=0.1 * std)
-    assert found.upper == pytest.approx(value + 1.96 * std, abs=0.1 * std)
-    assert np.all(found.rise > -1e-6)
-    with pytest.raises(ValueError, match="no unknown"):
-        profile(fit, "damping.dry")
-
-
-@pytest.mark.parametrize(
-    ("failed", "end", "status"),
-    [
-        ([8], 2.0, IntervalEnd.BRACKETED),  # within: neighbours bracket the end all the same
-        ([9], 1.75, IntervalEnd.BRACKETED),  # between χ² of 0.96 at 1 and of 8.64 at 3
-        ([12], 2.0, IntervalEnd.BRACKETED),  # beyond it
-        ([*range(9, 15)], np.nan, IntervalEnd.NOT_COMPUTED),
-        ([], np.inf, IntervalEnd.BEYOND_REACH),
-    ],
-)
-def test_a_profile_does_not_pass_through_refits_that_failed(fit, monkeypatch, failed, end, status):
-    """χ² that rises by 3.84 two values from the best one, with refits that failed."""
-    offsets = np.arange(-7, 8)
-    rise = 3.84 * (offsets / 2) ** 2 if end != np.inf else 0.01 * offsets**2.0
-    rise[failed] = np.nan
-    monkeypatch.setattr(refits, "_pinned", lambda *_: 100.0 + rise)
-    found = profile(fit, "damping.viscous", n_points=15, reach=7.0)
-    middle, std = float(fit.vector()[0][2]), np.sqrt(fit.covariance[2, 2])
-    assert found.upper_status == status
-    assert (found.upper - middle) / std == pytest.approx(end, nan_ok=True)
-    lower = -np.inf if end == np.inf else -2.0
-    assert (found.lower - middle) / std == pytest.approx(lower)
-    assert found.lower_status != IntervalEnd.NOT_COMPUTED
-
-
-@pytest.mark.long
 def test_the_bootstrap_knows_the_states_but_not_what_levels_share():
     independent = sj.fit_jointly(noisy(3, per_level=25), modes(), **TRUE)
     drawn = bootstrap(independent, 100)
@@ -117,12 +79,3 @@ def test_a_bootstrap_of_levels_sees_their_scatter():
     good = np.all(np.isfinite(found), axis=1)
     assert np.mean(good) > 0.5
     assert np.std(found[good, 3]) > np.std(inside[:, 3])
-
-
-def test_a_profile_says_itself_and_is_drawn(fit, monkeypatch):
-    monkeypatch.setattr(refits, "_pinned", lambda *_: 3.84 * (np.arange(-7, 8) / 2) ** 2)
-    found = profile(fit, "damping.viscous", n_points=15, reach=7.0)
-    assert "between two computed values" in repr(found)
-    assert found.to_xarray()["value"].attrs["units"] == "1/s"
-    assert list(found.to_pandas()["rise"]) == list(found.rise)
-    assert found.plot().axes

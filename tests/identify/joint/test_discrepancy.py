@@ -86,5 +86,6 @@ def test_a_free_force_gain_moves_no_velocity():
     # Gains of 1 on the mean; what levels have in common is the instrument's.
     assert float(np.exp(fit.unknowns.log_force_gain)) == pytest.approx(3.0, rel=0.02)
     assert fit.largest[1] == pytest.approx(np.max(np.abs(velocity)), rel=1e-12)
-    (note,) = (note for note in fit.notes if "scaled the forces" in note)
-    assert "1 to 4 by +" in note
+    (note,) = (note for note in fit.notes if note.get("of") == "forces")
+    assert note["levels"] == (1, 2, 3, 4)
+    assert note["change"][0] > 0

@@ -18,8 +18,7 @@ from snrmjax.identify.joint.force_balance import (
     balance_data,
     weighting_at,
 )
-from snrmjax.identify.joint.free_unknowns import Unravel
-from snrmjax.identify.joint.residuals import all_residuals
+from snrmjax.identify.joint.free_unknowns import Unravel, all_residuals
 
 
 def drawn():

@@ -1,4 +1,4 @@
-"""Backbones of a Duffing-like mode in closed form: exact values, bands, anchors, refusals."""
+"""Backbones of a Duffing-like mode in closed form: exact values, bands, refusals."""
 
 import equinox as eqx
 import jax
@@ -62,10 +62,9 @@ def fitted(data, modes=MODES, **settings):
 
 
 class TestExactPoints:
-    @pytest.mark.parametrize("anchor", [False, True])
     @pytest.mark.parametrize("seed", [0, 1])
-    def test_a_duffing_backbone_is_recovered(self, seed, anchor):
-        found = fitted(duffing_test(seed, stated=False), anchor=anchor)
+    def test_a_duffing_backbone_is_recovered(self, seed):
+        found = fitted(duffing_test(seed, stated=False))
         values = found.backbone.values(GRID)
         # Noise is taken to be 1e-5 at least, and to grow off resonance.
         np.testing.assert_allclose(values.natural_frequency, np.sqrt(squared(GRID)), rtol=1e-6)
@@ -191,49 +190,6 @@ class TestStd:
         assert np.isfinite(broken.natural_frequency(at)[0])
         assert np.isnan(broken.natural_frequency(at)[1])
         assert np.isnan(broken.damping_ratio(at)[1])
-
-
-class TestAnchor:
-    def test_it_meets_the_linear_mode_exactly(self):
-        data = duffing_test(0, amplitude=0.01, phase=0.01)
-        backbone, zero = fitted(data, anchor=True).backbone, jnp.zeros(1)
-        np.testing.assert_allclose(backbone.natural_frequency(zero), W0, rtol=1e-12)
-        np.testing.assert_allclose(backbone.damping_ratio(zero), RATE / (2 * W0), rtol=1e-12)
-        np.testing.assert_allclose(backbone.values(zero).natural_frequency_std, 0.0, atol=1e-6)
-        assert float(backbone.smallest) == 0
-        assert fitted(data).anchor is None
-
-    def test_without_an_error_nothing_is_moved(self):
-        exact = fitted(duffing_test(0, stated=False), anchor=True).anchor
-        # Steps of the fit end at 1e-9.
-        assert abs(exact.frequency_gap) < 1e-6 * W0
-        assert abs(exact.damping_gap) < 1e-8
-        assert abs(exact.largest_frequency_shift) < 1e-6 * W0
-        assert abs(exact.largest_damping_shift) < 1e-8
-
-    @pytest.mark.long
-    def test_gaps_of_noisy_tests_are_as_large_as_stated(self):
-        ratios = []
-        for seed in range(20):
-            report = fitted(
-                duffing_test(seed, amplitude=0.01, phase=0.01), anchor=True, n_knots=4
-            ).anchor
-            ratios.append(report.frequency_gap / report.frequency_gap_std)
-            ratios.append(report.damping_gap / report.damping_gap_std)
-        # 40 draws know an rms to 11 %; bands of few levels are a little wide.
-        assert 0.5 < np.sqrt(np.mean(np.square(ratios))) < 1.5
-
-    def test_a_linear_mode_that_is_off_is_reported(self):
-        wrong = linear_modes([W0 + 2.0], [1.2 * RATE / (2 * W0)], [[SHAPE]], [PARTICIPATION])
-        report = fitted(duffing_test(0, stated=False), wrong, anchor=True).anchor
-        np.testing.assert_allclose(report.frequency_gap, -2.0, rtol=1e-4)
-        # The gap is given at the linear mode's frequency, ω0 + 2.
-        truth = RATE / (2 * (W0 + 2.0)) - 1.2 * RATE / (2 * W0)
-        np.testing.assert_allclose(report.damping_gap, truth, rtol=1e-4)
-        # Among the points the curves move towards the linear mode, if at all, and not beyond it;
-        # where the penalty is weak they bend below the points alone.
-        assert -0.02 < report.largest_frequency_shift <= 2.0
-        assert -0.01 * abs(truth) < report.largest_damping_shift <= abs(truth)
 
 
 class TestRefusals:

@@ -8,6 +8,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.interpolate import PchipInterpolator
 from scipy.optimize import brentq
+from truths.shape_preserving import ShapePreservingCurve
 
 from snrmjax.identify.pointwise.backbone import Backbone
 from snrmjax.identify.pointwise.prediction import (
@@ -15,7 +16,6 @@ from snrmjax.identify.pointwise.prediction import (
     predict_response,
     resonances,
 )
-from snrmjax.methods.steady.mode_synthesis import ShapePreservingCurve
 from snrmjax.model.modes import RigidBodyModes, linear_modes, residual_velocity
 
 W0 = 500.0
@@ -183,10 +183,11 @@ class TestResonances:
         np.testing.assert_allclose(long.amplitude.max(), 3.0 * LARGEST, rtol=1e-4)
         n = int(long.continued.sum())
         assert 0 < n < len(long.continued)
-        assert long.note.startswith(f"{n} of {len(long.continued)} points lie beyond the largest")
-        assert "up to 3 times it" in long.note
+        (note,) = long.notes
+        assert (note["n_points"], note["of"]) == (n, len(long.continued))
+        assert note["ratio"] == pytest.approx(3, rel=1e-4)
         (small,) = predict_response(DUFFING, MODES, force_for(DUFFING, 0.5))
-        assert small.note == ""
+        assert small.notes == ()
 
     @pytest.mark.parametrize("ratio", [0.0, -1.0, np.nan, np.inf])
     @pytest.mark.parametrize("verb", [resonances, predict_response])

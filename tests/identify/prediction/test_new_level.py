@@ -11,8 +11,7 @@ from truths.exact_states import CONSTANT, GAIN, TRUE, damping, driven, modes, sq
 from truths.levels_with_errors import drawn_levels, measured
 
 import snrmjax as sj
-from snrmjax.identify.prediction.new_level import DayToDay, LevelTrend, NewLevel, new_level
-from snrmjax.identify.prediction.notes import notes_on_trends
+from snrmjax.identify.prediction.new_level import DayToDay, NewLevel, new_level
 
 FORCE = 1.5  # N, below the folds
 
@@ -135,14 +134,6 @@ def test_levels_that_rise_with_their_force_are_a_law(fit):
     assert trend.p_value < 1e-4
     assert one.std[0] == pytest.approx(np.hypot(0.02, trend.there), rel=1e-9)
     assert one.std[3] == pytest.approx(0.05)
-
-
-def test_a_trend_is_said_with_its_numbers():
-    (said,) = notes_on_trends([LevelTrend("gain", -0.03, 0.032, 0.077, 0.04)], "0.45 V")
-    assert "+6.2 % in gain from the smallest" in said
-    assert "p = 0.04" in said
-    assert "+7.7 % in gain at 0.45 V" in said
-    assert notes_on_trends([], "1 N") == []
 
 
 @pytest.mark.long

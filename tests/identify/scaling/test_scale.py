@@ -88,7 +88,7 @@ def test_an_added_mass(mass):
     # The first-order formula errs by 3/2 of the relative shift: the note says by how much.
     shift = 1 - heavier.natural_frequency / STRUCTURE.natural_frequency
     first = 2 * shift / mass / SHAPES[1] ** 2 - 1
-    said = [float(n.split("shape ")[1].split(" %")[0]) / 100 for n in scaled.notes[-3:]]
+    said = [note["first_order"] for note in scaled.notes if note.kind == "added_mass_shift"]
     assert np.allclose(said, first, atol=0.02 * np.abs(first).max() + 1e-4)
 
 
@@ -191,8 +191,9 @@ def test_a_free_structure_has_its_rigid_body_mode():
         scaled = scale_modes(fit, DrivePoint(), free=given)
         assert np.allclose(scaled.rigid_shape, 3.0**-0.5, rtol=1e-4)
         assert scaled.rigid_participation == pytest.approx(3.0**-0.5, rel=1e-4)
-    said = scale_modes(fit, DrivePoint()).notes
-    assert any("free mass of 3 kg" in note for note in said)
+    notes = scale_modes(fit, DrivePoint()).notes
+    (note,) = (note for note in notes if note.kind == "low_residual_of_free_mass")
+    assert note["mass_kg"] == pytest.approx(3, rel=1e-3)
     omega = np.array([20.0, 60.0]) * HERTZ
     modes = scale_modes(fit, DrivePoint(), free=Free()).linear_modes()
     velocity = np.asarray(linear_response(modes, omega, np.ones(2)))
@@ -239,7 +240,7 @@ def test_the_lowest_level_of_steady_states():
     assert abs(found.natural_frequency[0] - STRUCTURE.natural_frequency[0]) < (
         4 * found.natural_frequency_std[0]
     )
-    assert "no amplitude dependence" in notes[0]
+    assert notes[0].kind == "levels_agree"
     scaled = scale_modes(found, DrivePoint("tip"))
     assert scaled.shape[0, 0] == pytest.approx(SHAPES[0, 0], rel=5e-3)
 
@@ -247,8 +248,8 @@ def test_the_lowest_level_of_steady_states():
 def test_an_amplitude_dependence_is_said_and_added_to_the_error():
     # Hardening: 2e-3 of the frequency for each 0.1 m/s.
     found, notes = find_modes(states(0.02))
-    assert any(
-        "frequency of mode 1" in note and "depends on the amplitude" in note for note in notes
+    assert (notes[0].kind, notes[0]["mode"], notes[0]["of_damping"]) == (
+        *("amplitude_dependence", 1, False),
     )
     off = abs(found.natural_frequency[0] - STRUCTURE.natural_frequency[0])
     assert off < 3 * found.natural_frequency_std[0]

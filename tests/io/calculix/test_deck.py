@@ -70,52 +70,6 @@ def test_elements_on_two_lines(write):
     assert deck.nodes.tolist() == list(range(1, 21))
 
 
-ASSEMBLED = """*Heading
-*Part, name=Part-1
-{mesh}*Nset, nset=Set-1, generate
- 1, 13, 1
-*Elset, elset=Set-1
- BEAM,
-*Beam Section, elset=Set-1, material=steel, section=RECT
-0.002, 0.01
-0., 0., 1.
-*End Part
-*Assembly, name=Assembly
-*Instance, name=Part-1-1, part=Part-1
-{moved}*End Instance
-*Nset, nset=Set-1, instance=Part-1-1
- 1, 13
-*Nset, nset=Set-2
- Part-1-1.Set-1,
-*End Assembly
-*Material, name=steel
-*Density
-7800.,
-*Elastic
-2e11, 0.3
-*Boundary
-Set-1, 1, 6
-Part-1-1.7, 3, 3
-"""
-
-
-def test_an_assembly_of_one_part_is_written_flat(write):
-    mesh = beam_deck().split("*MATERIAL", maxsplit=1)[0]
-    deck = read_deck(write(ASSEMBLED.format(mesh=mesh, moved="")))
-    assert "*NSET, NSET=Set-1_IN_PART, GENERATE\n1, 13, 1" in deck.text
-    assert "*ELSET, ELSET=Set-1_IN_PART\nBEAM_IN_PART" in deck.text
-    assert "*BEAM SECTION, ELSET=Set-1_IN_PART, MATERIAL=steel" in deck.text
-    assert "*NSET, NSET=Set-1\n1, 13\n*NSET, NSET=Set-2\nSet-1_IN_PART\n" in deck.text
-    assert deck.text.endswith("*BOUNDARY\nSet-1, 1, 6\n7, 3, 3\n")
-    with pytest.raises(ValueError, match=r"deck.inp, line 35: the instance is moved"):
-        read_deck(write(ASSEMBLED.format(mesh=mesh, moved="0., 1., 0.\n")))
-    twice = ASSEMBLED.format(mesh=mesh, moved="").replace(
-        "*End Instance\n", "*End Instance\n*Instance, name=B, part=Part-1\n*End Instance\n"
-    )
-    with pytest.raises(ValueError, match=r"line 36: 2 \*INSTANCE blocks"):
-        read_deck(write(twice))
-
-
 GOOD = beam_deck()
 BAD = {
     "no nodes": (GOOD.replace("*NODE, NSET=ALL", "*COMMENT"), r"no \*NODE block"),
@@ -152,6 +106,7 @@ BAD = {
     ),
     "contact": (GOOD + "*CONTACT PAIR, INTERACTION=I\nA, B\n", r"\*CONTACT PAIR: contact has no"),
     "local system": (GOOD + "*TRANSFORM, NSET=ALL\n1., 0., 0., 0., 1., 0.\n", r"\*TRANSFORM: disp"),
+    "parts": ("*Part, name=A\n" + GOOD, r"\*PART: CalculiX reads no parts and assemblies"),
     "user element": (GOOD.replace("TYPE=B32R", "TYPE=U1"), "user elements are linear"),
     "thickness zero": (GOOD.replace("0.002, 0.01", "0., 0.01"), "must be positive, but one is 0"),
     "include missing": ("*INCLUDE, INPUT=mesh.inp\n" + GOOD, "included file mesh.inp does not"),

@@ -60,7 +60,7 @@ def test_spectra_and_complex_channels(tmp_path):
     np.testing.assert_array_equal(table.columns["H1"], response)
     assert table.units == {"frequency": "Hz", "H1": "g"}
     np.testing.assert_array_equal(table.columns["coherence"], values[0])
-    assert found.notes == ("channel log holds times of day and is not read.",)
+    assert [dict(note) for note in found.notes] == [{"name": "channel log", "why": "times_of_day"}]
 
 
 def text_of_tdms(word):
@@ -142,7 +142,7 @@ def test_a_word_among_numbers_and_lines_of_comment(tmp_path):
     path.write_text("f,F\n# one\n79,1\n80,2\n% two\n\n81,3\n# end\n")
     found = read_laboratory_file(path)
     np.testing.assert_array_equal(found.tables[0].columns["F"], [1, 2, 3])
-    assert any("2 lines of comment" in note for note in found.notes)
+    assert [note["n"] for note in found.notes if note.kind == "comments_not_read"] == [2]
     path.write_text("f,F\n79,1\n80,-.-\n81,3\n")
     with pytest.raises(ValueError, match=r"column F must be numbers, but row 3 of export\.csv"):
         read_laboratory_file(path)

@@ -10,7 +10,7 @@ from snrmjax.io.reduction.load_tables import read_load_tables
 
 def coefficients(folder):
     source = read_load_tables(folder.path)
-    found = sj.condense.condense(source.basis, source.cases, expand=False)
+    found = sj.condense.reduced_model(source.basis, source.cases, expand=False)
     return found.potential
 
 
@@ -140,7 +140,7 @@ BAD_TABLES = [
     (lambda folder: (folder.path / "mass.csv").unlink(), "mass.csv does not exist"),
     (edit("modes.toml", "frequency_hz", "frequencies_hz"), "unknown key 'frequencies_hz' (did"),
     (edit("modes.toml", "frequency_hz = [", "frequency_hz = [-"), "must be positive"),
-    (edit("modes.toml", "[1, 3]", "[1, 1]"), "2 different whole numbers"),
+    (edit("modes.toml", "[1, 3]", "[1, 1]"), "`numbers` must be different mode numbers"),
     (edit("modes.toml", "0.02", "1.5"), "from 0 to below 1"),
     (edit("modes.toml", "[0.5, -0.25]", "[0.5]"), "2 numbers, one a mode"),
     (edit("modes.toml", 'shapes = "shapes.csv"\n', ""), "has a `mass`, but no `shapes`"),
@@ -148,7 +148,7 @@ BAD_TABLES = [
     (other_shape(1.0, 0.1), "not orthogonal: ΦᵀMΦ of modes 1 and 3 is 0.1"),
     (lambda folder: folder.write("shapes.csv", shape=np.eye(4)), "4 shapes for the 2 modes"),
     (lambda folder: folder.write("mass.csv", mass=np.ones(3)), "shape (3,), but shapes.csv has 4"),
-    (edit("cases.csv", "u_2", "u_3"), "the column 'u_3' twice"),
+    (edit("cases.csv", "u_2", "u_3"), "the column `u_3` twice"),
     (edit("cases.csv", "u_2", "v_2"), "unknown column 'v_2'"),
     (edit("cases.csv", "u_1,u_2,u_3,u_4", "u_1,u_2,u_3,u_5"), "lacks the column `u_4`"),
     (edit("cases.csv", "f_1,f_2", "q_1,q_2"), "cases.csv has no `f_1 …`"),
@@ -157,7 +157,7 @@ BAD_TABLES = [
         "`f_1` must be a number, but row 2 of cases.csv",
     ),
     (twice, "the case '+1 at 0.5' twice"),
-    (kept(0), "no rows of numbers"),
+    (kept(0), "no rows below it"),
     (kept(3), "3 usable load cases give 6 equations for 9"),
     (scaled(5, range(3, 7), -1.0), "contradict +1 +2 at 0.5 (against their force"),
     (scaled(2, range(3, 7), 1e3), "another unit"),

@@ -10,12 +10,13 @@ import xarray as xr
 from typer.testing import CliRunner
 
 from snrmjax.cli import app
-from snrmjax.report.study.digest import digest, digest_notes
-from snrmjax.report.study.failures import failure_share, failures_of, most_telling
-from snrmjax.report.study.scalars import Scalar, display_on_axis, readable, scalars
+from snrmjax.numerics.facts import Fact
 from snrmjax.report.study.study_figures import main_effects_figure
 from snrmjax.report.study.study_report import study_sentence, write_study_report
-from snrmjax.report.study.summary import summarized
+from snrmjax.report.study.words import display_on_axis
+from snrmjax.study.analysis.digest import digest
+from snrmjax.study.analysis.failures import failure_share, failures_of, most_telling
+from snrmjax.study.analysis.outputs import Scalar, scalars, summarized
 
 NASTY = "<script>alert(1)</script>$x^2$"
 FORCES = (0.001, 0.002)
@@ -113,7 +114,7 @@ def test_failures_are_placed(written):
     n_failed = int(np.sum(b > 0.8))
     assert found.failures.n_failed == n_failed
     assert found.failures.counts == {"upper_end": 2 * N - n_failed, "step_too_small": n_failed}
-    assert found.failures.kinds == ["step_too_small"]
+    assert found.failures.failed_counts == {"step_too_small": n_failed}
     both = {"a": data_set()["a.b"].values, "b": b}
     assert most_telling(both, found.failures.failed) == ["b", "a"]
     share = failure_share(b, found.failures.failed)
@@ -140,7 +141,7 @@ def test_the_page_is_whole_and_escaped(written):
     assert page.count("data:image/png;base64,") == len(figures)
     sentence = study_sentence(found)
     assert sentence.startswith(f"{N} members, of which {found.failures.n_failed} failed.")
-    assert "Peak velocity at 2 mN: median 0.6" in sentence
+    assert "Peak velocity at 0.002 N: median 0.6" in sentence
     assert "a.b alone makes 100 % of its variance" in sentence
     assert sentence.replace("<", "&lt;") in page
 
@@ -150,20 +151,22 @@ def test_notes_tell_what_the_numbers_are_not():
     few, together = data_set(40, **grid), data_set()
     together["also"] = ("member",), together["a.b"].values + 0.1 * together[NASTY].values
     together = together.set_coords("also")
-    notes = " ".join(digest_notes(digest(few), few))
-    assert "a grid of chosen values" in notes
-    assert "too few members (fewer than 50)" in notes
-    notes = " ".join(digest_notes(digest(together), together))
-    assert "a.b and also vary together" in notes
-    assert "grid" not in notes
-    assert re.search(r"left out: .*Peak velocity at 1 mN \(\d+ of 400\)", notes)
+    first, second, *_ = digest(few).facts
+    assert first == Fact("members_chosen", method="grid")
+    assert (second.kind, second["fewest"]) == ("too_few_for_shares", 50)
+    facts = {fact.kind: fact for fact in digest(together).facts}
+    assert facts["varied_together"]["pairs"] == (("a.b", "also"),)
+    assert "members_chosen" not in facts
+    n_failed = int(np.sum(data_set()[NASTY] > 0.8))
+    missing = ("peak_velocity_m_s", FORCES[0], n_failed, N)
+    assert missing in facts["values_missing"]["outputs"]
 
 
 def test_dots_of_few_members_are_seen_and_named_by_their_force():
     found = digest(data_set(3))
     figure = main_effects_figure(found.effects, {"a.b": found.quantities["a.b"]}, found.units)
     names = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert names[:2] == ["1 mN", "2 mN"]
+    assert names[:2] == ["0.001 N", "0.002 N"]
     dots = figure.axes[0].get_lines()[0]
     # A dot is drawn at half of its marker's size, in points: two at least to be seen on a page.
     assert dots.get_markersize() / 2 > 2
@@ -194,7 +197,7 @@ def test_the_command_writes_the_report(tmp_path):
     out = tmp_path / "report"
     done = CliRunner().invoke(app, ["study", "report", str(tmp_path / "s.zarr"), "--out", str(out)])
     assert done.exit_code == 0, done.output
-    assert "Peak velocity at 2 mN" in done.output
+    assert "Peak velocity at 0.002 N" in done.output
     assert "Number of points" not in done.output
     assert {path.name for path in out.iterdir()} >= {"summary.csv", "report.html"}
 
@@ -207,12 +210,7 @@ def test_the_command_without_a_study(tmp_path):
     assert not (tmp_path / "r").exists()
 
 
-def test_words_and_units_of_axes():
-    assert readable("peak_velocity_m_s") == "Peak velocity"
-    assert readable("n_folds") == "Number of folds"
-    assert readable("natural_frequency_hz_at_largest_amplitude") == (
-        "Natural frequency at largest amplitude"
-    )
+def test_units_of_axes():
     assert display_on_axis(np.array([-1.2e9, np.nan]), "").labelled("k") == "k (10⁹)"
     assert display_on_axis(np.array([0.02, 0.03]), "m/s").labelled("v") == "v (mm/s)"
     assert display_on_axis(np.array([40.0, 90.0]), "Hz").labelled("f") == "f (Hz)"

@@ -367,7 +367,7 @@ def test_sensitivity_to_force_and_frequency_by_forward_differentiation():
 
 @pytest.mark.parametrize("force", [0.0, -1.0, np.nan, np.inf])
 def test_a_force_that_is_not_positive_is_refused(force):
-    with pytest.raises(ValueError, match="every force must be positive, but one is"):
+    with pytest.raises(ValueError, match="`forces` must be positive and finite, but is"):
         forced_response(two_modes(), [force], 1.0, 3.5, harmonic_order=3)
 
 

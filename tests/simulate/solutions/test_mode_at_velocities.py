@@ -89,8 +89,8 @@ def test_beyond_the_end_of_a_softening_mode_nothing_is_found():
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        ({"velocities": [1.0, -2.0]}, "`velocities` must be positive and finite, but one is -2"),
-        ({"velocities": np.nan}, "one is nan"),
+        ({"velocities": [1.0, -2.0]}, "`velocities` must be positive and finite, but is -2"),
+        ({"velocities": np.nan}, "but is nan"),
         ({"velocities": 1.0, "steps": 0}, "`steps` must be at least 1"),
     ],
 )

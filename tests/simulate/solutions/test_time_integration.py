@@ -306,7 +306,7 @@ def test_wrong_settings_of_a_settled_motion_are_named(options, message):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"frequencies": []}, "`frequencies` must be a vector of steps"),
+        ({"frequencies": []}, "`frequencies` must have at least one number"),
         ({"frequencies": [500.0, -1.0]}, "`frequencies` must be positive and finite, but is"),
         ({"test_orders": [0.0]}, r"`test_orders` must have shape \(2,\), but has \(1,\)"),
         ({"cycles_per_step": 3}, "needs 8 cycles"),

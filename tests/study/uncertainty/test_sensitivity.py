@@ -8,14 +8,14 @@ import xarray as xr
 
 from snrmjax.study.sampling import Sampling, drawn_members
 from snrmjax.study.uncertainty.sensitivity import sobol_indices
-from snrmjax.study.variations import joint_normal, lognormal, normal, uniform
+from snrmjax.study.variations import LogNormal, MultivariateNormal, Normal, Uniform
 
 A, B = 7.0, 0.1  # of Ishigami's function
 PI4 = np.pi**4
 VARIANCE = A**2 / 8 + B * PI4 / 5 + B**2 * PI4**2 / 18 + 0.5
 FIRST = np.array([0.5 * (1 + B * PI4 / 5) ** 2, A**2 / 8, 0.0]) / VARIANCE
 TOTAL = FIRST + np.array([1.0, 0.0, 1.0]) * B**2 * PI4**2 * 8 / 225 / VARIANCE
-X = tuple(uniform(name, -np.pi, np.pi) for name in ("x1", "x2", "x3"))
+X = tuple(Uniform(name, -np.pi, np.pi) for name in ("x1", "x2", "x3"))
 
 
 def studied(varied, members, *functions, seed=1, method="saltelli"):
@@ -53,7 +53,7 @@ def test_shares_of_a_product_of_lognormal_numbers():
     # With s² the variance of the logarithms the first index of input i is
     # (e^s_i² − 1)/(e^Σs² − 1).
     std = np.array([0.05, 0.2, 0.1])
-    varied = [lognormal(name, 1.0, one) for name, one in zip("abc", std, strict=True)]
+    varied = [LogNormal(name, 1.0, one) for name, one in zip("abc", std, strict=True)]
     found = sobol_indices(studied(varied, 5 * 256, lambda x: np.prod(x, axis=1)))
     square = np.log1p(std**2)
     first = np.expm1(square) / (np.exp(square.sum()) - 1)
@@ -62,8 +62,8 @@ def test_shares_of_a_product_of_lognormal_numbers():
 
 
 def test_quantities_that_vary_together_are_one_input():
-    pair = joint_normal(["a", "b"], [0.0, 0.0], [[1.0, 0.8], [0.8, 1.0]])
-    found = sobol_indices(studied((pair, normal("c", 0.0, 1.0)), 4 * 1024, lambda x: x.sum(axis=1)))
+    pair = MultivariateNormal(["a", "b"], [0.0, 0.0], [[1.0, 0.8], [0.8, 1.0]])
+    found = sobol_indices(studied((pair, Normal("c", 0.0, 1.0)), 4 * 1024, lambda x: x.sum(axis=1)))
     # Var(a + b) = 3.6 beside Var(c) = 1.
     assert found.input_names == ("a, b", "c")
     np.testing.assert_allclose(found.first[0], [3.6 / 4.6, 1 / 4.6], atol=0.02)
@@ -71,13 +71,15 @@ def test_quantities_that_vary_together_are_one_input():
 
 
 def test_rows_without_a_value_are_left_out_whole():
-    varied = (normal("x", 1.0, 1.0), normal("y", 0.0, 1.0))
+    varied = (Normal("x", 1.0, 1.0), Normal("y", 0.0, 1.0))
     with np.errstate(invalid="ignore"):
         data = studied(varied, 4 * 256, lambda x: np.sqrt(x[:, 0]) + x[:, 1])
     found = sobol_indices(data)
     # x is drawn twice in a row, P(x < 0) = 0.1587: (1 − 0.1587)² of the rows stay.
     assert found.rows[0] / 256 == pytest.approx(0.708, abs=0.02)
-    assert any("29 % of the rows are left out" in note for note in found.notes)
+    (note,) = found.notes
+    assert (note.kind, note["output"]) == ("rows_without_value", "y0")
+    assert note["share"] == pytest.approx(1 - found.rows[0] / 256)
 
 
 def test_other_members_are_refused():

@@ -1,4 +1,9 @@
-"""HDF5, netCDF 4 and MATLAB v7.3 as a tree of named arrays, which stay in the file."""
+"""HDF5, netCDF 4 and MATLAB v7.3 as a tree of named arrays, which stay in the file.
+
+Files may be made to burst a reader: a few bytes may state numbers that no memory holds, and links
+may lead in circles or to other files. So sizes are compared with what the file can hold before
+anything is read, and only its own content is followed.
+"""
 
 import os
 from collections.abc import Callable
@@ -7,9 +12,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from snrmjax.io.laboratory.arrays.structs import file_of_tree
 from snrmjax.io.laboratory.arrays.value_tree import Node, Numbers, Selection, held
+from snrmjax.io.laboratory.contents import LaboratoryFile
 from snrmjax.io.laboratory.libraries import damaged_if_it_fails, library
 from snrmjax.io.laboratory.names import role_of
+from snrmjax.numerics.facts import Fact
+
+NETCDF = (".nc", ".nc4", ".cdf")
+"""Endings of HDF5 files that are called netCDF."""
 
 _MOST_OBJECTS = 20_000
 _DEEPEST = 24
@@ -25,103 +36,110 @@ class _Walk(NamedTuple):
     h5py: Any
     path: Path
     size: int
-    notes: list[str]
+    notes: list[Fact]
     seen: list[Any]  # addresses of groups above, against links in a circle
     objects: list[int]
 
+    def leave_out(self, name: str, why: str) -> None:
+        """Note that something is not read."""
+        self.notes.append(Fact("not_read", name=name, why=why))
 
-def open_tree(path: Path) -> tuple[dict[str, Node], list[str]]:
+    def add_object(self) -> None:
+        """One more object. Raises `ValueError` where that are too many."""
+        self.objects[0] += 1
+        if self.objects[0] > _MOST_OBJECTS:
+            raise ValueError(f"it has more than {_MOST_OBJECTS} objects")
+
+
+def open_tree(path: Path) -> tuple[dict[str, Node], list[Fact]]:
     """The tree of an HDF5 file and what was not read. The file is closed again.
 
     Links to other files, virtual and external data are not followed: a file is read alone.
     Raises `ValueError` for a damaged file and for more than 20 000 objects.
     """
     h5py = library("h5py", "reading HDF5, netCDF and MATLAB v7.3")
-    notes: list[str] = []
+    notes: list[Fact] = []
     walk = _Walk(h5py, path, os.path.getsize(path), notes, [], [0])
     with damaged_if_it_fails(path.name, "an HDF5 file"), h5py.File(path, "r") as file:
         return _group(walk, file), notes
+
+
+def read_hdf5(path: Path) -> LaboratoryFile:
+    """An HDF5 or netCDF 4 file. Raises `ValueError` as `read_laboratory_file` does."""
+    netcdf = path.suffix.lower() in NETCDF
+    return file_of_tree(path.name, "netcdf" if netcdf else "hdf5", *open_tree(path))
 
 
 def _group(walk: _Walk, group: Any) -> dict[str, Node]:
     """A group as a struct. Its attributes that state a rate are numbers of it."""
     address = walk.h5py.h5o.get_info(group.id).addr
     if address in walk.seen or len(walk.seen) > _DEEPEST:
-        walk.notes.append(f"{group.name} links in a circle or nests too deeply and is not read.")
+        walk.leave_out(group.name, "circle")
         return {}
     walk.seen.append(address)
     fields: dict[str, Node] = dict(_rates(group))
     for name in group:
         if name in _HIDDEN:
             continue
-        walk.objects[0] += 1
-        if walk.objects[0] > _MOST_OBJECTS:
-            raise ValueError(f"it has more than {_MOST_OBJECTS} objects")
+        walk.add_object()
         link = group.get(name, getlink=True)
         if isinstance(link, walk.h5py.ExternalLink):
-            walk.notes.append(f"{name} is a link to another file and is not read.")
+            walk.leave_out(name, "other_file")
             continue
-        one = group.get(name)
-        node = None if one is None else _object(walk, one, name)
+        item = group.get(name)
+        node = None if item is None else _object(walk, item, name)
         if node is not None:
             fields[name] = node
-        if isinstance(one, walk.h5py.Dataset):
-            for key, rate in _rates(one).items():
+        if isinstance(item, walk.h5py.Dataset):
+            for key, rate in _rates(item).items():
                 fields.setdefault(key, rate)
     walk.seen.pop()
     return fields
 
 
-def _rates(one: Any) -> dict[str, Numbers]:
+def _rates(item: Any) -> dict[str, Numbers]:
     """Attributes that state a sampling rate or step, or the start of a record."""
-    found = {}
-    for key in one.attrs:
+    rates = {}
+    for key in item.attrs:
         if role_of(key.removesuffix("_hz").removesuffix("_s")) in ("rate", "step") or key in (
             "start_time_s",
         ):
-            value = np.asarray(one.attrs[key])
+            value = np.asarray(item.attrs[key])
             if value.size == 1 and value.dtype.kind in "iuf":
-                found[key] = held(value.astype(float).reshape(1))
-    return found
+                rates[key] = held(value.astype(float).reshape(1))
+    return rates
 
 
-def _object(walk: _Walk, one: Any, name: str) -> Node | None:
+def _object(walk: _Walk, item: Any, name: str) -> Node | None:
     """A group or data set as a node, or None with a note."""
-    kind = _attribute(one, "MATLAB_class")
-    if "MATLAB_object_decode" in one.attrs or kind in ("function_handle", "opaque"):
-        walk.notes.append(
-            f"variable {name} is a function handle or an object (string, table, …), which is not "
-            "read: save numbers, text, structs and cells instead."
-        )
+    kind = _attribute(item, "MATLAB_class")
+    if "MATLAB_object_decode" in item.attrs or kind in ("function_handle", "opaque"):
+        return walk.leave_out(name, "object")
+    if isinstance(item, walk.h5py.Group):
+        return _structs(_group(walk, item)) if kind == "struct" else _group(walk, item)
+    if not isinstance(item, walk.h5py.Dataset) or "MATLAB_empty" in item.attrs:
         return None
-    if isinstance(one, walk.h5py.Group):
-        return _structs(_group(walk, one)) if kind == "struct" else _group(walk, one)
-    if not isinstance(one, walk.h5py.Dataset) or "MATLAB_empty" in one.attrs:
+    if _attribute(item, "NAME").startswith("This is a netCDF dimension but not"):
         return None
-    if _attribute(one, "NAME").startswith("This is a netCDF dimension but not"):
-        return None
-    reference = walk.h5py.check_ref_dtype(one.dtype) is walk.h5py.Reference
+    reference = walk.h5py.check_ref_dtype(item.dtype) is walk.h5py.Reference
     if reference:
-        return _references(walk, one, name)
-    if walk.h5py.check_string_dtype(one.dtype) is not None or kind == "char":
-        if one.size > _LONGEST_TEXT:
-            walk.notes.append(f"{name} has more than {_LONGEST_TEXT} texts and is not read.")
-            return None
-        return _text(one, is_matlab=kind == "char")
-    why = _cannot_hold(walk, one)
+        return _references(walk, item, name)
+    if walk.h5py.check_string_dtype(item.dtype) is not None or kind == "char":
+        if item.size > _LONGEST_TEXT:
+            return walk.leave_out(name, "too_many_texts")
+        return _text(item, is_matlab=kind == "char")
+    why = _cannot_hold(walk, item)
     if why:
-        walk.notes.append(f"{name} {why} and is not read.")
-        return None
-    if one.dtype.names and set(one.dtype.names) not in ({"real", "imag"}, {"r", "i"}):
+        return walk.leave_out(name, why)
+    if item.dtype.names and set(item.dtype.names) not in ({"real", "imag"}, {"r", "i"}):
         return {
-            field: _numbers(walk, one, field=field)
-            for field in one.dtype.names
-            if one.dtype[field].kind in "biuf" and one.ndim == 1
+            field: _numbers(walk, item, field=field)
+            for field in item.dtype.names
+            if item.dtype[field].kind in "biuf" and item.ndim == 1
         }
-    if one.dtype.names is None and one.dtype.kind not in "biufc":
-        walk.notes.append(f"{name} is of type {one.dtype} and is not read.")
-        return None
-    return _numbers(walk, one, transposed=bool(kind)) if one.size else None
+    if item.dtype.names is None and item.dtype.kind not in "biufc":
+        return walk.leave_out(name, "type")
+    return _numbers(walk, item, transposed=bool(kind)) if item.size else None
 
 
 def _structs(fields: dict[str, Node]) -> Node:
@@ -137,32 +155,30 @@ class _ArrayField(list):
     """The values of one field of a struct array: references without a class of their own."""
 
 
-def _references(walk: _Walk, one: Any, name: str) -> Node | None:
+def _references(walk: _Walk, item: Any, name: str) -> Node | None:
     """A cell array, or a field of a struct array."""
-    if one.size > _MOST_OBJECTS:
-        raise ValueError(f"{name} lists {one.size} entries")
+    if item.size > _MOST_OBJECTS:
+        raise ValueError(f"{name} lists {item.size} entries")
     nodes: list[list[Node]] = []
     # MATLAB's columns are the rows of the file.
-    for row in np.atleast_2d(one[()]).T:
+    for row in np.atleast_2d(item[()]).T:
         line: list[Node] = []
         for reference in row:
-            walk.objects[0] += 1
-            if walk.objects[0] > _MOST_OBJECTS:
-                raise ValueError(f"it has more than {_MOST_OBJECTS} objects")
-            inner = one.file[reference] if reference else None
+            walk.add_object()
+            inner = item.file[reference] if reference else None
             node = None if inner is None else _object(walk, inner, name)
             if node is not None:
                 line.append(node)
         nodes.append(line)
-    if one.ndim == 2 and min(one.shape) > 1:
+    if item.ndim == 2 and min(item.shape) > 1:
         return list(nodes)
     flat = [node for line in nodes for node in line]
-    return flat if _attribute(one, "MATLAB_class") == "cell" else _ArrayField(flat)
+    return flat if _attribute(item, "MATLAB_class") == "cell" else _ArrayField(flat)
 
 
-def _text(one: Any, *, is_matlab: bool) -> Node:
+def _text(item: Any, *, is_matlab: bool) -> Node:
     """Text, or a list of texts."""
-    value = one[()]
+    value = item[()]
     if is_matlab:
         codes = np.asarray(value).T.reshape(-1)
         return "".join(chr(int(code)) for code in codes if 0 < int(code) < 0xD800)
@@ -173,32 +189,29 @@ def _text(one: Any, *, is_matlab: bool) -> Node:
     return texts[0] if np.ndim(value) == 0 else list(texts)
 
 
-def _cannot_hold(walk: _Walk, one: Any) -> str:
+def _cannot_hold(walk: _Walk, item: Any) -> str:
     """Why the numbers of a data set cannot be in this file, or nothing."""
-    if one.is_virtual or one.external:
-        return "lies in other files"
-    stored, wanted = one.id.get_storage_size(), one.size * one.dtype.itemsize
-    if one.size and not stored:
-        return "was declared but never written"
-    if stored > walk.size:
-        return f"states {stored} bytes in a file of {walk.size}"
-    if wanted > (_INFLATES * stored if one.chunks else stored):
-        return f"states {one.size} numbers, which the file cannot hold,"
-    if one.chunks and int(np.prod(one.chunks, dtype=object)) * one.dtype.itemsize > _LARGEST_CHUNK:
-        return f"is stored in pieces of more than {_LARGEST_CHUNK // 2**20} MiB"
-    return ""
+    if item.is_virtual or item.external:
+        return "elsewhere"
+    stored, wanted = item.id.get_storage_size(), item.size * item.dtype.itemsize
+    if item.size and not stored:
+        return "never_written"
+    if stored > walk.size or wanted > (_INFLATES * stored if item.chunks else stored):
+        return "larger_than_file"
+    pieces = int(np.prod(item.chunks, dtype=object)) if item.chunks else 0
+    return "large_pieces" if pieces * item.dtype.itemsize > _LARGEST_CHUNK else ""
 
 
-def _numbers(walk: _Walk, one: Any, *, transposed: bool = False, field: str = "") -> Numbers:
+def _numbers(walk: _Walk, item: Any, *, transposed: bool = False, field: str = "") -> Numbers:
     """A data set as numbers, which are read by opening the file again."""
-    scale, offset = _single(one, "scale_factor", 1.0), _single(one, "add_offset", 0.0)
-    fill = _single(one, "_FillValue", np.nan)
-    words = {key: _attribute(one, key) for key in _WORDS if key in one.attrs}
-    unit = next((_attribute(one, key) for key in _UNITS if key in one.attrs), "")
-    kind = one.dtype[field] if field else one.dtype
+    scale, offset = _single(item, "scale_factor", 1.0), _single(item, "add_offset", 0.0)
+    fill = _single(item, "_FillValue", np.nan)
+    words = {key: _attribute(item, key) for key in _WORDS if key in item.attrs}
+    unit = next((_attribute(item, key) for key in _UNITS if key in item.attrs), "")
+    kind = item.dtype[field] if field else item.dtype
     is_complex = kind.names is not None or kind.kind == "c"
     packed = (scale, offset) != (1.0, 0.0) or (kind.kind in "iu" and not np.isnan(fill))
-    read = _reader(walk.path, one.name, field, transposed)
+    read = _reader(walk.path, item.name, field, transposed)
 
     def unpacked(at: Selection) -> np.ndarray:
         raw = read(at)
@@ -206,7 +219,7 @@ def _numbers(walk: _Walk, one: Any, *, transposed: bool = False, field: str = ""
         return np.where(raw == fill, np.nan, values)
 
     return Numbers(
-        one.shape[::-1] if transposed else one.shape,
+        item.shape[::-1] if transposed else item.shape,
         unpacked if packed and not is_complex else read,
         is_complex,
         {**words, "unit": unit} if unit else words,
@@ -231,11 +244,11 @@ def _reader(
     return read
 
 
-def _attribute(one: Any, key: str) -> str:
+def _attribute(item: Any, key: str) -> str:
     """A text among the attributes, empty where it is none."""
-    if key not in one.attrs:
+    if key not in item.attrs:
         return ""
-    value = one.attrs[key]
+    value = item.attrs[key]
     if isinstance(value, np.ndarray) and value.size == 1:
         value = value.reshape(-1)[0]
     if isinstance(value, bytes):
@@ -243,9 +256,9 @@ def _attribute(one: Any, key: str) -> str:
     return value if isinstance(value, str) else ""
 
 
-def _single(one: Any, key: str, default: float) -> float:
+def _single(item: Any, key: str, default: float) -> float:
     """A single number among the attributes."""
-    if key not in one.attrs:
+    if key not in item.attrs:
         return default
-    value = np.asarray(one.attrs[key])
+    value = np.asarray(item.attrs[key])
     return float(value.reshape(-1)[0]) if value.size == 1 and value.dtype.kind in "iuf" else default

@@ -1,7 +1,7 @@
 """Time records among named arrays: samples beside a sampling rate, a step or an even time."""
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 import numpy as np
 
@@ -10,35 +10,23 @@ from snrmjax.io.laboratory.names import role_of
 from snrmjax.io.laboratory.physical_units import channel_meaning
 from snrmjax.measure.recordings.channels import Channel, Quantity
 from snrmjax.measure.recordings.time_recording import TimeRecording, time_recording
+from snrmjax.numerics.facts import Fact
 
 _SHORTEST = 64  # samples; shorter vectors beside a time are a table
 _MOST_CHANNELS = 4096
 _LOOK = 4096  # samples of a long time vector that are looked at, at each of three places
 _EVEN = 1e-3  # of a step: what rounding leaves of an even time
-_QUANTITIES: dict[str, Quantity] = {
-    "force": "force",
-    "displacement": "displacement",
-    "velocity": "velocity",
-    "acceleration": "acceleration",
-    "voltage": "voltage",
-}
-
-
 _NAMES = frozenset({"channel", "channels", "channel_names", "names", "labels", "chan"})
-_SAID = {"unit": "unit", "units": "unit", "quantity": "quantity", "quantities": "quantity"} | {
-    "point": "point",
-    "points": "point",
-    "direction": "direction",
-    "directions": "direction",
-}
+_SAID = {"unit": "unit", "quantity": "quantity", "point": "point", "direction": "direction"}
+_SAID |= {"units": "unit", "quantities": "quantity", "points": "point", "directions": "direction"}
 
 
-class FewRecordings(NamedTuple):
-    """The recordings of a struct, the arrays that they used, and notes."""
+class FoundRecord(NamedTuple):
+    """The time record of a struct, the arrays that it used, and notes."""
 
-    recordings: tuple[TimeRecording, ...]
-    used: frozenset[str]
-    notes: tuple[str, ...]
+    record: TimeRecording | None = None
+    used: frozenset[str] = frozenset()
+    notes: tuple[Fact, ...] = ()
 
 
 class _Axis(NamedTuple):
@@ -46,12 +34,12 @@ class _Axis(NamedTuple):
     rate: float
     start: float
     used: tuple[str, ...]
-    note: str
+    notes: tuple[Fact, ...] = ()
 
 
 def recording_of(
     name: str, numbers: Mapping[str, Numbers], words: Mapping[str, Sequence[str]]
-) -> FewRecordings:
+) -> FoundRecord:
     """The time record of a struct, if it has one.
 
     Arguments: `words` are lists of text beside the arrays: names of channels, and lists called
@@ -59,46 +47,49 @@ def recording_of(
     """
     axis = _time_axis(numbers)
     if axis is None:
-        return FewRecordings((), frozenset(), ())
-    if isinstance(axis, str):
-        return FewRecordings((), frozenset(), (axis,))
+        return FoundRecord()
+    if isinstance(axis, Fact):
+        return FoundRecord(notes=(axis,))
     sampled = {
-        key: one
-        for key, one in numbers.items()
-        if key not in axis.used and not one.is_complex and len([n for n in one.shape if n != 1]) < 3
+        key: array
+        for key, array in numbers.items()
+        if key not in axis.used and not array.is_complex and len(array.sides) < 3
     }
-    lengths = [max(one.shape, default=1) for one in sampled.values()]
+    lengths = [max(array.shape, default=1) for array in sampled.values()]
     long = axis.length or max(lengths, default=0)
     if long < _SHORTEST:
-        return FewRecordings((), frozenset(), ())
-    alike = {key: one for key, one in sampled.items() if long in one.shape}
-    if any(role_of(key) == "frequency" and one.length == long for key, one in alike.items()):
-        return FewRecordings((), frozenset(), ())
+        return FoundRecord()
+    alike = {key: array for key, array in sampled.items() if long in array.shape}
+    if any(role_of(key) == "frequency" and array.length == long for key, array in alike.items()):
+        return FoundRecord()
     places: list[ChannelPlace] = []
     channels: list[Channel] = []
-    for key, one in alike.items():
-        side = one.shape.index(long)
-        others = 1 if one.length is not None else one.size // long
+    for key, array in alike.items():
+        side = array.shape.index(long)
+        others = 1 if array.length is not None else array.size // long
         labels = _labels(words, others)
-        told = _told(words, others) if labels else [{} for _ in range(others)]
+        said = _said_of(words, others) if labels else [{} for _ in range(others)]
         for k in range(others):
             alone = key if others == 1 else f"{key}_{k + 1}"
-            places.append(ChannelPlace(one, side, k))
-            channels.append(_channel((labels[k] if labels else "") or alone, one, told[k]))
-    names = [one.name for one in channels]
+            places.append(ChannelPlace(array, side, k))
+            name_of = (labels[k] if labels else "") or alone
+            channels.append(_channel(name_of, {**array.attributes, **said[k]}))
+    names = [channel.name for channel in channels]
     if not channels or len(channels) > _MOST_CHANNELS:
-        return FewRecordings((), frozenset(), ())
+        return FoundRecord()
     if len(set(names)) < len(names):
-        channels = [one._replace(name=f"{one.name} #{k + 1}") for k, one in enumerate(channels)]
+        channels = [
+            channel._replace(name=f"{channel.name} #{k + 1}") for k, channel in enumerate(channels)
+        ]
     record = time_recording(
         PlacedSamples(places, long),
         channels,
         axis.rate,
         start_time=axis.start,
         name=name,
-        notes=[axis.note] if axis.note else [],
+        notes=axis.notes,
     )
-    return FewRecordings((record,), frozenset((*alike, *axis.used)), ())
+    return FoundRecord(record, frozenset((*alike, *axis.used)))
 
 
 def _labels(words: Mapping[str, Sequence[str]], count: int) -> Sequence[str] | None:
@@ -112,107 +103,93 @@ def _labels(words: Mapping[str, Sequence[str]], count: int) -> Sequence[str] | N
     return alike[0] if alike else None
 
 
-def _told(words: Mapping[str, Sequence[str]], count: int) -> list[dict[str, str]]:
+def _said_of(words: Mapping[str, Sequence[str]], count: int) -> list[dict[str, str]]:
     """What lists of text say of each column of a matrix."""
-    told: list[dict[str, str]] = [{} for _ in range(count)]
+    said: list[dict[str, str]] = [{} for _ in range(count)]
     for key, word in words.items():
         if key.lower() in _SAID and len(word) == count:
-            for k, one in enumerate(word):
-                told[k][_SAID[key.lower()]] = one
-    return told
+            for k, text in enumerate(word):
+                said[k][_SAID[key.lower()]] = text
+    return said
 
 
-def _channel(name: str, one: Numbers, told: Mapping[str, str]) -> Channel:
+def _channel(name: str, said: Mapping[str, str]) -> Channel:
     """A channel with what the file says of it."""
-    said = {**one.attributes, **told}
     unit = said.get("unit", "")
     quantity, calibration = channel_meaning(unit)
-    stated = _QUANTITIES.get(said.get("quantity", ""))
-    return Channel(
-        name,
-        quantity if quantity != "unknown" or stated is None else stated,
-        unit,
-        calibration,
-        said.get("point", ""),
-        said.get("direction", ""),
-    )
+    if quantity == "unknown":
+        known: tuple[Quantity, ...] = get_args(Quantity)
+        quantity = next((name for name in known if name == said.get("quantity")), "unknown")
+    place = said.get("point", ""), said.get("direction", "")
+    return Channel(name, quantity, unit, calibration, *place)
 
 
-def _time_axis(numbers: Mapping[str, Numbers]) -> _Axis | str | None:
+def _time_axis(numbers: Mapping[str, Numbers]) -> _Axis | Fact | None:
     """The rate of samples: stated, or of a time vector; a note where that one is uneven."""
-    single = {key: one for key, one in numbers.items() if one.size == 1 and not one.is_complex}
-    start = 0.0
-    used_start: tuple[str, ...] = ()
-    for key, one in single.items():
-        if key in ("start_time_s", "start_time", "t0"):
-            start, used_start = _only(one), (key,)
+    single = {
+        key: array for key, array in numbers.items() if array.size == 1 and not array.is_complex
+    }
+    starts = [key for key in single if key in ("start_time_s", "start_time", "t0")][-1:]
+    start = _only(single[starts[0]]) if starts else 0.0
     if not np.isfinite(start):
-        start, used_start = 0.0, ()
+        start, starts = 0.0, []
     stated: tuple[float, str] | None = None
-    for key, one in single.items():
-        if role_of(key) in ("rate", "step"):
-            value = _only(one)
-            value = 1 / value if role_of(key) == "step" and value > 0 else value
-            if np.isfinite(value) and value > 0:
-                stated = (value, key)
-                break
+    for key in single:
+        if stated is None and (role := role_of(key)) in ("rate", "step"):
+            value = _only(single[key])
+            value = 1 / value if role == "step" and value > 0 else value
+            stated = (value, key) if np.isfinite(value) and value > 0 else None
     vectors = [
         key
-        for key, one in numbers.items()
+        for key, array in numbers.items()
         if role_of(key.removesuffix("_s")) == "time"
-        and one.length is not None
-        and one.length >= _SHORTEST
-        and not one.is_complex
+        and array.length is not None
+        and array.length >= _SHORTEST
+        and not array.is_complex
     ]
     if stated is not None:
-        used = (stated[1], *used_start, *vectors[:1])
+        used = (stated[1], *starts, *vectors[:1])
         length = numbers[vectors[0]].length if vectors else None
-        if vectors and not used_start:
-            start = float(_look(numbers[vectors[0]], 0, 1)[0])
+        if vectors and not starts:
+            start = float(numbers[vectors[0]].stretch(0, 1)[0])
             start = start if np.isfinite(start) else 0.0
-        return _Axis(length, stated[0], start, used, "")
+        return _Axis(length, stated[0], start, used)
     if not vectors:
         return None
     return _even_axis(vectors[0], numbers[vectors[0]])
 
 
-def _even_axis(key: str, one: Numbers) -> _Axis | str:
+def _even_axis(key: str, array: Numbers) -> _Axis | Fact:
     """Rate and start of a time vector, looked at whole or, where it is long, at three places."""
-    n = one.length or 0
-    first, last = float(_look(one, 0, 1)[0]), float(_look(one, n - 1, n)[0])
+    n = array.length or 0
+    first, last = float(array.stretch(0, 1)[0]), float(array.stretch(n - 1, n)[0])
     step = (last - first) / (n - 1)
-    uneven = f"{key} is no even time and is read as a column."
+    uneven = Fact("uneven_time", name=key)
     if not (np.isfinite(step) and step > 0 and np.isfinite(1 / step)):
         return uneven
     for start in sorted({0, max(0, n // 2 - _LOOK // 2), max(0, n - _LOOK)}):
         stop = min(start + _LOOK, n)
         expected = first + step * np.arange(start, stop)
         # Times of many seconds in few digits: rounding by the resolution of what is written.
-        slack = _EVEN * step + 4e-16 * abs(last) + _single(one) * abs(last)
-        if not np.all(np.abs(_look(one, start, stop) - expected) <= slack):
+        slack = _EVEN * step + 4e-16 * abs(last) + _single(array) * abs(last)
+        if not np.all(np.abs(array.stretch(start, stop) - expected) <= slack):
             return uneven
     rate = 1 / step
     whole = round(rate)
     if whole and abs(rate - whole) < 1e-6 * rate * min(1.0, 1e3 / n):
         rate = float(whole)
-    unit = one.unit.lower()
+    unit = array.unit.lower()
     factor = 1e3 if unit in ("ms", "msec") else 1e6 if unit in ("us", "µs", "μs") else 1.0
-    note = f"{key} was looked at in three places: even steps." if n > 3 * _LOOK else ""
-    return _Axis(n, rate * factor, first / factor, (key,), note)
+    notes = (Fact("time_seen_in_places", name=key),) if n > 3 * _LOOK else ()
+    return _Axis(n, rate * factor, first / factor, (key,), notes)
 
 
-def _single(one: Numbers) -> float:
+def _single(array: Numbers) -> float:
     """Relative resolution of times that are stored in single precision, else 0."""
-    kind = _look(one, 0, 1).dtype
+    kind = array.stretch(0, 1).dtype
     return 1.2e-7 if kind == np.float32 else 0.0
 
 
-def _look(one: Numbers, start: int, stop: int) -> np.ndarray:
-    """A stretch of a vector, whichever way it lies."""
-    at = tuple(slice(start, stop) if n != 1 else slice(0, 1) for n in one.shape)
-    return one.read(at).reshape(-1)
-
-
-def _only(one: Numbers) -> float:
+def _only(array: Numbers) -> float:
     """A single number."""
-    return float(one.read(tuple(slice(0, 1) for _ in one.shape)).reshape(-1)[0])
+    return float(array.read(tuple(slice(0, 1) for _ in array.shape)).reshape(-1)[0])

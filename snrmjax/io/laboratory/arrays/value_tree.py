@@ -30,10 +30,14 @@ class Numbers(NamedTuple):
         return int(np.prod(self.shape, dtype=object)) if self.shape else 1
 
     @property
+    def sides(self) -> list[int]:
+        """The lengths of its axes but for those of 1."""
+        return [n for n in self.shape if n != 1]
+
+    @property
     def length(self) -> int | None:
         """Length of a vector (a row, a column, or of one axis), else None."""
-        long = [n for n in self.shape if n != 1]
-        return None if len(long) > 1 else (long[0] if long else 1)
+        return None if len(self.sides) > 1 else (self.sides or [1])[0]
 
     @property
     def unit(self) -> str:
@@ -52,6 +56,11 @@ class Numbers(NamedTuple):
     def vector(self, name: str) -> Num[np.ndarray, " row"]:
         """A vector, whichever way it lies."""
         return self.all(name).reshape(-1)
+
+    def stretch(self, start: int, stop: int) -> Num[np.ndarray, " row"]:
+        """A part of a vector, whichever way it lies."""
+        at = tuple(slice(start, stop) if n != 1 else slice(0, 1) for n in self.shape)
+        return self.read(at).reshape(-1)
 
 
 Node = Union[Numbers, str, list["Node"], dict[str, "Node"]]  # noqa: UP007
@@ -81,29 +90,30 @@ class PlacedSamples(AbstractSamples):
 
     @property
     def shape(self) -> tuple[int, int]:
-        """See `AbstractSamples.shape`."""
+        """Channels and samples."""
         return len(self._places), self._samples
 
     def read(
         self, channels: Sequence[int], start: int, stop: int
     ) -> Num[np.ndarray, "channel sample"]:
-        """See `AbstractSamples.read`. Channels of one matrix are read together."""
+        """A stretch of some channels; those of one matrix are read together."""
         chosen = [self._places[k] for k in channels]
-        rows: list[np.ndarray | None] = [None] * len(chosen)
+        rows: dict[int, np.ndarray] = {}
         for k, place in enumerate(chosen):
-            if rows[k] is not None:
+            if k in rows:
                 continue
-            alike = [m for m, one in enumerate(chosen) if one.numbers is place.numbers]
-            others = [chosen[m].other for m in alike]
+            alike = {
+                m: sibling.other
+                for m, sibling in enumerate(chosen)
+                if sibling.numbers is place.numbers
+            }
             at = [slice(0, n) for n in place.numbers.shape]
             at[place.axis] = slice(start, stop)
-            wide = len(at) > 1
-            if wide:
-                at[1 - place.axis] = slice(min(others), max(others) + 1)
-            found = place.numbers.read(tuple(at))
-            for m, other in zip(alike, others, strict=True):
-                if wide:
-                    rows[m] = np.take(found, other - min(others), axis=1 - place.axis)
-                else:
-                    rows[m] = found
-        return np.stack([row for row in rows if row is not None])
+            first = min(alike.values())
+            if len(at) > 1:
+                at[1 - place.axis] = slice(first, max(alike.values()) + 1)
+            block = place.numbers.read(tuple(at))
+            for m, other in alike.items():
+                is_matrix = len(at) > 1
+                rows[m] = np.take(block, other - first, 1 - place.axis) if is_matrix else block
+        return np.stack([rows[k] for k in range(len(chosen))])

@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from snrmjax.numerics.facts import Fact
+
 _EVEN = 1e-6  # of a step: an abscissa of doubles that is uneven by less is even
 _DIGITS = 5  # behind the first, in the header's E13.5
 
@@ -16,41 +18,38 @@ class EvenAbscissa(NamedTuple):
 
     first: float
     rate: float
-    note: str
+    notes: tuple[Fact, ...] = ()
 
 
-def even_abscissa(one: Mapping[str, Any]) -> EvenAbscissa | None:
+def even_abscissa(function: Mapping[str, Any]) -> EvenAbscissa | None:
     """Start and rate of a function's abscissa, or None where its steps are uneven.
 
     The header has both to six digits. Where these digits allow one whole number of samples per
     unit (4.88281E-04 s: 2048 Hz), that is taken.
     """
-    x = np.asarray(one["x"])
-    if one["abscissa_spacing"] != 1:
+    x = np.asarray(function["x"])
+    if function["abscissa_spacing"] != 1:
         return _of_values(x)
-    first, step = float(one["abscissa_min"]), float(one["abscissa_inc"])
+    first, step = float(function["abscissa_min"]), float(function["abscissa_inc"])
     if not (math.isfinite(step) and step > 0):
         return None
     half = 0.5 * 10.0 ** (math.floor(math.log10(step)) - _DIGITS)
     low, high = math.ceil(1 / (step + half)), math.floor(1 / (step - half))
-    rounded = f"{step:.4e}"
-    if low == high and float(rounded) != step:
-        return EvenAbscissa(
-            first, float(low), f"rate {low} per unit, from a step of six digits, {step:.5e}."
-        )
-    wide = (x.size - 1) * half
-    note = f"the abscissa has six digits: its end may be off by {wide:.1g}."
-    return EvenAbscissa(first, 1 / step, "" if float(rounded) == step else note)
+    if float(f"{step:.4e}") == step:
+        return EvenAbscissa(first, 1 / step)
+    if low == high:
+        return EvenAbscissa(first, float(low), (Fact("whole_rate", rate=low, step=step),))
+    return EvenAbscissa(first, 1 / step, (Fact("six_digits", off=(x.size - 1) * half),))
 
 
-def abscissa(one: Mapping[str, Any]) -> Float[np.ndarray, " point"]:
+def abscissa(function: Mapping[str, Any]) -> Float[np.ndarray, " point"]:
     """The abscissa of a function, value by value."""
-    if one["abscissa_spacing"] != 1:
-        return np.asarray(one["x"], dtype=float)
-    even = even_abscissa(one)
+    if function["abscissa_spacing"] != 1:
+        return np.asarray(function["x"], dtype=float)
+    even = even_abscissa(function)
     if even is None:
-        return np.asarray(one["x"], dtype=float)
-    return even.first + np.arange(len(one["x"])) / even.rate
+        return np.asarray(function["x"], dtype=float)
+    return even.first + np.arange(len(function["x"])) / even.rate
 
 
 def _of_values(x: Float[np.ndarray, " point"]) -> EvenAbscissa | None:
@@ -60,4 +59,4 @@ def _of_values(x: Float[np.ndarray, " point"]) -> EvenAbscissa | None:
     step = (x[-1] - x[0]) / (x.size - 1)
     if np.max(np.abs(x - (x[0] + step * np.arange(x.size)))) > _EVEN * step:
         return None
-    return EvenAbscissa(float(x[0]), float(1 / step), "")
+    return EvenAbscissa(float(x[0]), float(1 / step))

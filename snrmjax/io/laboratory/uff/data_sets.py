@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from snrmjax.io.laboratory.libraries import damaged_if_it_fails, library
+from snrmjax.numerics.facts import Fact
 
 _LARGEST = 2**29  # bytes: pyuff holds all of a file, and each number as an object for a while
 _READ = {58: "function", 151: "header", 164: "units"}
@@ -32,11 +33,11 @@ class DataSets(NamedTuple):
     """Data sets of a universal file in order, as pyuff's dictionaries, and what was not read."""
 
     sets: tuple[Mapping[str, Any], ...]
-    notes: tuple[str, ...]
+    notes: tuple[Fact, ...]
 
     def of_type(self, number: int) -> tuple[Mapping[str, Any], ...]:
         """Those of one type."""
-        return tuple(one for one in self.sets if one["type"] == number)
+        return tuple(function for function in self.sets if function["type"] == number)
 
 
 def read_data_sets(path: Path) -> DataSets:
@@ -55,12 +56,12 @@ def read_data_sets(path: Path) -> DataSets:
     content = path.read_bytes()
     if len(_TAG.findall(content)) % 2:
         raise ValueError(f"{file} is damaged: it ends within a data set (no closing -1).")
-    found: list[Mapping[str, Any]] = []
+    sets: list[Mapping[str, Any]] = []
     left_out: dict[int, int] = {}
     with damaged_if_it_fails(file, "a universal file"):
         source = pyuff.UFF(str(path))
         types = [int(number) for number in source.get_set_types()]
-    starts = [found.start() for found in _TAG.finditer(content)][::2]
+    starts = [tag.start() for tag in _TAG.finditer(content)][::2]
     heads = [content[at : at + _HEAD] for at in starts] + [b""] * len(types)
     for k, number in enumerate(types):
         if number not in _READ:
@@ -73,7 +74,7 @@ def read_data_sets(path: Path) -> DataSets:
             _check_count(header, size, file, k + 1)
         try:
             with damaged_if_it_fails(file, where):
-                one = source.read_sets(k)
+                function = source.read_sets(k)
         except ValueError:
             if number != 151:
                 raise
@@ -81,18 +82,13 @@ def read_data_sets(path: Path) -> DataSets:
             left_out[number] = left_out.get(number, 0) + 1
             continue
         if number == 58:
-            one = _with_letters(_checked_function(one, file, k + 1), heads[k])
-        found.append(one)
-    notes = tuple(
-        f"{count} data set{'s' * (count > 1)} of type {number}{_meaning(number)} not read."
+            function = _with_letters(_checked_function(function, file, k + 1), heads[k])
+        sets.append(function)
+    notes = [
+        Fact("data_sets_not_read", n=count, type=number, meaning=_OTHERS.get(number, ""))
         for number, count in sorted(left_out.items())
-    )
-    return DataSets(tuple(found), notes)
-
-
-def _meaning(number: int) -> str:
-    """What a type of data set holds, in brackets."""
-    return f" ({_OTHERS[number]})" if number in _OTHERS else ""
+    ]
+    return DataSets(tuple(sets), tuple(notes))
 
 
 def direction_of(code: int) -> str:
@@ -110,17 +106,19 @@ def stated(text: str) -> str:
     return "" if plain.upper() == "NONE" else plain
 
 
-def _with_letters(one: dict[str, Any], head: bytes) -> dict[str, Any]:
+def _with_letters(function: dict[str, Any], head: bytes) -> dict[str, Any]:
     """A function whose texts have Windows' Western letters (², µ, °), which pyuff replaces."""
-    broken = {key for key, value in one.items() if isinstance(value, str) and "\ufffd" in value}
+    broken = {
+        key for key, value in function.items() if isinstance(value, str) and "\ufffd" in value
+    }
     restored = {}
     for line in head.splitlines() if broken else ():
         seen, meant = line.decode("utf-8", "replace"), line.decode("cp1252", "replace")
         for key in broken:
-            at = seen.find(one[key])
+            at = seen.find(function[key])
             if at >= 0 and len(seen) == len(meant):
-                restored[key] = meant[at : at + len(one[key])]
-    return {**one, **restored}
+                restored[key] = meant[at : at + len(function[key])]
+    return {**function, **restored}
 
 
 def _check_count(header: Mapping[str, Any], size: int, file: str, number: int) -> None:
@@ -138,14 +136,14 @@ def _check_count(header: Mapping[str, Any], size: int, file: str, number: int) -
         )
 
 
-def _checked_function(one: dict[str, Any], file: str, number: int) -> dict[str, Any]:
+def _checked_function(function: dict[str, Any], file: str, number: int) -> dict[str, Any]:
     """A function with as many values as it states. Trailing bytes (line ends) are dropped."""
-    points = one["num_pts"]
-    x, data = np.asarray(one["x"], float), np.asarray(one["data"])
+    points = function["num_pts"]
+    x, data = np.asarray(function["x"], float), np.asarray(function["data"])
     if min(x.size, data.size) < points:
         raise ValueError(
             f"data set {number} of {file} states {points} points, but holds {data.size}."
         )
-    if not np.isfinite(x[:points]).all() or not np.isfinite(one["z_axis_value"]):
+    if not np.isfinite(x[:points]).all() or not np.isfinite(function["z_axis_value"]):
         raise ValueError(f"data set {number} of {file} has an abscissa that is not finite.")
-    return {**one, "x": x[:points], "data": data[:points], "number": number}
+    return {**function, "x": x[:points], "data": data[:points], "number": number}

@@ -1,1 +1,0 @@
-"""Methods that run a test by themselves, in a virtual laboratory."""

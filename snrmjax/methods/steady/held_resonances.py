@@ -1,0 +1,127 @@
+"""Backbones of tests that hold resonances by a controller, in the virtual laboratory."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from snrmjax.methods.one_sensor import drive_point
+from snrmjax.methods.result import MethodPoint, MethodResult, MethodStatus, method_result
+from snrmjax.simulate.balance.given_numbers import positive
+from snrmjax.simulate.virtual_test.laboratory import Laboratory
+from snrmjax.simulate.virtual_test.phase_loop import LoopGains, locked_motions
+from snrmjax.simulate.virtual_test.record_phasors import HeldMotion
+from snrmjax.simulate.virtual_test.target_feedback import FeedbackBench, FeedbackSettings
+
+_SAME_VELOCITY = 0.02  # relative difference: levels that say nothing of a slope
+
+
+def phase_locked_loop(
+    laboratory: Laboratory,
+    voltages: Float[np.ndarray, " level"],
+    *,
+    gains: LoopGains | None = None,
+    settle_cycles: int = 300,
+    record_cycles: int = 50,
+    seed: int = 0,
+) -> MethodResult:
+    """Track the backbone: the loop stays closed while the drive voltage steps up.
+
+    Damping is from the balance of power, 2ζ̃ω̃ = |Φ_r Φᵀb| F / |v|.
+
+    Arguments: `voltages` in V, in the order of the test; the others as in `locked_motions`.
+    Returns a `MethodResult` with a point a voltage; 1σ from the noise of the samples, which the
+    loop carries into its frequency, or from the scatter between tenths of the record where that
+    says more, and from the noise of the velocity at which the point lies, along the slope between
+    the levels. Levels whose record is off phase resonance by more than 1°, or whose
+    frequency wandered by more than half of ζω (1σ), are `NOT_LOCKED`. `test_seconds` counts
+    everything.
+    Raises `ValueError` for voltages or cycles that are not positive.
+    Validity: where the natural frequency changes much with little amplitude (a stop, a gap) the
+    loop must follow faster than the motion grows: gains above the standard ones, or small steps.
+    A loop that has not come to rest is off by some times what it still drifts, which 1σ does not
+    know: 0.005 % of the frequency after 300 cycles at a large step under v|v|, nothing after 900.
+    """
+    motions, _, seconds = locked_motions(
+        *(laboratory, [(float(voltage), 0.0) for voltage in positive("voltages", voltages)]),
+        gains=gains,
+        settle_cycles=settle_cycles,
+        record_cycles=record_cycles,
+        seed=seed,
+    )
+    per_force = drive_point(laboratory.structure.modes)
+
+    def point(level: int, motion: HeldMotion) -> MethodPoint:
+        damping = per_force * (motion.force / motion.velocity).real
+        ratio = damping / (2 * motion.frequency)
+        return MethodPoint(
+            *(MethodStatus.FOUND, level, abs(motion.velocity)),
+            *(motion.frequency, motion.frequency_std, ratio, ratio * motion.ratio_std),
+        )
+
+    return method_result("pll", _points(motions, point), len(motions), test_seconds=seconds)
+
+
+def control_based_continuation(
+    laboratory: Laboratory,
+    amplitudes: Float[np.ndarray, " level"],
+    settings: FeedbackSettings,
+    *,
+    seed: int = 0,
+) -> MethodResult:
+    """The backbone: at each target amplitude the frequency at which force and velocity agree.
+
+    The phase that is left between them is taken away by the balance of the mode,
+    ω̃² − Ω² + 2iζ̃ω̃Ω = iΩ|Φ_r Φᵀb| F/v.
+
+    Arguments: `amplitudes` of the target in m/s, rising. Returns a `MethodResult` with a point an
+    amplitude; damping by the balance of power. Amplitudes whose phase was not brought within 0.5°,
+    whose feedback kept harmonics of its own beyond `settings.invasive`, or that were not steady
+    within 1 %, are `NOT_LOCKED`. 1σ are those of the noise and of the scatter within a record; a
+    second mode close by or harmonics of the force are not in them. `test_seconds` counts
+    everything.
+    Raises `ValueError` for numbers that are not positive.
+    """
+    bench = FeedbackBench(laboratory, settings, seed)
+    motions, omega = [], laboratory.frequency
+    for size in positive("amplitudes", amplitudes):
+        motions.append(bench.resonance(omega, float(size)))
+        omega = motions[-1].frequency if motions[-1].held else omega
+    per_force = drive_point(laboratory.structure.modes)
+
+    def point(level: int, motion: HeldMotion) -> MethodPoint:
+        balance = per_force * motion.force / motion.velocity  # 2ζ̃ω̃ + (ω̃² − Ω²)/(iΩ)
+        natural = float(np.sqrt(motion.frequency**2 - motion.frequency * balance.imag))
+        error = abs(balance) * motion.ratio_std
+        return MethodPoint(
+            *(MethodStatus.FOUND, level, abs(motion.velocity), natural, error / 2),
+            *(balance.real / (2 * natural), error / (2 * natural)),
+        )
+
+    return method_result("cbc", _points(motions, point), len(motions), test_seconds=bench.seconds)
+
+
+def _points(
+    motions: Sequence[HeldMotion], point: Callable[[int, HeldMotion], MethodPoint]
+) -> list[MethodPoint]:
+    """Points of held motions, whose 1σ hold that their own velocity is not exact either."""
+    points = [
+        point(level, motion) if motion.held else MethodPoint(MethodStatus.NOT_LOCKED, level)
+        for level, motion in enumerate(motions, 1)
+    ]
+    held = [k for k, motion in enumerate(motions) if motion.held]
+    at = np.log([points[k].velocity for k in held])
+    order = np.argsort(at)
+    if len(held) < 2 or not np.all(np.diff(at[order]) > _SAME_VELOCITY):
+        return points
+    curves = np.array([(points[k].natural_frequency, points[k].damping_ratio) for k in held])
+    slopes = np.empty_like(curves)
+    slopes[order] = np.gradient(curves[order], at[order], axis=0)
+    for k, slope in zip(held, slopes, strict=True):
+        frequency, ratio = slope * motions[k].velocity_std
+        point_of_level = points[k]
+        points[k] = point_of_level._replace(
+            natural_frequency_std=float(np.hypot(point_of_level.natural_frequency_std, frequency)),
+            damping_ratio_std=float(np.hypot(point_of_level.damping_ratio_std, ratio)),
+        )
+    return points

@@ -1,0 +1,31 @@
+"""Import: a laboratory's files to our tables, and what they hold where nobody says what is what."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from snrmjax.io.exchange.import_map import map_of_options
+from snrmjax.io.exchange.importing import Imported, import_files
+from snrmjax.io.exchange.listing import listed_contents, suggested_command
+from snrmjax.io.files import FilePath
+from snrmjax.io.laboratory.reading import read_laboratory_file
+
+
+def import_test(
+    files: Sequence[FilePath], map_file: FilePath | None = None, **options: Any
+) -> Imported:
+    """Steady states, or records that stay records, from the files of one test.
+
+    Arguments: `map_file` of an earlier import; `options` of the command by name, which win over it
+    (`force="CH1"`, `response=["CH2:acceleration:g"]`).
+    Raises `ValueError` as `import_files` does: a question where something cannot be told.
+    """
+    stated = map_of_options(None if map_file is None else Path(map_file), options)
+    return import_files([Path(file) for file in files], stated)
+
+
+def list_contents(file: FilePath, **options: Any) -> list[str]:
+    """What a file holds, in lines, and the command that would import it."""
+    text_format = map_of_options(None, options).text_format
+    held = read_laboratory_file(Path(file), text_format)
+    return [*listed_contents(held), *suggested_command([Path(file)], held)]

@@ -1,0 +1,451 @@
+"""What identifications, joint fits, predictions, modal fits and calibrations have to tell."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from snrmjax.identify.checks.instruments import Determination
+from snrmjax.identify.test_model.states import LEVEL_ERRORS
+from snrmjax.report.sentences import Wording, enumerated, number_of
+
+_MEASURE_GAIN = (
+    "Measure the force, or calibrate the drive (a force transducer at one state, or a known added "
+    "mass); or add states 30° to 70° from resonance on both sides, where the inertia of the modal "
+    "mass is known"
+)
+_LISTED = 8  # levels by name
+_UNITS = {
+    "gain": (100, " % in gain"),
+    "phase": (180 / np.pi, "° in phase"),
+    "stiffness": (50, " % in natural frequency"),
+    "damping": (100, " % in damping"),
+}
+_COMMON = {
+    "gain": "all velocities share an error, or the force or the modal mass has one",
+    "phase": "the instruments turn all phases alike (free `instrument_phase`)",
+    "stiffness": "the natural frequency differs between this test and the others",
+    "damping": "the force or the modal mass has an error",
+}
+_CORRECTIONS = {
+    "velocities": ("scaled the velocities", 100, " %"),
+    "forces": ("scaled the forces", 100, " %"),
+    "phases": ("turned the phases of the velocity", 180 / np.pi, "°"),
+}
+_REMEDIES = {
+    "force_offset": "Add levels of smaller force, and states 30° to 70° from resonance",
+    "instrument_phase": "Add states on both sides of resonance",
+}
+
+
+def in_words(level_std: Sequence[float] | np.ndarray) -> str:
+    """By how much levels differ, and in what (`LEVEL_ERRORS`); nothing where they do not."""
+    pairs = [(_UNITS[k], one) for k, one in zip(LEVEL_ERRORS, level_std, strict=True) if one > 0]
+    return ", ".join(f"{factor * one:.2g}{name}" for (factor, name), one in pairs)
+
+
+def _of_kind(error: str, size: float) -> str:
+    factor, name = _UNITS[error]
+    return f"{factor * size:.2g}{name}"
+
+
+def _undetermined_gain(std: float, how: str) -> str:
+    if how == Determination.HARDLY:
+        return (
+            f"these data hardly determine the force gain: its 1σ is {100 * std:.2g} %, and so is "
+            "that of every damping; natural frequencies rest on the states near resonance. "
+            f"{_MEASURE_GAIN}."
+        )
+    wide = "any value fits them about equally well"
+    if std < np.log(100):
+        wide = f"its 1σ is a factor of {np.exp(std):.2g}, and damping is proportional to it"
+    return f"the force gain cannot be determined from these data ({wide}). {_MEASURE_GAIN}."
+
+
+def _undetermined(name: str, std: float, how: str) -> str:
+    is_phase = name == "instrument_phase"
+    size = f"{np.degrees(std):.2g}°" if is_phase else f"{100 * std:.2g} % of the smallest force"
+    verb = "hardly determine" if how == Determination.HARDLY else "cannot determine"
+    return f"these data {verb} `{name}` (1σ {size}). {_REMEDIES[name]}, or do not free it."
+
+
+def _at_limit(errors: Sequence[str], limit: float, gain: bool) -> str:
+    said = (
+        f"the error in {enumerated(errors)} that the states of a level share is as large as a fit "
+        f"allows ({100 * limit:.0f} %, 1σ): no levels of one test differ by so much, and the "
+        "curves are not to be believed."
+    )
+    if not gain:
+        return said
+    return f"{said} The force gain cannot be determined beside it. {_MEASURE_GAIN}."
+
+
+def _wanders(std: float, noise_stated: bool) -> str:
+    more = "which the stated noise does not explain"
+    if not noise_stated:
+        more = "more than random noise of force and velocity explains"
+    return (
+        f"the natural frequency varies by {100 * std:.2g} % from state to state (1σ), {more}; the "
+        "bands include it."
+    )
+
+
+def _levels_differ(std: Sequence[float], beyond_stated: bool) -> str:
+    more = ", which no stated error explains" if beyond_stated else ""
+    differ = f"levels differ from one another by {in_words(std)} (1σ, estimated)"
+    return f"{differ}{more}; the bands include this level-to-level variance."
+
+
+def _beyond_stated(
+    error: str, stated: float, rms: float, largest: float, mean: float | None
+) -> str:
+    common = "" if mean is None else f"; their mean is {mean:+.2g} of it: {_COMMON[error]}"
+    return (
+        f"levels deviate by {rms:.2g} times the stated 1σ of {_of_kind(error, stated)} (root mean "
+        f"square; largest {largest:.2g} times): the data ask for at least "
+        f"{_of_kind(error, rms * stated)}, or the bands are too narrow{common}."
+    )
+
+
+def _mass_moved(
+    found_kg: float,
+    std_kg: float,
+    model_kg: float,
+    model_std: float,
+    std_stated: bool,
+    beyond_std: bool,
+) -> str:
+    away, source = found_kg / model_kg - 1, "stated" if std_stated else "assumed"
+    more = (
+        f"Damping ratios are relative to it: by the model's they are {100 * abs(away):.2g} % "
+        f"{'larger' if away > 0 else 'smaller'}."
+    )
+    if beyond_std:
+        more = "Check the linear test, the force calibration and the mode shape at the sensor."
+    return (
+        f"states away from resonance ask for a modal mass of {found_kg:.4g} ± {std_kg:.2g} kg, "
+        f"{100 * away:+.2g} % from the model's {model_kg:.4g} kg ({source} 1σ "
+        f"{100 * model_std:.2g} %). {more}"
+    )
+
+
+def _correlated(in_phase: float, quadrature: float, states_as_one: float) -> str:
+    parts = {
+        "for the part in phase with the force": in_phase,
+        "for the part in quadrature with it": quadrature,
+    }
+    found = ", ".join(f"{value:.2g} {part}" for part, value in parts.items() if value > 0)
+    return (
+        f"neighbouring points miss the curve in the same direction (correlation {found}): a "
+        "systematic error, not noise; the curves do not follow the data there, or the motion was "
+        f"not steady. About {states_as_one:.0f} points count as one in the bands."
+    )
+
+
+def _levels_corrected(of: str, levels: Sequence[int], change: Sequence[float], trend: int) -> str:
+    done, factor, unit = _CORRECTIONS[of]
+    change = [factor * one for one in change]
+    if len(levels) > _LISTED:
+        low, high = int(np.argmin(change)), int(np.argmax(change))
+        which = (
+            f"{len(levels)} levels by {change[low]:+.2g}{unit} (level {levels[low]}) to "
+            f"{change[high]:+.2g}{unit} (level {levels[high]})"
+        )
+    else:
+        run = list(levels) == list(range(levels[0], levels[0] + len(levels)))
+        named = f"{levels[0]} to {levels[-1]}" if run and len(levels) > 2 else enumerated(levels)
+        which = f"levels {named} by {enumerated([f'{one:+.2g}' for one in change])}{unit}"
+    more = ""
+    if trend:
+        verb = "grow" if trend > 0 else "fall"
+        more = f"; they {verb} with the force of the level, so they are probably not random"
+    return f"the fit {done} of {which}, so that all levels lie on one pair of curves{more}."
+
+
+def _without_point(n_states: int, of: int, reason: str) -> str:
+    return (
+        f"{n_states} of {of} steady states have no point of their own (the curves use them): "
+        f"{reason}."
+    )
+
+
+def _damping_and_phase(change: float, phase_was_free: bool) -> str:
+    sides = ["45° below resonance (velocity leads)", "45° above it (velocity lags)"]
+    if change < 0:
+        sides = ["45° above resonance (velocity lags)", "45° below it (velocity leads)"]
+    advice = (
+        "let a joint fit estimate it (`--free instrument_phase`; in Python "
+        '`fit_jointly(…, free=["instrument_phase"])`)'
+    )
+    if phase_was_free:
+        advice = (
+            "since this fit has already estimated it, check the force calibration and trust points "
+            "near resonance"
+        )
+    return (
+        f"damping comes out {100 * abs(change):.0f} % higher from points {sides[0]} than from "
+        f"points {sides[1]}, which a damping that depends on amplitude alone does not do; an error "
+        f"of the instrument's phase does: {advice}."
+    )
+
+
+def _trend(error: str, change: float, there: float, p_value: float, load: object) -> str:
+    def sized(size: float) -> str:
+        return f"{'-' if size < 0 else '+'}{_of_kind(error, abs(size))}"
+
+    return (
+        f"levels differ steadily with their force, by {sized(change)} from the smallest to the "
+        f"largest (p = {p_value:.1g}): a law that the curves lack, or a drive that is not linear. "
+        f"Its line has {sized(there)} at {load}: bands there are as much wider (1σ)."
+    )
+
+
+def _resonance_range(
+    probability: float,
+    ratio: float,
+    frequency_hz: tuple[float, float],
+    velocity: tuple[float, float],
+    another_day: bool,
+    sure: bool,
+) -> str:
+    words = []
+    if not sure:
+        words = [
+            f"within {ratio:g} times the largest measured amplitude with probability "
+            f"{probability:.2g}, else beyond (`--extrapolate` looks farther)"
+        ]
+    (low, high), (slow, fast) = frequency_hz, velocity
+    if np.isfinite(low) and np.isfinite(high):
+        day = " and another day's" if another_day else ""
+        band = f"{low:.6g} to {high:.6g} Hz, {slow:.3g} to {fast:.3g} m/s"
+        words.append(f"95 % {band} (a further level's errors{day})")
+    return "; ".join(words)
+
+
+def _not_located(points: Sequence[tuple[str, float]], force: float) -> str:
+    listed = ", ".join(f"{kind} near {hertz:.5g} Hz" for kind, hertz in points)
+    return (
+        f"{len(points)} resonances or folds under {force:g} N could not be located ({listed}) and "
+        "have no band."
+    )
+
+
+def _amplitude_dependence(
+    mode: int,
+    frequency_hz: float,
+    of_damping: bool,
+    change: float,
+    allowed: float,
+    left: float,
+    velocities: tuple[float, float],
+) -> str:
+    name, unit, factor = "frequency", "Hz", 0.5 / np.pi
+    if of_damping:
+        name, unit, factor = "damping", "%", 100.0
+    low, high = velocities
+    return (
+        f"the {name} of mode {mode} ({frequency_hz:.6g} Hz) depends on the amplitude: "
+        f"{factor * change:+.3g} {unit} from {low:.3g} to {high:.3g} m/s, where the errors allow "
+        f"{factor * allowed:.2g} {unit}; at the lowest level some {factor * left:.2g} {unit} may "
+        "be left, which is added to its error (1σ)"
+    )
+
+
+def _low_residual(mass_kg: float, ratio: float, off: bool) -> str:
+    more = ""
+    if off:
+        more = (
+            f", {ratio:.2g} times the stated mass: the force acts off the centre of mass, or the "
+            "suspension's modes or missed modes are in it"
+        )
+    return f"the low residual at the drive point is that of {mass_kg:.4g} kg{more}"
+
+
+SENTENCES: dict[str, Wording] = {
+    # Joint fits.
+    "as_in_file": "{text}",
+    "fit_not_converged": "the fit has {reason}; try a simpler family.",
+    "noise_exceeded": (
+        "the fit misses the data by {scale:.2g} ± {scale_std:.1g} times the stated noise: either "
+        "that noise is too small or the model is wrong; the bands are {scale:.2g} times wider for "
+        "it."
+    ),
+    "noise_overstated": (
+        "states scatter about the curves by only {scale:.2g} ± {scale_std:.1g} times the stated "
+        "noise, errors of whole levels apart: it is overstated."
+    ),
+    "frequency_wanders": _wanders,
+    "levels_differ": _levels_differ,
+    "few_levels": lambda n_levels: (
+        "1 level only: the level-to-level variance is unknown, and the bands do not include it."
+        if n_levels == 1
+        else "2 levels only: the level-to-level variance rests on a single difference, and the "
+        "bands may be too narrow."
+    ),
+    "level_beyond_stated": _beyond_stated,
+    "modal_mass_moved": _mass_moved,
+    "residuals_correlated": _correlated,
+    "levels_corrected": _levels_corrected,
+    "one_side_of_resonance": lambda near_deg, far_deg, below: (
+        f"all states lie on one side of resonance ({near_deg:.0f}° to {far_deg:.0f}° "
+        f"{'below' if below else 'above'} it): a phase error that they share looks like a change "
+        "of natural frequency and damping, and the bands include it only if it is stated."
+    ),
+    "levels_of_one_amplitude": lambda apart: (
+        f"the levels' largest amplitudes lie within {max(100 * apart, 0.1):.2g} % of each other: "
+        "how the mode changes with amplitude rests on the smaller states of the same levels alone."
+    ),
+    "force_gain_near_resonance": (
+        "these data hardly determine the force gain: all states lie within {farthest_deg:.0f}° of "
+        "resonance, where an error of the velocity that changes with the amplitude passes for a "
+        f"gain; the 1σ of gain and damping leave such errors out. {_MEASURE_GAIN}."
+    ),
+    "force_gain_undetermined": _undetermined_gain,
+    "instrument_undetermined": _undetermined,
+    "level_errors_at_limit": _at_limit,
+    # Points.
+    "states_without_point": _without_point,
+    "second_solutions": lambda n_states: (
+        f"{number_of(n_states, 'steady state')} {'has' if n_states == 1 else 'have'} a second "
+        "solution that amplitude and phase alone would also allow."
+    ),
+    "shape_not_followed": (
+        "the sensors do not move as the mode shape says (residual up to {residual:%.0f}): check "
+        "the shape, or the mode's shape changes with amplitude."
+    ),
+    "damping_changes_with_phase": _damping_and_phase,
+    # Predictions.
+    "beyond_measured_amplitudes": (
+        "{n_points} of {of} points lie beyond the largest measured amplitude, up to {ratio:.3g} "
+        "times it: there the backbone is extrapolated, which no measurement supports."
+    ),
+    "points_not_located": _not_located,
+    "negative_damping_left_out": (
+        "damping extrapolated to nothing at {load}: {share:%.2g} of the curves have none left "
+        "before a resonance. No passive structure is so: they are left out (`--self-excited` keeps "
+        "them)."
+    ),
+    "levels_follow_force": _trend,
+    "damping_below_zero": lambda velocity, ratio, ratio_std, probability: (
+        f"damping at {velocity:.3g} m/s is {100 * ratio:.2g} ± {100 * ratio_std:.2g} % of "
+        f"critical, below zero with probability {probability:.2g}: a passive structure's is not, "
+        "so read the band upwards of zero."
+    ),
+    "resonance_of_a_level": _resonance_range,
+    # Advice.
+    "advice_of_unconverged_fit": (
+        "the fit that this advice rests on has not converged: another fit may advise other states"
+    ),
+    "band_narrower": "the {curve} band becomes {share:%.2g} narrower",
+    # Linear modes.
+    "leakage": lambda mode, frequency_hz, lines, bias: (
+        f"the half-power band of mode {mode} ({frequency_hz:.6g} Hz) has {lines:.1f} lines: if "
+        "these are averages of random excitation under Hann's window, leakage makes its damping "
+        f"some {100 * bias:.2g} % too high, which is not in the error; model it (window hann), or "
+        "measure with finer lines"
+    ),
+    "residues_turned": lambda mode, frequency_hz, phase_deg, std_deg: (
+        f"the residues of mode {mode} ({frequency_hz:.6g} Hz) are turned by {phase_deg:.2g}° ± "
+        f"{1.96 * std_deg:.2g}° from real ones: an instrument's phase (free it), a neighbouring "
+        "mode that was missed, or complex modes"
+    ),
+    "complex_mode": (
+        "mode {mode} ({frequency_hz:.6g} Hz) is complex: modal phase collinearity "
+        "{collinearity:.2f}; its real shape is an approximation"
+    ),
+    "misfit_of_sensor": (
+        "the residuals of {sensor} are {times:.2g} times what is stated of its errors: the errors "
+        "of the modes are scaled by that"
+    ),
+    "modal_fit_not_settled": "the least-squares fit had not settled after its last step",
+    "leakage_modelled": (
+        "leakage of Hann's window is modelled: averages of stationary random excitation, windows "
+        "of {window_s:.4g} s"
+    ),
+    "decay_residuals_correlated": (
+        "residuals of neighbouring samples are correlated (a mode that was missed, or a decay that "
+        "is not linear): errors are widened for it"
+    ),
+    "coherence_in_part": "the coherence is stated in part and not used",
+    "coherence_is_one": "the coherence is 1 at most lines: it says nothing of errors",
+    "one_level_for_modes": ("one level alone: nothing says whether it was low enough to be linear"),
+    "levels_not_compared": "level {other} cannot be compared with level {level}: {reason}",
+    "levels_agree": (
+        "the two lowest levels agree within their errors: no amplitude dependence shows"
+    ),
+    "amplitude_dependence": _amplitude_dependence,
+    # Scales of shapes.
+    "scaled_by_drive_point": "scaled by the drive point {sensor}",
+    "scaled_by_added_mass": "scaled by an added mass of {mass_kg:.4g} kg at {sensor}",
+    "scaled_by_sensor_masses": "scaled by the masses at the sensors",
+    "scaled_by_known_shape": "scaled by the shape stated at {sensor}",
+    "not_scaled": "not scaled",
+    "shapes_not_scaled": (
+        "shapes and participations are not mass-normalised: only frequencies, damping ratios and "
+        "ratios of a shape hold; the gain of the force must be free in what follows"
+    ),
+    "participations_per_volt": (
+        "participations are per volt: states with `drive_v` and the gain of the force in newtons "
+        "per volt free, or fixed to one, fit this model"
+    ),
+    "mode_not_scaled": lambda frequency_hz, residue, std: (
+        f"mode at {frequency_hz:.6g} Hz left out: its residue at the drive point is {residue:.3g} "
+        f"± {1.96 * std:.2g} 1/kg (95 %), from which no shape follows"
+    ),
+    "forced_fixture": (
+        "the forced fixture of {mass_kg:.4g} kg moves as the sensors' masses balance it"
+    ),
+    "effective_masses": lambda masses_kg, at_sensors_kg: (
+        f"effective masses: {', '.join(f'{one:.4g}' for one in masses_kg)} kg by modes, of "
+        f"{at_sensors_kg:.4g} kg at the sensors"
+    ),
+    "shape_for_all_modes": "the shape {value:.6g} at {sensor} was taken for every mode",
+    "added_mass_shift": lambda mode, mass_kg, shift_hz, std_hz, first_order: (
+        f"mode {mode}: the mass of {mass_kg:.4g} kg lowers the frequency by {shift_hz:.4g} ± "
+        f"{1.96 * std_hz:.2g} Hz; the first-order formula would give a squared shape "
+        f"{100 * first_order:+.2g} % from this one"
+    ),
+    "added_mass_large": (
+        "the added mass is so large that shapes change with it: take a smaller one"
+    ),
+    "low_residual_of_free_mass": (
+        "the low residual at the drive point is that of a free mass of {mass_kg:.4g} kg or of "
+        "modes below the band: it is written as a rigid-body mode where the structure is said to "
+        "be free"
+    ),
+    "rigid_body_of_stated_mass": "the rigid-body mode is that of the stated mass alone",
+    "low_residual_of_mass": _low_residual,
+    "rigid_body_of_residuals": lambda mass_kg, std_kg, scaled_by: (
+        f"rigid-body mode from the low residuals ({scaled_by}): the force feels {mass_kg:.4g} ± "
+        f"{1.96 * std_kg:.2g} kg"
+    ),
+    # Calibrations.
+    "equal_errors_assumed": lambda some_stated: (
+        "every point is given the same relative error, as "
+        f"{'not all are' if some_stated else 'none is'} stated."
+    ),
+    "harmonics_without_error": "harmonics are left out: no error is stated for them.",
+    "no_motion_for_calibration": (
+        "no balanced motion was found for any state: nothing was fitted."
+    ),
+    "no_mode_at_start": "the start has no such mode at some velocities: begin nearer.",
+    "calibration_not_converged": (
+        "the fit did not converge: values and standard deviations are not those of a minimum; "
+        "begin nearer, or fit fewer parameters."
+    ),
+    "states_without_motion": (
+        "no balanced motion was found for the states {states}: they have no weight."
+    ),
+    "calibration_noise": lambda scale: (
+        f"residuals are {scale:.2g} times the stated noise: it is understated or the model lacks "
+        "something; the standard deviations are widened."
+        if not scale < 1
+        else f"residuals are only {scale:.2g} times the stated noise: it is overstated."
+    ),
+    "parameters_without_data": "the data say nothing about {names}.",
+    "parameters_hardly_known": (
+        "the backbone says next to nothing about {names}: state `prior_std`."
+    ),
+    "parameters_at_limit": (
+        "{names} ended ten times off the start: begin nearer, or state `prior_std`."
+    ),
+}

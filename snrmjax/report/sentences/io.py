@@ -1,0 +1,124 @@
+"""What files, and their import, have to tell."""
+
+from snrmjax.report.sentences import Wording, number_of
+
+
+def _our_own_table(unit: str, force_unit: str, amplitude: str, conjugated: bool) -> str:
+    said = (
+        (unit, f"velocity columns in {unit}"),
+        (force_unit, f"forces in {force_unit}"),
+        (amplitude, f"amplitudes {amplitude}"),
+        (conjugated, "phasors conjugated"),
+    )
+    how = ", ".join(words for is_so, words in said if is_so) or "taken as they are"
+    return f"the columns are those of our table: {how}."
+
+
+_NOT_READ = {
+    "empty": "is empty",
+    "type": "is of a type that is not read",
+    "times_of_day": "holds times of day",
+    "sparse": "is a sparse matrix: save numbers, text, structs and cells",
+    "object": "is a function handle or an object: save numbers, text, structs and cells",
+    "circle": "links in a circle or nests too deeply",
+    "other_file": "is a link to another file",
+    "elsewhere": "lies in other files",
+    "never_written": "was declared but never written",
+    "larger_than_file": "states more numbers than the file can hold",
+    "large_pieces": "is stored in pieces that are too large",
+    "too_many_texts": "has too many texts",
+}
+
+
+SENTENCES: dict[str, Wording] = {
+    # Why an import took what nobody stated.
+    "unit_of_file": "the file says so",
+    "unit_stated_over_file": "stated, though the file says {unit}",
+    "units_say_so": "the units say so",
+    "nothing_is_said": "nothing is said",
+    "column_by_name": "the column's name says so",
+    "by_names_of_columns": "by the names of the columns",
+    "column_says_so": "{column} says so",
+    "phase_beyond_two_turns": "{column} reaches beyond two turns in radians",
+    "phase_ahead_of_the_force": "a positive phase is ahead of the force, e^(+iwt)",
+    "imaginary_ahead_of_the_force": "a positive imaginary part is ahead of the force",
+    "phasors_turn_forward": "phasors are e^(+iwt)",
+    "quantity_by_unit": "the unit {unit} says so",
+    "sensor_not_stated": "not stated; --sensor names it",
+    "deviation_of_one_row": ("1σ of the row, by its name (if of each of N readings: divide by √N)"),
+    "level_a_file": "one level a file, in the order in which they were named",
+    "level_a_record": "one level a record, in the order in which they were named",
+    "level_a_set": "one level a set of responses, in the file's order",
+    "levels_found": "{n} found",
+    "record_recognised": "recognised in the record",
+    "spectra_of_one_reference": "spectra or responses over one reference, of amplitude 1",
+    "reference_without_unit": "the file states none of the reference",
+    # Notes on our own tables.
+    "column_without_name": "column {number} of {file} has no name and is not used.",
+    "column_not_used": lambda name, file, near: (
+        f"the column `{name}` of {file} is not used{f' (did you mean `{near}`?)' if near else ''}."
+    ),
+    "column_partly_stated": (
+        "`{name}` is not stated in {n} of {of} rows of {file} (first in row {first_row})."
+    ),
+    "error_of_no_harmonics": (
+        "`harmonic_std_m_s` of {file} is not used: the table has no harmonics."
+    ),
+    "error_of_no_phases": "`phase_std_deg` of {file} is not used: the table has no phases.",
+    "amplitudes_without_phases": (
+        "{file} has the amplitude of the velocity alone: its phase is unknown, and that of "
+        "harmonics is not used."
+    ),
+    # Notes on files of laboratories.
+    "not_read": lambda name, why: f"{name} {_NOT_READ[why]}; not read.",
+    "nothing_measured": lambda names: (
+        "it has only texts, single numbers and empty arrays"
+        + (f" ({', '.join(names)})." if names else ".")
+    ),
+    "not_a_table": lambda name, sides: (
+        f"{name} has {' by '.join(map(str, sides))} numbers and is not read as a table."
+    ),
+    "uneven_time": "{name} is no even time and is read as a column.",
+    "time_seen_in_places": "{name} was looked at in three places: even steps.",
+    "responses_along_first_side": "responses along the first side that is not the frequency's.",
+    "columns_numbered": "no row of names above the numbers: the columns are numbered.",
+    "comments_not_read": "{n:#line} of comment among the numbers not read.",
+    "empty_fields": "column {name} has {n:#empty field}.",
+    "text_read": "separator {separator}, decimal {decimal}, numbers from row {first_row}.",
+    "coherence_alone": "a coherence without its frequency response is not read.",
+    "frequencies_do_not_rise": "frequency responses whose frequencies do not rise are in a table.",
+    "uneven_record": "a time record with uneven steps is in a table.",
+    "channel_described": "channel {name}: {text}.",
+    "model_named": "model {name}.",
+    "whole_rate": "rate {rate} per unit, from a step of six digits, {step:.5e}.",
+    "six_digits": "the abscissa has six digits: its end may be off by {off:.1g}.",
+    "no_unit_system": "no units (data set 164): SI where an axis states none.",
+    "unit_system": lambda name, length, force: (
+        f"units{name and ' '}{name}: 1 m is {length:.6g} of the file's, 1 N is {force:.6g}."
+    ),
+    "unit_unknown": "the unit {unit!r} is not understood and its factor is taken as 1.",
+    "unit_of_other_quantity": "an axis of {stated} has the unit {unit!r}: taken for {taken}.",
+    "data_sets_not_read": lambda n, type, meaning: (
+        f"{number_of(n, 'data set')} of type {type}{f' ({meaning})' if meaning else ''} not read."
+    ),
+    # What a reduced model took that nobody stated.
+    "damping_assumed": "no damping is stated: {ratio:g} is taken for every mode",
+    "sensor_assumed": "no sensor is stated: {name}, where mode 1 is largest, is taken",
+    "point_force_assumed": "no participation is stated: a point force at {sensor} is taken",
+    "driven_at_largest": (
+        "the model is driven and observed at node {node} in {direction}, where its first mode is "
+        "largest"
+    ),
+    "large_displacements_taken": (
+        "no step of the deck has NLGEOM: the load cases ran with large displacements, as `{step}` "
+        "in place of the deck's steps"
+    ),
+    "loads_left_out": lambda keywords: (
+        f"loads of the deck are left out ({', '.join(f'*{word}' for word in keywords)}): the model "
+        "is that of the unloaded structure"
+    ),
+    # Notes on an import.
+    "note_of_file": "{file}: {note}",
+    "rows_incomplete": "{n} of {of} rows of {file} are incomplete, left out.",
+    "our_own_table": _our_own_table,
+}

@@ -1,0 +1,403 @@
+"""A virtual laboratory: structure, shaker, instruments and a sampled controller, in time.
+
+The structure is any model of this package: modes, potential, contacts, friction with its memory.
+An electrodynamic shaker drives it through a stinger, so that the force drops at resonance and
+carries harmonics, as on a real shaker. From one sample of the controller to the next the voltage
+goes from the last command to the new one (a delay of one sample) on the cubic through the last four
+commands, as smooth as a reconstruction filter leaves it: straight lines, or steps, would have
+images about the sampling rate, which alias into the sampled force. The equations of motion are
+integrated by the classical method of Runge and Kutta, of order 4, in substeps of equal length;
+sliders are moved exactly after each of them.
+
+Reference: for the shaker, G. R. Tomlinson, J. Sound Vib. 63 (1979) 337,
+doi:10.1016/0022-460X(79)90681-9.
+"""
+
+import abc
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from snrmjax.model.effect_base import (
+    AbstractForceSpectrum,
+    AbstractHysteresis,
+    AbstractKinked,
+    AbstractMeasurementEffect,
+)
+from snrmjax.model.modes import reference_sensor
+from snrmjax.model.structures import Structure, simulated_structure
+from snrmjax.simulate.solutions.hysteresis_cycles import (
+    memory_after_step,
+    memory_at_rest,
+    memory_rate,
+    scaled_friction,
+)
+from snrmjax.simulate.virtual_test.equipment import (
+    Instruments,
+    Shaker,
+    check_instruments,
+    check_shaker,
+    filter_sections,
+)
+
+_FEWEST_STEPS = 20  # a cycle of the fastest linear motion, that the integration can follow it
+
+
+class Sample(NamedTuple):
+    """What the controller sees at a sample."""
+
+    time: Float[Array, ""]
+    force: Float[Array, ""]  # N
+    velocity: Float[Array, ""]  # m/s, at the reference sensor
+
+
+class AbstractController(eqx.Module):
+    """A sampled controller: it sees force and velocity and sets the shaker's voltage."""
+
+    @abc.abstractmethod
+    def initial(self) -> Any:
+        """Its state before the first sample."""
+
+    @abc.abstractmethod
+    def step(self, state: Any, sample: Sample, period: Float[Array, ""]) -> tuple[Any, Array, Any]:
+        """The next state, the voltage until the next sample, and what it reports."""
+
+
+class TestRecord(NamedTuple):
+    """Channels of a test, one entry a sample."""
+
+    time: Float[Array, " sample"]  # s
+    voltage: Float[Array, " sample"]  # V, of the amplifier
+    force: Float[Array, " sample"]  # N, as recorded
+    velocity: Float[Array, " sample"]  # m/s, as recorded
+    report: Any  # of the controller, arrays that lead with the sample
+
+
+class LabMotion(NamedTuple):
+    """What the equations of motion integrate."""
+
+    displacement: Float[Array, " mode"]  # kg^1/2 m
+    velocity: Float[Array, " mode"]  # kg^1/2 m/s
+    memory: tuple[Float[Array, " state"], ...]  # of friction, one entry an effect
+
+
+class LabState(NamedTuple):
+    """Everything that goes on from one run to the next."""
+
+    motion: LabMotion
+    controller: Any
+    time: Float[Array, ""]
+    voltage: Float[Array, "3"]  # of the amplifier at the last three samples, V
+    seen: Float[Array, " channel"]  # force (N) and velocity (m/s) behind the anti-alias filter
+    filtered: Float[Array, "section 2 channel"]  # memory of the anti-alias filter
+    largest: Float[Array, ""]  # |q| of the mode of interest so far, kg^1/2 m
+
+
+class Laboratory(eqx.Module):
+    """A structure on a shaker with its instruments.
+
+    `sampling_rate` in Hz is that of the controller and of the records; each sample is integrated
+    in `substeps`, of which the fastest linear motion (a contact that is closed included) needs 20 a
+    cycle. Effects with memory (friction) need `largest_displacement`, in m at
+    the reference sensor: their sliders, and the width of a smoothed Coulomb force, are set for
+    motions up to it. With `attached` False the shaker is away and nothing drives the structure.
+    What is left of the voltage's images aliases into the force by about (ω period)⁴/38 of the
+    shaker's own force, which near resonance may be several times the force on the structure.
+    Raises `ValueError` for numbers that cannot be, a rate too low, and effects of the measurement
+    or of the force's spectrum, which the shaker and the instruments here have themselves.
+    """
+
+    structure: Structure
+    shaker: Shaker
+    instruments: Instruments
+    sampling_rate: float = eqx.field(static=True)
+    substeps: int = eqx.field(static=True, default=2)
+    largest_displacement: float = eqx.field(static=True, default=np.nan)
+    attached: bool = eqx.field(static=True, default=True)
+
+    def __check_init__(self) -> None:
+        check_shaker(self.shaker)
+        check_instruments(self.instruments, self.sampling_rate)
+        foreign = (AbstractMeasurementEffect, AbstractForceSpectrum)
+        kinds = ", ".join(e.kind for e in self.structure.effects if isinstance(e, foreign))
+        if kinds:
+            raise ValueError(
+                f"the virtual laboratory has its own shaker and instruments, but the model has "
+                f"{kinds}: state them in `shaker` and `instruments`."
+            )
+        if self.structure.hysteretic and not self.largest_displacement > 0:
+            kinds = ", ".join(effect.kind for effect in self.structure.hysteretic)
+            raise ValueError(
+                f"{kinds} needs `largest_displacement`, in m at the reference sensor, but it is "
+                f"{self.largest_displacement}."
+            )
+        if self.substeps < 1:
+            raise ValueError(f"`substeps` must be 1 or more, but is {self.substeps}.")
+        fastest = _fastest(self.structure, self.shaker) / (2 * np.pi)
+        if self.sampling_rate * self.substeps < _FEWEST_STEPS * fastest:
+            raise ValueError(
+                f"`sampling_rate` times `substeps` must be {_FEWEST_STEPS} times the highest "
+                f"frequency of structure and contacts, {fastest:.4g} Hz, or more, but is "
+                f"{self.sampling_rate * self.substeps:g} Hz: "
+                f"{int(np.ceil(_FEWEST_STEPS * fastest / self.sampling_rate))} substeps would do."
+            )
+
+    @property
+    def frequency(self) -> float:
+        """Natural frequency of the mode of interest, rad/s."""
+        modes = self.structure.modes
+        return float(modes.natural_frequency[modes.mode_of_interest])
+
+    @property
+    def decay(self) -> float:
+        """ζω of the mode of interest, 1/s."""
+        modes = self.structure.modes
+        return float(modes.damping_ratio[modes.mode_of_interest]) * self.frequency
+
+    def samples(self, cycles: float) -> int:
+        """How many samples so many cycles of the mode of interest have."""
+        return round(cycles * self.sampling_rate * 2 * np.pi / self.frequency)
+
+    def at_rest(self, controller: AbstractController) -> LabState:
+        """The state before anything moves."""
+        n = simulated_structure(self.structure).n_modes
+        memory = tuple(memory_at_rest(e, jnp.zeros(())) for e in self.friction())
+        sections = len(filter_sections(self.instruments, self.sampling_rate * self.substeps))
+        return LabState(
+            LabMotion(jnp.zeros(n), jnp.zeros(n), memory),
+            controller.initial(),
+            jnp.zeros(()),
+            jnp.zeros(3),
+            jnp.zeros(2),
+            jnp.zeros((sections, 2, 2)),
+            jnp.zeros(()),
+        )
+
+    def reach(self) -> float:
+        """`largest_displacement` as |q| of the mode of interest, kg^1/2 m."""
+        modes = self.structure.modes
+        shape = modes.mode_shape[reference_sensor(modes), modes.mode_of_interest]
+        return self.largest_displacement / abs(float(shape))
+
+    def friction(self) -> tuple[AbstractHysteresis, ...]:
+        """The effects with a memory, set for motions up to `largest_displacement`."""
+        if not self.structure.hysteretic:
+            return ()
+        speed = self.reach() * self.frequency / np.sqrt(2)
+        return scaled_friction(self.structure, self.reach(), speed)
+
+
+def run_test(
+    laboratory: Laboratory,
+    controller: AbstractController,
+    samples: int,
+    *,
+    start: LabState | None = None,
+    seed: int = 0,
+) -> tuple[TestRecord, LabState]:
+    """Let the controller work for a number of samples.
+
+    Arguments: `start` is where another run ended, by default rest; `seed` draws the noise.
+    Returns the record and the state at its end. Deterministic for a seed.
+    Raises `ValueError` where a structure with friction went beyond `largest_displacement`.
+    """
+    begin = laboratory.at_rest(controller) if start is None else start
+    noise = np.random.default_rng(seed).standard_normal((samples, 2))
+    instruments = laboratory.instruments
+    sections = filter_sections(instruments, laboratory.sampling_rate * laboratory.substeps)
+    record, end = _run(laboratory, laboratory.friction(), controller, begin, sections, noise)
+    if laboratory.structure.hysteretic and float(end.largest) > laboratory.reach():
+        ratio = float(end.largest) / laboratory.reach()
+        raise ValueError(
+            f"the motion reached {ratio * laboratory.largest_displacement:.4g} m at the reference "
+            f"sensor, beyond `largest_displacement`, {laboratory.largest_displacement:g} m, up to "
+            "which friction is resolved."
+        )
+    return record, end
+
+
+@eqx.filter_jit
+def _run(
+    laboratory: Laboratory,
+    friction: tuple[AbstractHysteresis, ...],
+    controller: AbstractController,
+    begin: LabState,
+    sections: Float[np.ndarray, "section 6"],
+    noise: Float[Array | np.ndarray, "sample channel"],
+) -> tuple[TestRecord, LabState]:
+    structure, ins = simulated_structure(laboratory.structure), laboratory.instruments
+    modes, j = structure.modes, structure.modes.mode_of_interest
+    shape = modes.mode_shape[reference_sensor(laboratory.structure.modes)]
+    turn = jnp.sign(shape[j] * modes.participation[j])
+    period = jnp.asarray(1 / laboratory.sampling_rate)
+    steps, limit = laboratory.substeps, laboratory.shaker.largest_voltage
+    slope = _equations(laboratory.shaker, laboratory.attached, structure, friction)
+    step = _integrator(slope, friction, j, period / steps)
+    cubic = _between_samples(np.arange(2 * steps + 1) / (2 * steps))
+
+    def channels(motion: LabMotion, voltage: Array) -> Array:
+        return jnp.stack([slope(motion, voltage)[1], turn * (shape @ motion.velocity)])
+
+    def sample(state: LabState, drawn: Array) -> tuple[LabState, tuple]:
+        force = state.seen[0] + ins.force_noise * drawn[0]
+        speed = state.seen[1] + ins.velocity_noise * drawn[1]
+        control, command, report = controller.step(
+            state.controller, Sample(state.time, force, speed), period
+        )
+        voltage = jnp.clip(command, -limit, limit)
+        known = jnp.append(state.voltage, voltage)
+        along = jnp.clip(cubic @ known, -limit, limit)
+
+        def substep(now: tuple, volts: Array) -> tuple[tuple, None]:
+            motion, filtered, seen = now
+            motion = step(motion, volts)
+            if len(sections):
+                seen, filtered = _filtered(sections, filtered, channels(motion, volts[2]))
+            return (motion, filtered, seen), None
+
+        now = (state.motion, state.filtered, state.seen)
+        volts_of_steps = jnp.stack([along[:-2:2], along[1::2], along[2::2]], axis=1)
+        (motion, filtered, seen), _ = jax.lax.scan(substep, now, volts_of_steps, unroll=2)
+        if not len(sections):
+            seen = channels(motion, voltage)
+        largest = jnp.maximum(state.largest, jnp.abs(motion.displacement[j]))
+        after = LabState(
+            *(motion, control, state.time + period, known[1:], seen, filtered),
+            largest,
+        )
+        return after, (state.time, voltage, force, speed, report)
+
+    end, columns = jax.lax.scan(sample, begin, jnp.asarray(noise))
+    return TestRecord(*columns), end
+
+
+def _equations(
+    shaker: Shaker,
+    attached: bool,
+    structure: Structure,
+    friction: tuple[AbstractHysteresis, ...],
+) -> Callable[[LabMotion, Array], tuple[LabMotion, Array]]:
+    """Rates of a motion under a voltage, and the force that the cell reads."""
+    terms, drive, j = (
+        structure.linear_terms(),
+        structure.modes.participation,
+        structure.modes.mode_of_interest,
+    )
+    per_force = drive / terms.mass
+    inertia = 1 + shaker.mass * (drive @ per_force)
+
+    def pushed(at: Array, speed: Array, voltage: Array) -> Array:
+        """What the armature gets from its coil and its suspension."""
+        current = (voltage - shaker.motor_constant * speed) / shaker.resistance
+        current = jnp.clip(current, -shaker.largest_current, shaker.largest_current)
+        return shaker.motor_constant * current - shaker.damping * speed - shaker.stiffness * at
+
+    def slope(motion: LabMotion, voltage: Array) -> tuple[LabMotion, Array]:
+        q, v = motion.displacement, motion.velocity
+        inner = (
+            terms.damping * v
+            + terms.stiffness * q
+            + structure.memoryless_force(q[None], v[None])[0]
+        )
+        for effect, states in zip(friction, motion.memory, strict=True):
+            inner = inner.at[j].add(effect.state_force(q[j], v[j], states))
+        free = -inner / terms.mass
+        force = jnp.zeros(())
+        if attached:
+            # The armature's inertia is part of the force: F = push − m (Γ·q̈), q̈ = free + Γ F.
+            push = pushed(drive @ q, drive @ v, voltage)
+            force = (push - shaker.mass * (drive @ free)) / inertia
+        memory = tuple(
+            memory_rate(effect, q[j], v[j], states)
+            for effect, states in zip(friction, motion.memory, strict=True)
+        )
+        return LabMotion(v, free + per_force * force, memory), force
+
+    return slope
+
+
+def _integrator(
+    slope: Callable[[LabMotion, Array], tuple[LabMotion, Array]],
+    friction: tuple[AbstractHysteresis, ...],
+    j: int,
+    h: Array,
+) -> Callable[[LabMotion, Float[Array, "3"]], LabMotion]:
+    """One step of length h by the classical method of Runge and Kutta, sliders moved after it."""
+
+    def step(motion: LabMotion, volts: Float[Array, "3"]) -> LabMotion:
+        first, middle, last = volts
+
+        def after(time: Array, rate: LabMotion) -> LabMotion:
+            return jax.tree.map(lambda at, by: at + time * by, motion, rate)
+
+        one = slope(motion, first)[0]
+        two = slope(after(h / 2, one), middle)[0]
+        three = slope(after(h / 2, two), middle)[0]
+        four = slope(after(h, three), last)[0]
+        mean = jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, one, two, three, four)
+        moved = after(h, mean)
+        way = [(at.displacement[j], at.velocity[j]) for at in (motion, moved)]
+        memory = (
+            memory_after_step(effect, states, way[0], way[1], h)
+            for effect, states in zip(friction, moved.memory, strict=True)
+        )
+        return moved._replace(memory=tuple(memory))
+
+    return step
+
+
+def _between_samples(share: Float[np.ndarray, " time"]) -> Float[np.ndarray, "time 4"]:
+    """Weights of the last four commands, by Lagrange, at shares of the way between the last two."""
+    at = np.arange(-2.0, 2.0)
+    others = [np.delete(at, k) for k in range(4)]
+    return np.stack(
+        [
+            np.prod((share[:, None] - other) / (node - other), axis=1)
+            for node, other in zip(at, others, strict=True)
+        ],
+        axis=1,
+    )
+
+
+def _filtered(
+    sections: Float[np.ndarray, "section 6"],
+    memory: Float[Array, "section 2 channel"],
+    value: Float[Array, " channel"],
+) -> tuple[Float[Array, " channel"], Float[Array, "section 2 channel"]]:
+    """One sample through the sections, direct form II transposed."""
+    kept = []
+    for k, (b0, b1, b2, _, a1, a2) in enumerate(sections):
+        out = b0 * value + memory[k, 0]
+        kept.append(jnp.stack([b1 * value - a1 * out + memory[k, 1], b2 * value - a2 * out]))
+        value = out
+    return value, jnp.stack(kept)
+
+
+def _fastest(structure: Structure, shaker: Shaker) -> float:
+    """Largest |eigenvalue| (rad/s) of structure and shaker, closed contacts included."""
+    model = simulated_structure(structure)
+    n, j = model.n_modes, model.modes.mode_of_interest
+    mass, damping, stiffness = (np.diag(np.asarray(term)) for term in model.linear_terms())
+    grid = np.logspace(-12, 3, 301)
+    q = jnp.asarray(np.concatenate([-grid, grid]))
+    for effect in model.memoryless:
+        if isinstance(effect, AbstractKinked):
+            slope = jax.vmap(jax.grad(effect.force))(q, jnp.zeros_like(q))
+            stiffness[j, j] += float(jnp.max(slope))
+    drive = np.asarray(model.modes.participation)
+    coil = shaker.damping + shaker.motor_constant**2 / shaker.resistance
+    coupling = np.outer(drive, drive)
+    mass, damping = mass + shaker.mass * coupling, damping + coil * coupling
+    stiffness = stiffness + shaker.stiffness * coupling
+    state = np.block(
+        [
+            [np.zeros((n, n)), np.eye(n)],
+            [-np.linalg.solve(mass, stiffness), -np.linalg.solve(mass, damping)],
+        ]
+    )
+    return float(np.abs(np.linalg.eigvals(state)).max())

@@ -1,0 +1,316 @@
+"""Programmes of a test: stepped sines, multisines, decays and tables of voltages, in time.
+
+A stepped sine may hold the voltage (open loop: force and response find themselves, and jump where
+a branch ends), or by its voltage the amplitude of force, velocity or displacement. The law is
+proportional and integral in the logarithm: ln U = I + k e, İ = λ e with e = 1 − |X|/target, |X|
+from adaptive filters at the frequency of the drive.
+
+References: for response control, T. Karaağaçlı & H. N. Özgüven, Mech. Syst. Signal Process. 144
+(2020) 107023, doi:10.1016/j.ymssp.2020.107023; for phases of multisines, M. R. Schroeder, IEEE
+Trans. Inf. Theory 16 (1970) 85, doi:10.1109/TIT.1970.1054411.
+"""
+
+import dataclasses
+from typing import Literal, NamedTuple, get_args
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from snrmjax.measure.records import steady_state_from_records
+from snrmjax.measure.states import SteadyStates, join_steady_states
+from snrmjax.model.modes import reference_sensor
+from snrmjax.simulate.balance.given_numbers import positive
+from snrmjax.simulate.virtual_test.laboratory import (
+    AbstractController,
+    Laboratory,
+    Sample,
+    TestRecord,
+    run_test,
+)
+from snrmjax.simulate.virtual_test.phase_loop import LoopGains, locked_motions
+from snrmjax.simulate.virtual_test.record_phasors import (
+    FourierState,
+    HeldMotion,
+    followed,
+    nothing_followed,
+)
+
+Held = Literal["voltage", "force", "velocity", "displacement"]
+
+_ORDERS = np.arange(1, 6)  # harmonics that the filters follow beside the mean
+_APPROACH = 5.0  # times 1/λ, that a law has to find its first voltage
+_LARGEST_ERROR = 1.0  # of an amplitude, relative: what the law acts on at most
+
+
+class TestSteps(NamedTuple):
+    """Where the steady states of a record are."""
+
+    frequency: Float[np.ndarray, " step"]  # rad/s
+    first: Int[np.ndarray, " step"]  # sample at which the settled part begins
+    samples: int  # of the settled part
+
+
+class LaboratoryTest(NamedTuple):
+    """A test in the virtual laboratory: its channels and how long it took."""
+
+    record: TestRecord
+    seconds: float
+    steps: TestSteps | None = None  # of a stepped sine
+
+
+class DecayTest(NamedTuple):
+    """A free decay from a resonance that a loop held, and that resonance."""
+
+    record: TestRecord  # from the moment on at which the shaker is away
+    seconds: float  # resonance and decay
+    resonance: HeldMotion  # `held` where the loop had locked
+
+
+class AmplitudeGains(NamedTuple):
+    """How a stepped sine holds an amplitude.
+
+    A branch that folds over at fixed frequency needs k > −d ln F/d ln X there; far from resonance
+    a large k meets the filters' delay, and the loop rings.
+    """
+
+    filter_rate: float  # 1/s
+    proportional: float  # k
+    integral_rate: float  # λ, 1/s
+
+
+class Playback(AbstractController):
+    """A table of voltages, one a sample; zero after its end."""
+
+    voltages: Float[Array, " sample"]
+
+    def initial(self) -> Int[Array, ""]:
+        """The number of the sample."""
+        return jnp.asarray(0)
+
+    def step(
+        self, state: Int[Array, ""], sample: Sample, period: Float[Array, ""]
+    ) -> tuple[Array, Array, Array]:
+        """The voltage of the next row."""
+        voltage = self.voltages.at[state].get(mode="fill", fill_value=0.0)
+        return state + 1, voltage, state
+
+
+class StepState(NamedTuple):
+    """Where a stepped sine is."""
+
+    samples: Int[Array, ""]  # so far
+    angle: Float[Array, ""]
+    integral: Float[Array, ""]  # of the logarithm of the voltage
+    filters: FourierState  # force, velocity
+
+
+class SteppedSineDrive(AbstractController):
+    """A sine whose frequency steps while its phase goes on; it may hold an amplitude."""
+
+    frequencies: Float[Array, " step"]  # rad/s
+    target: Float[Array, ""]  # of what is held: V, N, m/s or m
+    first_voltage: Float[Array, ""]
+    filter_rate: Float[Array, ""]  # 1/s
+    proportional: Float[Array, ""]
+    integral_rate: Float[Array, ""]  # 1/s
+    dwell: Int[Array, ""]  # samples a step
+    approach: Int[Array, ""]  # samples before the first step, at its frequency
+    held: Held = eqx.field(static=True)
+
+    def initial(self) -> StepState:
+        """At rest, with nothing followed."""
+        zero = jnp.zeros(())
+        return StepState(jnp.asarray(0), zero, zero, nothing_followed(2, _ORDERS))
+
+    def step(
+        self, state: StepState, sample: Sample, period: Float[Array, ""]
+    ) -> tuple[StepState, Array, Array]:
+        """A sine of the step's frequency, as large as what is held wants it."""
+        number = (state.samples - self.approach) // self.dwell
+        omega = self.frequencies[jnp.clip(number, 0, self.frequencies.size - 1)]
+        seen = jnp.stack([sample.force, sample.velocity])
+        filters = followed(state.filters, seen, state.angle, _ORDERS, self.filter_rate * period)
+        integral, size = state.integral, self.target
+        if self.held != "voltage":
+            found = jnp.abs(filters.harmonics[0 if self.held == "force" else 1, 0])
+            found = found / omega if self.held == "displacement" else found
+            error = jnp.clip(1 - found / self.target, -_LARGEST_ERROR, _LARGEST_ERROR)
+            integral = integral + self.integral_rate * period * error
+            size = self.first_voltage * jnp.exp(integral + self.proportional * error)
+        angle = jnp.mod(state.angle + omega * period, 2 * jnp.pi)
+        after = StepState(state.samples + 1, angle, integral, filters)
+        return after, size * jnp.cos(angle), angle
+
+
+def stepped_sine_test(
+    laboratory: Laboratory,
+    target: float,
+    frequencies: Float[np.ndarray, " step"],
+    *,
+    held: Held = "voltage",
+    gains: AmplitudeGains | None = None,
+    first_voltage: float = 0.1,
+    settle_cycles: int = 200,
+    record_cycles: int = 30,
+    seed: int = 0,
+) -> LaboratoryTest:
+    """Step the frequency of a sine without ever stopping the motion.
+
+    Arguments: `target` is the amplitude of what is `held`: voltage (V; open loop), force (N),
+    velocity (m/s) or displacement (m) at the reference sensor; `frequencies` in rad/s in the order
+    of the test; cycles of the linear mode of interest at each of them, to settle and then to
+    record; `gains` by default filters of ω/3 of the mode of interest, k = 1.5 and λ = ζω;
+    `first_voltage` (V) is where a law
+    begins, given five times 1/λ at the first frequency before the first step.
+    Returns a `LaboratoryTest` with its steps, for `steady_states_of`. An amplitude that is not
+    reached is seen there: the law has no status. Raises `ValueError` for numbers that are not
+    positive and for an unknown quantity to hold.
+    """
+    if held not in get_args(Held):
+        raise ValueError(f"`held` must be one of {', '.join(get_args(Held))}, but is {held!r}.")
+    rates = AmplitudeGains(laboratory.frequency / 3, 1.5, laboratory.decay)
+    rates = rates if gains is None else gains
+    steps = np.atleast_1d(np.asarray(frequencies, dtype=float))
+    for name, values in (
+        *(("target", target), ("frequencies", steps), ("first_voltage", first_voltage)),
+        *(("settle_cycles", settle_cycles), ("record_cycles", record_cycles), ("gains", rates)),
+    ):
+        positive(name, values)
+    settle, keep = laboratory.samples(settle_cycles), laboratory.samples(record_cycles)
+    approach = 0
+    if held != "voltage":
+        approach = round(_APPROACH / rates.integral_rate * laboratory.sampling_rate)
+    programme = SteppedSineDrive(
+        frequencies=jnp.asarray(steps),
+        target=jnp.asarray(float(target)),
+        first_voltage=jnp.asarray(float(first_voltage)),
+        filter_rate=jnp.asarray(float(rates.filter_rate)),
+        proportional=jnp.asarray(float(rates.proportional)),
+        integral_rate=jnp.asarray(float(rates.integral_rate)),
+        dwell=jnp.asarray(settle + keep),
+        approach=jnp.asarray(approach),
+        held=held,
+    )
+    count = approach + len(steps) * (settle + keep)
+    record, _ = run_test(laboratory, programme, count, seed=seed)
+    first = approach + settle + np.arange(len(steps)) * (settle + keep)
+    return LaboratoryTest(record, count / laboratory.sampling_rate, TestSteps(steps, first, keep))
+
+
+def multisine_test(
+    laboratory: Laboratory,
+    rms_voltage: float,
+    lines: Int[np.ndarray, " line"],
+    period_samples: int,
+    periods: int,
+    *,
+    phases: Literal["random", "schroeder"] = "random",
+    seed: int = 0,
+) -> LaboratoryTest:
+    """A periodic multisine of equal lines.
+
+    Arguments: `rms_voltage` in V of the whole; `lines` are multiples of the sampling rate over
+    `period_samples`; `phases` drawn from `seed`, or after Schroeder for a low crest.
+    Returns a `LaboratoryTest` of `periods` periods, the first of them with the transient.
+    Raises `ValueError` for lines outside 1 to half of `period_samples`, and for numbers that are
+    not positive.
+    """
+    distinct = np.unique(np.asarray(lines, dtype=int))
+    for name, value in (
+        *(("rms_voltage", rms_voltage), ("periods", periods)),
+        ("period_samples", period_samples),
+    ):
+        positive(name, value)
+    if not distinct.size or distinct[0] < 1 or distinct[-1] >= period_samples / 2:
+        raise ValueError(
+            f"`lines` must lie between 1 and half of `period_samples`, {period_samples / 2:g}, but "
+            f"are {lines}."
+        )
+    order = np.arange(len(distinct))
+    turned = {
+        "random": np.random.default_rng(seed).uniform(0, 2 * np.pi, len(distinct)),
+        "schroeder": -np.pi * order * (order + 1) / len(distinct),
+    }
+    if phases not in turned:
+        raise ValueError(f"`phases` must be random or schroeder, but is {phases!r}.")
+    spectrum = np.zeros(period_samples // 2 + 1, dtype=complex)
+    spectrum[distinct] = np.exp(1j * turned[phases])
+    once = np.fft.irfft(spectrum, period_samples)
+    voltages = np.tile(once * rms_voltage / np.sqrt(np.mean(once**2)), periods)
+    record, _ = run_test(laboratory, Playback(jnp.asarray(voltages)), len(voltages), seed=seed)
+    return LaboratoryTest(record, len(voltages) / laboratory.sampling_rate)
+
+
+def decay_test(
+    laboratory: Laboratory,
+    voltage: float,
+    decay_seconds: float,
+    *,
+    gains: LoopGains | None = None,
+    settle_cycles: int = 300,
+    record_cycles: int = 50,
+    seed: int = 0,
+) -> DecayTest:
+    """Hold phase resonance by a loop, take the shaker away and record the decay.
+
+    Arguments: `voltage` in V of the resonance; `decay_seconds` after it; the others as in
+    `locked_motions`. Returns a `DecayTest`, whose velocity goes into `resonant_decay`.
+    Raises `ValueError` for numbers that are not positive.
+    """
+    positive("decay_seconds", decay_seconds)
+    (resonance,), state, seconds = locked_motions(
+        *(laboratory, [(voltage, 0.0)]),
+        gains=gains,
+        settle_cycles=settle_cycles,
+        record_cycles=record_cycles,
+        seed=seed,
+    )
+    free = Playback(jnp.zeros(1))
+    held = state or laboratory.at_rest(free)
+    start = held._replace(controller=free.initial(), voltage=jnp.zeros(3))
+    count = round(decay_seconds * laboratory.sampling_rate)
+    away = dataclasses.replace(laboratory, attached=False)
+    record, _ = run_test(away, free, count, start=start, seed=seed + 1)
+    return DecayTest(record, seconds + decay_seconds, resonance)
+
+
+def steady_states_of(
+    laboratory: Laboratory,
+    test: LaboratoryTest,
+    *,
+    level: int = 1,
+    harmonic_order: tuple[int, ...] = (1, 2, 3),
+) -> SteadyStates:
+    """The steady states of a stepped sine: harmonics fitted to the settled part of every step.
+
+    Arguments: `level` that they all belong to; `harmonic_order` as in `steady_state_from_records`.
+    Returns `SteadyStates` of the reference sensor, with the standard deviations of the fits: a step
+    that has not settled, or on which the motion jumps, has a large one.
+    Raises `ValueError` for a test without steps, and for a step that cannot be fitted.
+    """
+    if test.steps is None:
+        raise ValueError("`test` must be a stepped sine: other records have no steady states.")
+    modes = laboratory.structure.modes
+    sensor, j = reference_sensor(modes), modes.mode_of_interest
+    # Records have the sign in which force and velocity agree; states have the model's.
+    turn = float(np.sign(modes.mode_shape[sensor, j] * modes.participation[j]))
+    time, force, velocity = (
+        np.asarray(column) for column in (test.record.time, test.record.force, test.record.velocity)
+    )
+    found = []
+    for omega, first in zip(test.steps.frequency, test.steps.first, strict=True):
+        part = slice(int(first), int(first) + test.steps.samples)
+        found.append(
+            steady_state_from_records(
+                time[part],
+                force[part],
+                turn * velocity[part],
+                float(omega),
+                level=level,
+                harmonic_order=harmonic_order,
+                sensors=(modes.sensors[sensor],),
+            )
+        )
+    return join_steady_states(found)

@@ -1,0 +1,110 @@
+"""Phasors of a record: followed sample by sample by a controller, or read from a whole stretch.
+
+The filter moves the Fourier coefficients at each sample along the gradient of the squared error of
+the series (least mean squares): a band-pass of half width `rate` about every harmonic.
+
+Reference: B. Widrow & S. D. Stearns, Adaptive Signal Processing (1985), chapter 12.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float, Int
+
+HANN = 1.5  # noise bandwidth of a Hann window, over that of none
+PARTS = 10  # of a record, for its scatter
+_MOST_HARMONICS = 9  # that a record may have beside its noise
+
+
+class HeldMotion(NamedTuple):
+    """What a controller held, of the end of a record: fundamentals and their errors, 1σ.
+
+    NaN where there is nothing to read; without `held` the target was missed, or not held steadily.
+    """
+
+    held: bool
+    frequency: float  # rad/s
+    frequency_std: float = np.nan  # rad/s; NaN where the frequency is prescribed
+    force: complex = complex(np.nan)  # N
+    velocity: complex = complex(np.nan)  # m/s
+    ratio_std: float = np.nan  # of force over velocity, relative: of either part
+    velocity_std: float = np.nan  # relative
+    invasive: float = np.nan  # higher harmonics of the voltage over its fundamental
+
+
+class FourierState(NamedTuple):
+    """What the filters know: complex amplitudes (peak) and means."""
+
+    harmonics: Complex[Array, "channel order"]
+    means: Float[Array, " channel"]
+
+
+def nothing_followed(channels: int, orders: Int[np.ndarray, " order"]) -> FourierState:
+    """The state before the first sample."""
+    return FourierState(jnp.zeros((channels, len(orders)), dtype=complex), jnp.zeros(channels))
+
+
+def followed(
+    state: FourierState,
+    seen: Float[Array, " channel"],
+    angle: Float[Array, ""],
+    orders: Int[np.ndarray, " order"],
+    share: Float[Array, ""],
+) -> FourierState:
+    """The state after one sample of each channel.
+
+    Arguments: `angle` of the fundamental in rad; `share` is the filter's rate times the sampling
+    period: what a coefficient forgets in a sample.
+    """
+    basis = jnp.exp(1j * orders * angle)
+    error = seen - state.means - jnp.real(state.harmonics @ basis)
+    return FourierState(
+        state.harmonics + 2 * share * error[:, None] * jnp.conj(basis),
+        state.means + share * error,
+    )
+
+
+def through_hann_window(
+    signal: Float[np.ndarray, " sample"], angle: Float[np.ndarray, "*order sample"]
+) -> Complex[np.ndarray, "*order sample"]:
+    """A signal turned back by an angle, whose mean is the amplitude there.
+
+    A record need not hold whole cycles.
+    """
+    window = np.hanning(len(signal))
+    return signal * (2 * np.exp(-1j * angle) * (window / window.mean()))
+
+
+def noise_of_sample(
+    signal: Float[np.ndarray, " sample"], angle: Float[np.ndarray, " sample"]
+) -> float:
+    """1σ of a sample: what the mean and the harmonics of the drive leave of a record."""
+    design, solved = _series(signal, angle)
+    return float(np.std(signal - design @ solved))
+
+
+def scatter_of_ratio(
+    force: Float[np.ndarray, " sample"],
+    velocity: Float[np.ndarray, " sample"],
+    angle: Float[np.ndarray, " sample"],
+) -> float:
+    """1σ of the mean force over velocity, relative: of either part, from the parts of a record."""
+
+    def fundamental(signal: np.ndarray, angle: np.ndarray) -> complex:
+        _, solved = _series(signal, angle)
+        return complex(solved[1] - 1j * solved[1 + _MOST_HARMONICS])
+
+    parts = np.array_split(np.arange(len(angle)), PARTS)
+    each = np.array(
+        [fundamental(force[k], angle[k]) / fundamental(velocity[k], angle[k]) for k in parts]
+    )
+    spread = np.abs(each - each.mean()) / abs(each.mean())
+    return float(np.sqrt(np.sum(spread**2) / (2 * (PARTS - 1) * PARTS)))
+
+
+def _series(signal: np.ndarray, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean, cosines and sines of the drive's harmonics, and their amplitudes in the record."""
+    turns = angle[:, None] * np.arange(1, _MOST_HARMONICS + 1)
+    design = np.concatenate([np.ones((len(angle), 1)), np.cos(turns), np.sin(turns)], axis=1)
+    return design, np.linalg.lstsq(design, signal, rcond=None)[0]

@@ -1,0 +1,1 @@
+"""What a study's data set says: outputs, their distributions and effects, bands, failures."""

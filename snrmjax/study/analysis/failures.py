@@ -1,0 +1,103 @@
+"""Where members of a study failed: by status, and in the space of what varies."""
+
+from collections import Counter
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from snrmjax.numerics.facts import Fact
+from snrmjax.study.computations.base import COMPLETE, HIGHEST_AT_END, NO_PEAK
+
+if TYPE_CHECKING:
+    import xarray
+
+_BINS = 10
+
+
+class Failures(NamedTuple):
+    """How the members ended. A member with several forces failed if it failed for one of them."""
+
+    counts: dict[str, int]  # by status, of all members and forces
+    failed: Bool[np.ndarray, " member"]
+    status: np.ndarray  # of each member: the first that is no success, or its own
+
+    @property
+    def n_failed(self) -> int:
+        """How many members failed."""
+        return int(self.failed.sum())
+
+    @property
+    def failed_counts(self) -> dict[str, int]:
+        """How many members failed with each status, the most frequent first."""
+        return dict(Counter(self.status[self.failed].tolist()).most_common())
+
+    @property
+    def n_outside(self) -> int:
+        """How many members were computed but have their resonance outside the range."""
+        return sum(self.failed_counts.get(name, 0) for name in (NO_PEAK, HIGHEST_AT_END))
+
+    @property
+    def facts(self) -> tuple[Fact, ...]:
+        """What to do about members whose resonance is not in the range of a study of peaks."""
+        counts = self.failed_counts
+        facts = []
+        if NO_PEAK in counts:
+            facts.append(Fact("no_peak_in_range", n_members=counts[NO_PEAK]))
+        if HIGHEST_AT_END in counts:
+            facts.append(Fact("highest_at_range_end", n_members=counts[HIGHEST_AT_END]))
+        return tuple(facts)
+
+
+class FailureShare(NamedTuple):
+    """Share of members that failed over equally populated parts of one varied quantity."""
+
+    edges: Float[np.ndarray, " edge"]
+    share: Float[np.ndarray, " part"]
+    low: Float[np.ndarray, " part"]  # of the 95 % interval (Wilson)
+    high: Float[np.ndarray, " part"]
+
+
+def failures_of(data: "xarray.Dataset") -> Failures:
+    """How the members of a data set ended."""
+    status = data["status"].values.astype(str)
+    rows = status.reshape(len(status), -1)
+    bad = np.asarray(~np.isin(rows, COMPLETE))
+    worst = rows[np.arange(len(rows)), np.argmax(bad, axis=1)]
+    counts = Counter(status.ravel().tolist())
+    return Failures(dict(counts.most_common()), np.any(bad, axis=1), worst)
+
+
+def failure_share(
+    quantity: Float[np.ndarray, " member"], failed: Bool[np.ndarray, " member"]
+) -> FailureShare:
+    """Share of failed members along one quantity, with 95 % intervals (Wilson)."""
+    from scipy.stats import binomtest
+
+    edges = np.unique(np.quantile(quantity, np.linspace(0, 1, _BINS + 1)))
+    n = np.histogram(quantity, edges)[0]
+    k = np.histogram(quantity[failed], edges)[0]
+    ends = [
+        binomtest(int(a), int(b)).proportion_ci(method="wilson") if b else (np.nan, np.nan)
+        for a, b in zip(k, n, strict=True)
+    ]
+    low, high = np.array(ends).T
+    return FailureShare(edges, np.where(n > 0, k / np.maximum(n, 1), np.nan), low, high)
+
+
+def most_telling(
+    quantities: dict[str, Float[np.ndarray, " member"]], failed: Bool[np.ndarray, " member"]
+) -> list[str]:
+    """Names of what varies, first those whose values differ most between failed and whole members.
+
+    By the Kolmogorov–Smirnov distance of the two groups.
+    """
+    from scipy.stats import ks_2samp
+
+    if failed.all() or not failed.any():
+        return list(quantities)
+    distance = {
+        name: ks_2samp(values[failed], values[~failed], method="asymp").statistic
+        for name, values in quantities.items()
+    }
+    return sorted(distance, key=lambda name: -distance[name])

@@ -1,0 +1,68 @@
+"""What commands do, in Python in at most five lines, with the files that the command writes."""
+
+import numpy as np
+import pytest
+from truths.one_mode import model, noisy, states, table
+
+import snrmjax as sj
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("verbs")
+    level, w, f, v = states()
+    sj.io.write_model(folder / "model.toml", model())
+    sj.io.write_steady_states(folder / "measured.csv", table(level, w, f, noisy(v)))
+    return folder
+
+
+def written(result, out, **settings):
+    sj.write_results(result, out, **settings)
+    return {path.name for path in out.iterdir()}
+
+
+def test_identification_obeys_or_refuses_every_option(files, tmp_path):
+    given, data = str(files / "model.toml"), str(files / "measured.csv")
+    model, data = sj.pipelines.read_test(data, given)
+    found = sj.pipelines.identify_test(data, model, predict_force=(1.0,))
+    assert {"points.csv", "backbone.csv", "prediction.csv", "summary.json", "report.html"} <= (
+        written(found, tmp_path / "out", title="One")
+    )
+    assert found.resonances[0].force == 1.0
+    for wrong, said in (
+        ({"robust": True}, "`--robust` belongs to a joint fit"),
+        ({"knots": 4, "fit": "auto"}, "`--knots` has no effect beside `--fit`"),
+        ({"extrapolate": 2.0}, "`--extrapolate` belongs to predictions"),
+        ({"predict_force": (-1.0,)}, "`--predict-force` must be above zero, but is -1 N"),
+        ({"predict_drive": (1.0,)}, "is for data with a drive voltage"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            sj.pipelines.identify_test(data, model, **wrong)
+
+
+def test_check_and_import(files, tmp_path):
+    found = sj.pipelines.check_files([str(files / "measured.csv")], str(files / "model.toml"))
+    assert found.findings == ()
+    assert written(found, tmp_path / "checked") == {"check.json"}
+    imported = sj.pipelines.import_test([str(files / "measured.csv")], phase_sign="lag")
+    data = sj.read_steady_states(files / "measured.csv")
+    np.testing.assert_allclose(imported.states.velocity, np.conj(data.velocity))
+    assert written(imported, tmp_path / "imported") == {"measured.csv", "map.toml"}
+
+
+def test_simulation(files, tmp_path):
+    given = sj.read_model(files / "model.toml")
+    found = sj.pipelines.simulate_responses(given, [1.0], 55, 65)
+    assert written(found, tmp_path / "out") == {"response.csv", "response.png"}
+    # A linear structure's largest response: Φ² F / (2ζω).
+    (curve,) = found.curves
+    modes = given.modes
+    peak = modes.mode_shape[0, 0] ** 2 / (2 * modes.damping_ratio[0] * modes.natural_frequency[0])
+    assert np.abs(curve.velocity[:, 1, 0]).max() == pytest.approx(float(peak), rel=1e-3)
+    with pytest.raises(ValueError, match="must differ from the linear frequency"):
+        sj.pipelines.simulate_mode(given, 60.0)
+
+
+def test_only_results_of_pipelines_have_files(tmp_path):
+    with pytest.raises(ValueError, match="a `dict` has no files"):
+        sj.write_results({}, tmp_path)

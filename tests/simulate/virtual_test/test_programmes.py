@@ -1,0 +1,126 @@
+"""Programmes in the virtual laboratory: what they hold, against Duffing's oscillator."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import snrmjax as sj
+
+REST, RATIO, CUBIC, MASS = 2 * np.pi * 40.0, 0.01, 3e9, 0.8  # cubic per modal mass, 1/(m² s²)
+RATE = 3000.0
+
+
+@pytest.fixture(scope="module")
+def laboratory():
+    shape = 1 / np.sqrt(MASS)
+    # The sensor looks the other way: states must come out with the model's sign.
+    modes = sj.model.linear_modes([REST], [RATIO], [[-shape]], [shape])
+    potential = sj.model.polynomial_potential({"1111": CUBIC * shape**2 / 4}, 1)
+    shaker = sj.simulate.Shaker(30.0, 8.0, mass=0.05, damping=1.0, stiffness=500.0)
+    beam = sj.model.structure(modes, potential)
+    return sj.simulate.Laboratory(beam, shaker, sj.simulate.Instruments(), RATE)
+
+
+def impedance(size, omega):
+    """F/v of one term of harmonic balance at a displacement amplitude, N s/m."""
+    square = REST**2 + 0.75 * CUBIC * size**2 - omega**2
+    return MASS * (2 * RATIO * REST + square / (1j * omega))
+
+
+@pytest.mark.parametrize(
+    ("held", "target"), [pytest.param("displacement", 1e-3, marks=pytest.mark.long), ("force", 2.0)]
+)
+def test_a_stepped_sine_holds_what_it_is_told_to(laboratory, held, target):
+    omega = 2 * np.pi * np.linspace(39.0, 42.6, 5)
+    test = sj.simulate.stepped_sine_test(laboratory, target, omega, held=held, record_cycles=20)
+    states = sj.simulate.steady_states_of(laboratory, test, level=3)
+    velocity, force = np.asarray(states.velocity)[:, 0], np.asarray(states.force)
+    size = np.abs(velocity) / omega
+    np.testing.assert_allclose(size if held == "displacement" else force, target, rtol=0.01)
+    needed = impedance(size, omega) * -velocity  # N; in phase with the force, which is real
+    np.testing.assert_allclose(needed, force, atol=0.01 * force.max())
+    jumps = size[1:] < 0.5 * size[:-1]
+    assert jumps.sum() == (held == "force")  # under a held displacement nothing jumps
+    assert list(states.level) == 5 * [3]
+    assert test.seconds == pytest.approx(len(test.record.time) / RATE)
+
+
+@pytest.mark.long
+def test_an_open_loop_jumps_down_later_than_up(laboratory):
+    omega = 2 * np.pi * np.linspace(39.0, 42.0, 7)
+    sizes = []
+    for way in (omega, omega[::-1]):
+        test = sj.simulate.stepped_sine_test(
+            laboratory, 10.0, way, settle_cycles=120, record_cycles=20
+        )
+        found = np.abs(np.asarray(sj.simulate.steady_states_of(laboratory, test).velocity)[:, 0])
+        sizes.append(found[np.argsort(way)])
+    up, down = sizes
+    assert (up > 1.5 * down).any()
+    np.testing.assert_allclose(up[[0, -1]], down[[0, -1]], rtol=0.01)
+
+
+def test_phase_after_phase_a_loop_goes_around_the_fold(laboratory):
+    phases, gains = np.radians([0.0, -40.0, -65.0, -80.0]), sj.simulate.LoopGains(80.0, 12.0)
+    sweep = sj.simulate.phase_sweep(laboratory, 20.0, phases, gains=gains, settle_cycles=150)
+    assert sweep.held.all()
+    size = np.abs(sweep.velocity) / sweep.frequency
+    needed = impedance(size, sweep.frequency) * sweep.velocity
+    np.testing.assert_allclose(needed.real, sweep.force, rtol=3e-3)
+    np.testing.assert_allclose(needed.imag / sweep.force, 0, atol=0.015)
+    np.testing.assert_allclose(np.angle(sweep.velocity), phases, atol=np.radians(0.5))
+    # Down from the resonance frequency falls, and then rises: the branch that open loops miss.
+    assert sweep.frequency[0] > sweep.frequency[1] < sweep.frequency[2] < sweep.frequency[3]
+    with pytest.raises(ValueError, match="`phases` must lie within ±90°"):
+        sj.simulate.phase_sweep(laboratory, 8.0, np.array([2.0]))
+
+
+def test_a_decay_begins_on_the_resonance_and_is_free(laboratory):
+    test = sj.simulate.decay_test(laboratory, 8.0, 3.0)
+    assert test.resonance.held
+    assert np.abs(np.asarray(test.record.force)[1:]).max() == 0
+    speed = np.abs(np.asarray(test.record.velocity))
+    assert speed[:80].max() == pytest.approx(abs(test.resonance.velocity), rel=0.03)
+    found = sj.methods.resonant_decay(
+        np.asarray(test.record.time), np.asarray(test.record.velocity), least_amplitude=5e-3
+    )
+    half = REST**2 / 2
+    true = np.sqrt(half + np.sqrt(half**2 + 0.75 * CUBIC * found.velocity**2))
+    np.testing.assert_allclose(found.natural_frequency, true, rtol=3e-4)
+    modal = 2 * found.damping_ratio * found.natural_frequency
+    np.testing.assert_allclose(modal, 2 * RATIO * REST, rtol=0.03)
+
+
+def test_multisine_and_sweep_are_what_was_asked_for(laboratory):
+    lines = np.arange(30, 60)
+    test = sj.simulate.multisine_test(laboratory, 0.02, lines, 3000, 6, phases="schroeder")
+    voltage, force, velocity = (
+        np.asarray(one)[-3000:]
+        for one in (test.record.voltage, test.record.force, test.record.velocity)
+    )
+    spectrum = np.fft.rfft(voltage) / 1500
+    assert np.sqrt(np.mean(voltage**2)) == pytest.approx(0.02)
+    np.testing.assert_allclose(np.abs(spectrum[lines]), 0.02 * np.sqrt(2 / 30), rtol=1e-6)
+    assert np.abs(np.delete(spectrum, lines)).max() < 1e-12
+    mobility = (np.fft.rfft(velocity) / np.fft.rfft(force))[lines]
+    omega = 2 * np.pi * lines  # small: linear; 1 Hz a line
+    np.testing.assert_allclose(1 / mobility, impedance(0.0, omega), rtol=0.02)
+    hertz = np.geomspace(50.0, 30.0, round(6 * RATE))  # a sweep is a table of voltages
+    table = np.sin(2 * np.pi * np.cumsum(hertz) / RATE)
+    swept, _ = sj.simulate.run_test(
+        laboratory, sj.simulate.Playback(jnp.asarray(table)), len(table)
+    )
+    np.testing.assert_array_equal(swept.voltage, table)
+    peak = np.argmax(np.abs(np.asarray(swept.velocity)))
+    assert 2 * np.pi * hertz[peak] == pytest.approx(0.96 * REST, rel=0.03)  # late
+
+
+def test_numbers_that_make_no_sense_are_refused(laboratory):
+    with pytest.raises(ValueError, match="`held` must be one of voltage, force"):
+        sj.simulate.stepped_sine_test(laboratory, 1.0, np.array([REST]), held="power")
+    with pytest.raises(ValueError, match="`frequencies` must be positive"):
+        sj.simulate.stepped_sine_test(laboratory, 1.0, np.array([REST, -1.0]))
+    with pytest.raises(ValueError, match="`lines` must lie between 1 and half"):
+        sj.simulate.multisine_test(laboratory, 1.0, np.array([0, 3]), 100, 2)
+    with pytest.raises(ValueError, match="`decay_seconds` must be positive"):
+        sj.simulate.decay_test(laboratory, 1.0, 0.0)
