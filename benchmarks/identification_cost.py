@@ -12,7 +12,6 @@ compiled programs and what they took, warm milliseconds a state and their ratio 
 size's, and the largest memory.
 """
 
-import argparse
 import json
 import os
 import resource
@@ -21,14 +20,18 @@ import sys
 import tempfile
 import time
 
+from harness import options, teller
+
+tell = teller(__file__)
+
 SIZES = (150, 1000, 3000, 12288)
-OMEGA, CONSTANT = 500.0, 6.0
 PER_LEVEL = 41
 
 
 def test_of(n_states: int, n_levels: int, *, stated: bool):
     """A noisy test and the linear mode of its structure."""
     import numpy as np
+    from closed_form import CONSTANT, OMEGA, damping, needed, squared
 
     import snrmjax as sj
 
@@ -39,21 +42,14 @@ def test_of(n_states: int, n_levels: int, *, stated: bool):
     place = np.arange(n_states) - np.searchsorted(level, level)
     phase = np.radians(60) * (2 * place / np.bincount(level)[level] - 1)
 
-    def squared(x):
-        return OMEGA**2 * (1 + 0.3 * (x / 2e-3) ** 2)
-
-    def damping(v):
-        return 12.0 + 6.0 * v
-
-    force = tip * squared(tip) ** 0.5 * damping(tip * squared(tip) ** 0.5) / CONSTANT
+    speed = tip * squared(tip) ** 0.5
+    force = speed * damping(speed) / CONSTANT
     x, omega = tip * np.cos(phase), np.sqrt(squared(tip))
     for _ in range(100):
         loss = damping(x * omega)
         omega = np.sqrt(squared(x) - omega * loss * np.tan(phase))
         x = 0.5 * (x + CONSTANT * force * np.cos(phase) / (omega * loss))
-    velocity = (
-        1j * omega * CONSTANT * force / (squared(x) - omega**2 + 1j * omega * damping(x * omega))
-    )
+    velocity = 1j * omega * CONSTANT * force / needed(x, omega)
     gain = 0.005 * rng.normal(size=levels)[level]
     noise = 0.005 * (rng.normal(size=n_states) + 1j * rng.normal(size=n_states))
     velocity = velocity * np.exp(gain + noise)
@@ -102,13 +98,9 @@ def measured(method: str, n_states: int, n_levels: int, *, stated: bool) -> dict
 
 def main() -> None:
     """One fresh process a line."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--states", type=int, nargs="+", default=SIZES)
-    parser.add_argument("--levels", type=int, default=8)
-    parser.add_argument("--method", nargs="+", default=["pointwise", "joint"])
-    parser.add_argument("--stated", action="store_true", help="the noise is stated in the data")
-    parser.add_argument("--here", action="store_true", help=argparse.SUPPRESS)
-    chosen = parser.parse_args()
+    chosen = options(
+        __doc__, states=SIZES, levels=8, method=["pointwise", "joint"], stated=False, here=False
+    )
     if chosen.here:
         own = (chosen.method[0], chosen.states[0], chosen.levels)
         print(json.dumps(measured(*own, stated=chosen.stated)))
@@ -124,12 +116,12 @@ def main() -> None:
                 answer = subprocess.run(
                     command, env=settings, capture_output=True, text=True, check=True
                 ).stdout
-            line = {"benchmark": "identification_cost", "method": method, "states": states}
+            line = {"method": method, "states": states}
             line |= json.loads(answer.splitlines()[-1])
             per_state = 1e3 * line["warm_s"] / states
             first = first or per_state
             line |= {"ms_per_state": round(per_state, 3), "ratio": round(per_state / first, 2)}
-            print(json.dumps(line), flush=True)
+            tell(**line)
 
 
 if __name__ == "__main__":

@@ -1,12 +1,11 @@
 """Each method against its own source: data, claims or formulas that its authors published.
 
-Run: python benchmarks/methods_sources.py [--pff FOLDER] [--pyvib FOLDER] [--nltest FOLDER]
+Run: python benchmarks/methods_sources.py [--pff FOLDER] [--nltest FOLDER]
          [--only METHOD ...]
 
-The folders are copies of github.com/JustinPorter88/pff-analysis, github.com/pawsen/pyvib and
-github.com/maltekrack/NLtest, whose programs and data are used where they lie (they are not part of
-this project); NLtest needs Octave. pyvib takes some minutes. One JSON line a method, `kind`
-says what it was held against:
+The folders are copies of github.com/JustinPorter88/pff-analysis and github.com/maltekrack/NLtest,
+whose programs and data are used where they lie (they are not part of this project); NLtest needs
+Octave. One JSON line a method, `kind` says what it was held against:
 
 - own_result: the authors' own numbers for the authors' own record (their Python program, run
   beside, and the stored result of their MATLAB program, which are also held against each other);
@@ -25,17 +24,15 @@ in itself; the response-controlled tests of the Tribomechadynamics challenge tha
 (40 GB, not in its repository).
 """
 
-import argparse
 import importlib.util
-import json
 import shutil
 import subprocess
 import tempfile
 from pathlib import Path
 
-import methods_state_space
 import numpy as np
 from contourpy import contour_generator
+from harness import options, teller
 from scipy.integrate import solve_ivp
 from scipy.linalg import eigh
 
@@ -43,14 +40,21 @@ import snrmjax as sj
 from snrmjax.methods.one_sensor import sensor_states
 from snrmjax.methods.steady.arslan_ozguven import describing_function
 
+tell = teller(__file__)
+
+METHODS = (
+    *("resonant_decay", "pll", "cbc", "rct", "harmonic_force_surface"),
+    *("concerto", "arslan_ozguven"),
+)
+
+
+def said(method: str, kind: str, source: str, **numbers: object) -> None:
+    """One line."""
+    tell(method=method, kind=kind, source=source, **numbers)
+
+
 HERTZ = 2 * np.pi
 REST, RATIO, MASS, CUBIC = 40 * HERTZ, 0.01, 0.8, 3e9  # cubic per modal mass, 1/(m² s²)
-
-
-def tell(method: str, kind: str, source: str, **numbers) -> None:
-    """One line."""
-    line = {"benchmark": "methods_sources", "method": method, "kind": kind, "source": source}
-    print(json.dumps({**line, **numbers}), flush=True)
 
 
 def duffing() -> sj.model.Structure:
@@ -65,7 +69,7 @@ def resonant_decay(folder: Path | None) -> None:
     """The authors' record of a bolted beam, band of their settings, against their result."""
     source = "Jin et al., J. Vib. Acoust. 142 (2020) 051111, doi:10.1115/1.4047416"
     if folder is None:
-        tell("resonant_decay", "own_result", source, not_run="--pff FOLDER is missing")
+        said("resonant_decay", "own_result", source, not_run="--pff FOLDER is missing")
         return
     from scipy.io import loadmat
 
@@ -104,7 +108,7 @@ def resonant_decay(folder: Path | None) -> None:
                 off = np.abs(answer[k][inside] / expected - 1)
                 numbers[f"{quantity}_from_{other}_median"] = float(np.median(off))
                 numbers[f"{quantity}_from_{other}_90"] = float(np.percentile(off, 90))
-        tell("resonant_decay", "own_result", source, reading=name, **numbers)
+        said("resonant_decay", "own_result", source, reading=name, **numbers)
 
 
 def _answer(result) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -137,7 +141,7 @@ def phase_locked_loop() -> None:
     good = found.found
     true = np.interp(found.velocity[good], speed[order], truth.frequency[order])
     omega = np.asarray(found.natural_frequency)[good]
-    tell(
+    said(
         *("pll", "own_claim"),
         "Hippold et al., Mech. Syst. Signal Process. 220 (2024) 111670, arXiv:2403.06639: fixed "
         "gains of the linear regime, a shift of 20 %, about 100 periods a point",
@@ -168,7 +172,7 @@ def continuation() -> None:
             law = sj.simulate.response_controlled(model, speed, 0.9 * omega, 1.1 * omega)
             true = np.interp(omega, law.frequency, np.abs(law.force))
             exact.append(abs(force - true) / needed.max())
-    tell(
+    said(
         *("cbc", "public_example"),
         "a public script of control-based continuation: forced Duffing equation with α = γ = 1, "
         "β = 0.04, δ = 0.1 and its one-term amplitudes; method of Sieber & Krauskopf 2008",
@@ -206,7 +210,7 @@ def response_controlled(nltest: Path | None) -> None:
     true = np.sqrt(REST**2 + 0.75 * CUBIC * size**2)
     ratios = np.array([_circle(data, level) for level in np.asarray(found.level)[good]])
     ours = np.asarray(found.damping_ratio)[good]
-    tell(
+    said(
         *("rct", "own_formula"),
         "Karaağaçlı & Özgüven, Vibration 3 (2020) 266, doi:10.3390/vibration3030019; circle fit of "
         "Maia & Silva (1997), which NLtest uses for such tests, written out here",
@@ -222,14 +226,14 @@ def response_controlled(nltest: Path | None) -> None:
     octave = shutil.which("octave-cli") or shutil.which("octave")
     if nltest is None or octave is None:
         why = "--nltest FOLDER is missing" if nltest is None else "Octave is not installed"
-        tell("rct", "independent_program", source, not_run=why)
+        said("rct", "independent_program", source, not_run=why)
         return
     theirs = np.array(
         [_their_circle(octave, nltest, data, level) for level in np.asarray(found.level)[good]]
     )
     # Theirs answers with the frequency of the state next to resonance: to the test's step at best.
     middle = theirs[:, 0] * HERTZ
-    tell(
+    said(
         *("rct", "independent_program", source),
         levels=len(theirs),
         step_of_frequency=float(np.ptp(np.asarray(data.frequency)[:13]) / 12 / REST),
@@ -268,11 +272,11 @@ def _their_circle(octave: str, folder: Path, data, level: int) -> tuple[float, f
             f"addpath('{folder / 'SRC'}'); t = load('states.txt');"
             "[f, d, s] = circleFit(t(:, 1), t(:, 2) + 1i * t(:, 3)); printf('%.17g\\n', f, d, s);"
         )
-        said = subprocess.run(
+        answer = subprocess.run(
             *([octave, "--no-gui", "--quiet", "--eval", script],),
             **{"cwd": place, "capture_output": True, "text": True, "check": True},
         )
-    frequency, ratio, scatter = (float(one) for one in said.stdout.split())
+    frequency, ratio, scatter = (float(one) for one in answer.stdout.split())
     return frequency, ratio, scatter
 
 
@@ -294,7 +298,7 @@ def harmonic_force_surface() -> None:
         nearest = int(np.argmin(np.abs(each - one)))
         distance.append(abs(each[nearest] - one) / height.max())
         unstable += bool(exact.is_unstable[k[nearest]])
-    tell(
+    said(
         *("harmonic_force_surface", "physics_only"),
         "Karaağaçlı & Özgüven, Vibration 3 (2020) 266: unstable branches are ordinary points of "
         "the surface (no table of their structures was found)",
@@ -308,7 +312,7 @@ def harmonic_force_surface() -> None:
     drawn = contour_generator(surface.frequency, surface.amplitude, np.abs(surface.force))
     lines = [one / unit for one in drawn.lines(force)]
     apart = [min(_distance(at, line) for line in lines) for at in np.stack([omega, cut], 1) / unit]
-    tell(
+    said(
         *("harmonic_force_surface", "independent_program"),
         "ContourPy: contour lines of the sizes of the forces, on the same levels; distances in "
         "half-power widths and peak heights",
@@ -384,7 +388,7 @@ def concerto() -> None:
     theirs = np.array(theirs)
     true = np.sqrt(REST**2 + 0.75 * CUBIC * size**2)
     ours = np.asarray(found.natural_frequency)[good], np.asarray(found.damping_ratio)[good]
-    tell(
+    said(
         *("concerto", "own_formula"),
         "Carrella & Ewins, Mech. Syst. Signal Process. 25 (2011) 1011, "
         "doi:10.1016/j.ymssp.2010.09.011: their real formulas, written out here (their example's "
@@ -441,7 +445,7 @@ def spring_in_a_chain() -> None:
     ours = np.stack([result.natural_frequency, result.damping_ratio], axis=1)
     apart = np.abs(ours / mode - 1).max(axis=0)
     fitted = [float(np.sum(one.real * size**2) / np.sum(0.75 * size**4)) for one in (v, theirs)]
-    tell(
+    said(
         *("arslan_ozguven", "own_formula"),
         "Arslan, Aykan & Özgüven, Mech. Syst. Signal Process. 25 (2011) 1112, "
         "doi:10.1016/j.ymssp.2010.10.010: nonlinearity matrix and describing function, written out "
@@ -477,24 +481,10 @@ def _steady_motion(stiffness, damping, mass, cubic, force, omega) -> np.ndarray:
     return np.fft.fft(found.y[:count], axis=1)[:, 1] / 32
 
 
-def state_space(folder: Path | None) -> None:
-    """The same multisine records by two programs."""
-    source = (
-        "pyvib (github.com/pawsen/pyvib), after the authors' PNLSS toolbox; method of Paduart et "
-        "al., Automatica 46 (2010) 647, doi:10.1016/j.automatica.2010.01.001"
-    )
-    if folder is None:
-        tell("pnlss", "independent_program", source, not_run="--pyvib FOLDER is missing")
-        return
-    for numbers in methods_state_space.compared(folder):
-        tell("pnlss", "independent_program", source, **numbers)
-
-
 def main() -> None:
     """All methods in turn."""
-    parser = argparse.ArgumentParser()
-    for name in ("--pff", "--pyvib", "--nltest"):
-        parser.add_argument(name, type=lambda given: Path(given).resolve())
+    folders = dict.fromkeys(("pff", "nltest"), Path)
+    given = options(__doc__, only=METHODS, **folders)
     runs = {
         "resonant_decay": lambda: resonant_decay(given.pff),
         "pll": phase_locked_loop,
@@ -503,10 +493,7 @@ def main() -> None:
         "harmonic_force_surface": harmonic_force_surface,
         "concerto": concerto,
         "arslan_ozguven": spring_in_a_chain,
-        "pnlss": lambda: state_space(given.pyvib),
     }
-    parser.add_argument("--only", nargs="*", choices=list(runs), default=list(runs))
-    given = parser.parse_args()
     for name in given.only:
         runs[name]()
 

@@ -11,56 +11,18 @@ repeated with the same noise, and the mean relative bands of both curves after a
 compared. One JSON line.
 """
 
-import argparse
-import json
-
 import numpy as np
+from closed_form import OMEGA, at_frequency, at_phase
+from harness import options, teller
 
 import snrmjax as sj
 
-OMEGA, CONSTANT = 500.0, 6.0
+tell = teller(__file__)
+
 NOISE = {"velocity": 0.01, "phase": 0.012, "force": 0.003, "gain": 0.01}
 FAMILIES = {"backbone": "polynomial:2@displacement", "damping": "viscous_quadratic@velocity"}
 FORCES = (0.3, 0.8, 1.6, 2.6)
 MODES = sj.model.linear_modes([OMEGA], [0.012], [[2.0]], [3.0])
-
-
-def squared(x: np.ndarray) -> np.ndarray:
-    """ω̃² against displacement (m)."""
-    return OMEGA**2 * (1 + 0.3 * (x / 2e-3) ** 2)
-
-
-def damping(v: np.ndarray) -> np.ndarray:
-    """2ζ̃ω̃ against velocity (m/s)."""
-    return 12.0 + 6.0 * v
-
-
-def needed(x: np.ndarray, omega: np.ndarray) -> np.ndarray:
-    """Complex force over displacement times A."""
-    return squared(x) - omega**2 + 1j * omega * damping(x * omega)
-
-
-def at_phase(force: float, phase: float) -> tuple[float, complex]:
-    """Frequency and velocity under a force where the velocity has a phase, by bisection."""
-    low, high, omega = 1e-6, 1e-2, OMEGA
-    for _ in range(200):
-        x = 0.5 * (low + high)
-        omega = np.sqrt(squared(x))
-        for _ in range(60):
-            omega = np.sqrt(squared(x) - omega * damping(x * omega) * np.tan(phase))
-        below = abs(needed(x, omega)) * x < CONSTANT * force
-        low, high = (x, high) if below else (low, x)
-    return float(omega), 1j * omega * CONSTANT * force / needed(x, omega)
-
-
-def at_frequency(force: float, omega: float, expected: float) -> complex:
-    """The motion under a force at a frequency whose velocity is nearest to the expected one."""
-    x = np.linspace(1e-6, 4e-3, 40001)
-    excess = np.abs(needed(x, omega)) * x - CONSTANT * force
-    at = np.flatnonzero(np.signbit(excess[:-1]) != np.signbit(excess[1:]))
-    roots = x[at] - excess[at] * (x[1] - x[0]) / (excess[at + 1] - excess[at])
-    best = roots[np.argmin(np.abs(roots * omega - expected))]
-    return 1j * omega * CONSTANT * force / needed(best, omega)
 
 
 Row = tuple[int, float, float, complex]  # level, force, frequency, velocity
@@ -164,13 +126,9 @@ def one_test(seed: int) -> list[float]:
 
 def main() -> None:
     """All tests and one line."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--tests", type=int, default=100)
-    parser.add_argument("--seed", type=int, default=0)
-    chosen = parser.parse_args()
+    chosen = options(__doc__, tests=100, seed=0)
     ratios = np.array([one_test(chosen.seed + k) for k in range(chosen.tests)])
     line: dict[str, object] = {
-        "benchmark": "next_measurement",
         "tests": len(ratios),
         "band_after_advised": round(float(np.median(ratios[:, 0])), 3),
     }
@@ -182,7 +140,7 @@ def main() -> None:
             "share_at_least_1_5": round(float(np.mean(gain >= 1.5)), 2),
             "share_better": round(float(np.mean(gain > 1)), 2),
         }
-    print(json.dumps(line), flush=True)
+    tell(**line)
 
 
 if __name__ == "__main__":

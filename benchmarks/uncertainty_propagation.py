@@ -13,15 +13,16 @@ mean in standard deviations, its standard deviation, the ends of its 95 % range 
 second order predicts it. One JSON line each.
 """
 
-import argparse
-import json
 import time
 from typing import NamedTuple
 
 import numpy as np
+from harness import options, teller
 
 import snrmjax as sj
 from snrmjax.study.uncertainty.propagation import STATISTICS
+
+tell = teller(__file__)
 
 HERTZ = 2 * np.pi
 SCALES = {"small": 0.5, "large": 5.0}
@@ -44,22 +45,6 @@ CASES = {
     "curved, stiffening": Case(sj.model.curved_beam(), 1e-3, (20, 160), CURVED, 9),
     "curved, softening": Case(sj.model.curved_beam(), 1.334e-4, (30, 110), CURVED, 9),
 }
-
-
-def tell(**fields: object) -> None:
-    """One JSON line with numbers of five digits."""
-
-    def short(value: object) -> object:
-        if isinstance(value, float):
-            return float(f"{value:.5g}") if np.isfinite(value) else str(value)
-        if isinstance(value, list):
-            return [short(one) for one in value]
-        if isinstance(value, dict):
-            return {name: short(one) for name, one in value.items()}
-        return value
-
-    rounded = {name: short(value) for name, value in fields.items()}
-    print(json.dumps({"benchmark": "uncertainty_propagation", **rounded}), flush=True)
 
 
 def varied_of(case: Case, scale: float) -> tuple:
@@ -133,11 +118,8 @@ def propagated(name: str, case: Case, members: int) -> None:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--members", type=int, default=2048, help="of each study")
-    parser.add_argument("--case", choices=CASES, action="append", help="all by default")
-    asked = parser.parse_args()
-    for name in asked.case or CASES:
+    asked = options(__doc__, members=2048, case=list(CASES))
+    for name in asked.case:
         propagated(name, CASES[name], asked.members)
 
 

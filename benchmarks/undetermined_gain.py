@@ -13,19 +13,20 @@ the largest velocity measured, and natural frequencies within three of their sta
 0.2 % (what this benchmark is not about).
 """
 
-import argparse
-import json
 import time
 from collections import Counter
 from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+from harness import options, teller
 from scipy.optimize import brentq
 
 import snrmjax as sj
 from snrmjax.identify.inference.fitted_curves import values_to_the_largest
 from snrmjax.numerics.facts import Fact
+
+tell = teller(__file__)
 
 HERTZ = 2 * np.pi
 NOISE = {"amplitude": 0.004, "phase": np.radians(0.3), "force": 0.001}
@@ -248,13 +249,8 @@ def one_test(verb: str, plant: Plant, plan: Plan, seed: int) -> Outcome:
 
 def main() -> None:
     """All structures under all plans."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--verb", choices=[*VERBS], action="append")
-    parser.add_argument("--only", default="")
-    parser.add_argument("--each", action="store_true")
-    chosen = parser.parse_args()
-    for verb in chosen.verb or VERBS:
+    chosen = options(__doc__, seed=0, verb=list(VERBS), only="", each=False)
+    for verb in chosen.verb:
         counts: Counter[str] = Counter()
         seconds, wrong = [], []
         for number, (name, plant) in enumerate(PLANTS.items()):
@@ -267,15 +263,11 @@ def main() -> None:
                 seconds.append(found.seconds)
                 wrong += [label] if found.kind == "silent_and_wrong" else []
                 if chosen.each:
-                    numbers = {
-                        k: (round(v, 4) if isinstance(v, float) else v)
-                        for k, v in found._asdict().items()
-                    }
-                    print(json.dumps({"test": label, **numbers}), flush=True)
-        line = {"benchmark": "undetermined_gain", "verb": verb, "tests": sum(counts.values())}
+                    tell(test=label, **found._asdict())
+        line = {"verb": verb, "tests": sum(counts.values())}
         names = ("refused", "bounded", "said", "silent_and_right", "silent_and_wrong")
         line |= {key: counts[key] for key in (*names, "refused_otherwise")}
-        print(json.dumps({**line, "seconds": round(float(np.median(seconds)), 2), "wrong": wrong}))
+        tell(**line, seconds=np.median(seconds), wrong=wrong)
 
 
 if __name__ == "__main__":

@@ -145,12 +145,11 @@ def joined(parts: Sequence[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
 
 
 def one_by_one(
-    members: Members, compute: Callable[[Structure, np.ndarray | None, int], dict], **failed: Any
+    computation: AbstractComputation,
+    members: Members,
+    compute: Callable[[Structure, np.ndarray | None, int], dict],
 ) -> dict[str, np.ndarray]:
-    """Rows of members that are computed singly; a `ValueError` becomes the member's status.
-
-    `failed` are the rows of a member that could not be computed, without its status.
-    """
+    """Rows of members that are computed singly; a `ValueError` becomes the member's status."""
     parts = []
     for k, model in enumerate(members.models):
         force = None if members.forces is None else members.forces[k]
@@ -158,5 +157,5 @@ def one_by_one(
             parts.append(compute(jax.device_put(model), force, members.seeds[k]))
         except ValueError as error:
             reason = str(error).splitlines()[0]
-            parts.append({**failed, "status": np.array([f"refused: {reason}"])})
+            parts.append(with_refused(computation, None, {0: f"refused: {reason}"}))
     return joined(parts)

@@ -44,8 +44,7 @@ class AbstractModes(AbstractComputation):
 
     def rows(self, members: Members) -> dict[str, np.ndarray]:
         """See `AbstractComputation.rows`."""
-        none = _rows(CurveStatus.INVALID, np.zeros(0), np.zeros(0))
-        return one_by_one(members, self._one, **none, **{self.further[0]: np.zeros(0)})
+        return one_by_one(self, members, self._one)
 
     @abc.abstractmethod
     def _one(self, model: Structure, force: np.ndarray | None, seed: int) -> dict:

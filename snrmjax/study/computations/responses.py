@@ -7,12 +7,10 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from snrmjax.model.structures import Structure
 from snrmjax.simulate.balance.labelled import HERTZ
 from snrmjax.simulate.continuation.continuation import CurveStatus
 from snrmjax.simulate.continuation.response_curve import ResponseCurve
 from snrmjax.simulate.solutions.forced_response import ResponseSettings, forced_response_batch
-from snrmjax.simulate.solutions.isolated_responses import isolated_responses
 from snrmjax.study.computations.base import (
     COMPLETE,
     HIGHEST_AT_END,
@@ -27,10 +25,6 @@ from snrmjax.study.computations.base import (
 )
 
 GRID = "frequency_hz"
-_ISOLATED = {
-    "n_isolated": ("i4", "1", "isolated responses that were found"),
-    "isolated_peak_velocity_m_s": ("f8", "m/s", "highest velocity of an isolated response"),
-}
 _FOLD = ("fold_frequency_hz", "fold_velocity_m_s")
 
 
@@ -62,8 +56,7 @@ class Peaks(AbstractComputation):
 
     `forces` in N; None: `force_n` varies. With `grid_points` also the highest and the lowest
     velocity of the response at that many frequencies: what the response bands of a report are made
-    of. With `isolated` also the responses that are not connected to those of small motion (takes
-    several times as long).
+    of.
     """
 
     kind: ClassVar[str] = "peaks"
@@ -72,7 +65,6 @@ class Peaks(AbstractComputation):
     within: ResponseRange
     forces: OfForces = eqx.field(default=None, converter=of_forces)
     grid_points: int = eqx.field(static=True, default=0)
-    isolated: bool = eqx.field(static=True, default=False)
 
     def outputs(self) -> dict[str, Output]:
         """See `AbstractComputation.outputs`."""
@@ -93,8 +85,6 @@ class Peaks(AbstractComputation):
             for name, which in (("upper", "highest"), ("lower", "lowest")):
                 text = f"{which} velocity of the response at this frequency"
                 named[f"{name}_velocity_m_s"] = Output((*at, GRID), "f8", "m/s", text)
-        if self.isolated:
-            named |= {name: Output(at, *rest) for name, rest in _ISOLATED.items()}
         return named
 
     def axes(self) -> dict[str, Axis]:
@@ -117,30 +107,11 @@ class Peaks(AbstractComputation):
             bounds = np.array([velocity_bounds(parts, self._grid) for parts in curves])
             rows["upper_velocity_m_s"] = self.forces.shaped(bounds[:, 1])
             rows["lower_velocity_m_s"] = self.forces.shaped(bounds[:, 0])
-        if self.isolated:
-            found = [self._isolated(*one) for one in self._each(members, curves)]
-            for name, column in zip(_ISOLATED, zip(*found, strict=True), strict=True):
-                rows[name] = self.forces.shaped(np.array(column))
         return rows
 
     @property
     def _grid(self) -> Float[np.ndarray, " frequency"]:
         return np.linspace(*self.within.ends, self.grid_points)
-
-    def _each(self, members: Members, curves: Sequence[tuple[ResponseCurve, ...]]) -> list[tuple]:
-        loads = self.forces.of(members)
-        models = [m for m in members.models for _ in range(loads.shape[1])]
-        return list(zip(models, loads.ravel().tolist(), curves, strict=True))
-
-    def _isolated(self, model: Structure, force: float, known: Sequence[ResponseCurve]) -> tuple:
-        """How many isolated responses there are, and their highest velocity in m/s."""
-        if known[0].status == CurveStatus.INVALID:
-            return 0, np.nan
-        further = isolated_responses(
-            model, force, *self.within.ends, known=known, settings=self.within.settings
-        )
-        heights = [np.max(np.abs(c.velocity[:, 1, 0])) for c in further if len(c.frequency)]
-        return len(heights), max(heights, default=np.nan)
 
 
 class Curves(AbstractComputation):

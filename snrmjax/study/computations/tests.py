@@ -71,12 +71,6 @@ class AbstractIdentified(AbstractComputation):
             **{name: np.asarray(one)[None] for name, one in row.items()},
         }
 
-    def failed(self) -> dict[str, np.ndarray]:
-        """The row of a member for which nothing is found."""
-        counts = {name: np.zeros(1, dtype="i4") for name in ("n_states", "n_solved")}
-        curves = {k: np.full((1, _POINTS), np.nan) for k in _FOUND if SHARE in _FOUND[k][0]}
-        return {**counts, **curves}
-
 
 class VirtualTests(AbstractIdentified):
     """A virtual near-resonance test of every member with its own noise, then its identification.
@@ -94,7 +88,7 @@ class VirtualTests(AbstractIdentified):
 
     def rows(self, members: Members) -> dict[str, np.ndarray]:
         """See `AbstractComputation.rows`."""
-        return one_by_one(members, self._one, **self.failed())
+        return one_by_one(self, members, self._one)
 
     def _one(self, model: Structure, force: np.ndarray | None, seed: int) -> dict:
         test = phase_resonance_test(
@@ -115,7 +109,7 @@ class Identifications(AbstractIdentified):
 
     def rows(self, members: Members) -> dict[str, np.ndarray]:
         """See `AbstractComputation.rows`."""
-        return one_by_one(members, self._one, **self.failed())
+        return one_by_one(self, members, self._one)
 
     def _one(self, model: Structure, force: np.ndarray | None, seed: int) -> dict:
         return self.identified(self.data, model)
@@ -143,9 +137,7 @@ class Diagnoses(AbstractComputation):
 
     def rows(self, members: Members) -> dict[str, np.ndarray]:
         """See `AbstractComputation.rows`."""
-        numbers = {name: np.full(1, np.nan) for name, o in self.outputs().items() if o.kind == "f8"}
-        texts = {name: np.array([""]) for name in ("verdict", "effects")}
-        return one_by_one(members, self._one, **numbers, **texts)
+        return one_by_one(self, members, self._one)
 
     def _one(self, model: Structure, force: np.ndarray | None, seed: int) -> dict:
         found = diagnose_model(model, self.data)
