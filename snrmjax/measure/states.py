@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
+from snrmjax.numerics.compiled import value_of
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
 from snrmjax.numerics.units import DEGREE, HERTZ
@@ -20,6 +21,8 @@ PHASE_UNKNOWN = np.pi / 3
 Errors are carried to first order, which at a radian says nothing any more: a velocity at
 resonance would pass for anything from cos 60° of its size on.
 """
+
+_UNKNOWN_FROM = PHASE_UNKNOWN * (1 - 1e-12)  # rounding of 60°
 
 NO_PHASE = np.pi
 """1σ, rad, that stands for a phase that was not measured."""
@@ -113,7 +116,7 @@ class SteadyStates(AbstractResult):
     @property
     def phase_unknown(self) -> Bool[Array, "state sensor"]:
         """Where a velocity was measured whose amplitude alone is known."""
-        return self.measured & (self.phase_std >= PHASE_UNKNOWN * (1 - 1e-12))
+        return self.measured & (self.phase_std >= _UNKNOWN_FROM)
 
     def select(self, rows: Bool[np.ndarray, " state"] | Int[np.ndarray, " row"]) -> "SteadyStates":
         """Some of the states: those where a mask is true, or of these rows in this order."""
@@ -228,21 +231,12 @@ def steady_states(
     return jax.device_put(states, may_alias=False)
 
 
-def _on_host(data: SteadyStates, *names: str) -> SteadyStates:
-    """Some columns as NumPy's, for which nothing compiles, unless one of them is traced."""
-    columns = [getattr(data, name) for name in names]
-    if any(isinstance(column, jax.core.Tracer) for column in columns):
-        return data
-    on_host: dict[str, Any] = dict(zip(names, map(np.asarray, columns), strict=True))
-    return dataclasses.replace(data, **on_host)
-
-
 def check_phases(data: SteadyStates, purpose: str) -> None:
     """Raise `ValueError` where phases are unknown; `purpose` is what needs them."""
-    phases: Any = _on_host(data, "phase_std", "measured").phase_unknown
-    if isinstance(phases, jax.core.Tracer):  # within `jax.jit` nothing has a value yet
+    std, measured = value_of(data.phase_std), value_of(data.measured)
+    if std is None or measured is None:
         return
-    unknown = np.any(np.asarray(phases), axis=1)
+    unknown = np.any(measured & (std >= _UNKNOWN_FROM), axis=1)
     if unknown.any():
         raise ValueError(
             f"{purpose} needs the phases of all velocities relative to the force, but those of "
@@ -255,10 +249,8 @@ def check_phases(data: SteadyStates, purpose: str) -> None:
 
 def check_force(data: SteadyStates, purpose: str) -> None:
     """Raise `ValueError` where no state has a force; `purpose` is what needs it."""
-    force: Any = _on_host(data, "force").force
-    known = force.__array_namespace__().isfinite(force)
-    # Within `jax.jit` nothing has a value yet; within a derivative this still has one.
-    if isinstance(known, jax.core.Tracer) or np.any(known):
+    force = value_of(data.force)
+    if force is None or np.any(np.isfinite(force)):
         return
     if not np.any(np.isfinite(np.asarray(data.drive))):
         raise ValueError(f"{purpose} needs the force, but no steady state has one.")

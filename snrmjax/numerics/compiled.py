@@ -61,6 +61,13 @@ def compiled(function: Callable[..., R], *, long_loops: bool = False) -> Callabl
     return call
 
 
+def value_of(array: Any) -> np.ndarray | None:
+    """An array's numbers on the host, also within a derivative; None within `jax.jit` or `vmap`."""
+    if isinstance(array, jax.core.Tracer):
+        array = jax.lax.stop_gradient(array)
+    return None if isinstance(array, jax.core.Tracer) else np.asarray(array)
+
+
 def numbers_as_arrays(tree: T) -> T:
     """A tree whose floating-point and complex numbers of Python are NumPy's.
 

@@ -2,6 +2,7 @@
 
 from typing import ClassVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import pytest
@@ -26,29 +27,14 @@ def modes():
     return sj.model.linear_modes([100.0], [0.01], [[1.0]], [1.0], sensors=("tip",))
 
 
-def peak(model):
-    curve, *_ = sj.forced_response(model, 1.0, 90.0, 110.0, harmonic_order=1)
-    return float(jnp.max(jnp.abs(curve.velocity[:, 1, 0])))
-
-
 @pytest.mark.parametrize("effect", [EFFECTS["quadratic_damping"], ThreeHalvesDamping])
 def test_parameters_may_be_plain_numbers(effect):
     plain = sj.model.structure(modes(), effects=(effect(2.0),))
     whole = sj.model.structure(modes(), effects=(effect(2),))
     same = sj.model.structure(modes(), effects=(effect(jnp.asarray(2.0)),))
     assert plain.effects[0].coefficient.dtype == whole.effects[0].coefficient.dtype == jnp.float64
-    assert jax.tree.structure(plain) == jax.tree.structure(same)
-    assert peak(plain) == peak(same)
+    assert eqx.tree_equal(plain, whole, same)
     assert sj.model.parameter_values(plain)[f"{effect.kind}.coefficient"] == 2.0
-
-
-def test_a_virtual_test_takes_an_effect_with_plain_numbers():
-    model = sj.model.structure(modes(), effects=ThreeHalvesDamping(2.0))
-    settings = sj.simulate.SweepSimulation(harmonic_order=1)
-    found = sj.phase_resonance_test(
-        model, [1.0], 95.0, 105.0, points_per_level=2, simulation=settings
-    )
-    assert found.steady_states.velocity.shape[0] > 0
 
 
 def test_traced_parameters_pass():

@@ -1,6 +1,7 @@
 """Facts, their sentences, and statuses: every kind is worded, every message says something."""
 
 import ast
+import functools
 import importlib
 import inspect
 import pkgutil
@@ -17,18 +18,22 @@ from snrmjax.report.sentences import sentence, wordings
 PACKAGE = Path(snrmjax.__file__).parent
 
 
+@functools.cache
 def stated_facts():
     """Every `Fact("kind", name=…)` of the package: place, kind, names of values."""
+    facts = []
     for path in sorted(PACKAGE.rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "Fact":
                 place = f"{path.relative_to(PACKAGE)}:{node.lineno}"
                 assert isinstance(node.args[0], ast.Constant), f"{place}: a kind is a constant"
-                yield place, node.args[0].value, {one.arg for one in node.keywords}
+                names = {keyword.arg for keyword in node.keywords}
+                facts.append((place, node.args[0].value, names))
+    return facts
 
 
 def test_every_fact_is_worded_from_values_that_it_has():
-    stated, words = list(stated_facts()), wordings()
+    stated, words = stated_facts(), wordings()
     assert stated
     for place, kind, names in stated:
         assert kind in words, f"{place}: {kind!r} stands in no table of report/sentences"

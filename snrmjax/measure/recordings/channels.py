@@ -17,6 +17,9 @@ SI_UNIT: dict[Quantity, str] = {
 }
 """The unit of each quantity in which all of the package computes."""
 
+DERIVATIVE: dict[Quantity, int] = {"displacement": 0, "velocity": 1, "acceleration": 2}
+"""Which derivative of the displacement a quantity of motion is."""
+
 
 class Channel(NamedTuple):
     """One channel of a recording.

@@ -7,7 +7,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float
 
-from snrmjax.measure.recordings.channels import Channel, checked_channels
+from snrmjax.measure.recordings.channels import DERIVATIVE, Channel, checked_channels
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
 from snrmjax.numerics.units import HERTZ
@@ -44,12 +44,12 @@ class FrequencyResponses(AbstractResult):
         """
         turned = []
         for channel, row in zip(self.responses, self.values, strict=True):
-            if channel.quantity not in _POWER:
+            if channel.quantity not in DERIVATIVE:
                 raise ValueError(
                     f"channel {channel.name} must be a displacement, velocity or acceleration, but "
                     f"is {channel.quantity}."
                 )
-            turned.append(row / (1j * self.frequency) ** _POWER[channel.quantity])
+            turned.append(row / (1j * self.frequency) ** DERIVATIVE[channel.quantity])
         return np.stack(turned)
 
     def summary(self) -> tuple[str, ...]:
@@ -77,9 +77,6 @@ def channel_variable(dimension: str, channels: Sequence[Channel]) -> Variable:
     """The names of channels along a dimension of a data set."""
     names = np.array([channel.name for channel in channels], dtype=str)
     return Variable((dimension,), names, "", f"{dimension} channel")
-
-
-_POWER = {"displacement": 0, "velocity": 1, "acceleration": 2}
 
 
 def frequency_responses(

@@ -7,14 +7,13 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
-from snrmjax.measure.recordings.channels import Channel, channel_number
+from snrmjax.measure.recordings.channels import DERIVATIVE, Channel, channel_number
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.states import SteadyStates, steady_states
 from snrmjax.numerics.facts import Fact
 
 Levels = Literal["auto", "force", "drive", "runs"]
 
-_MOTION = {"displacement": 1, "velocity": 0, "acceleration": -1}
 _GAP = 0.05  # of log amplitude between levels, at least
 _SPREAD = 0.4  # of log amplitude within a level, at most, where groups are to be believed
 
@@ -68,7 +67,7 @@ def choose_channels(
         )
     motions = tuple(recording.channels[_number(recording, name, "response")] for name in wanted)
     for channel in motions:
-        if channel.quantity not in _MOTION:
+        if channel.quantity not in DERIVATIVE:
             raise ValueError(
                 f"channel {channel.name} must be a displacement, velocity or acceleration, but its "
                 f"quantity is {channel.quantity}."
@@ -94,7 +93,7 @@ def velocity_factors(
     """What turns phasors of each channel into velocities: (ikΩ) for displacements, 1/(ikΩ) for
     accelerations. The mean of an acceleration says nothing of the velocity: NaN.
     """
-    power = np.array([_MOTION[channel.quantity] for channel in channels])[:, None]
+    power = 1 - np.array([DERIVATIVE[channel.quantity] for channel in channels])[:, None]
     turn = 1j * np.asarray(orders) * np.asarray(frequency, dtype=float)[..., None, None]
     safe = np.where(turn == 0, 1.0, turn)
     at_rest = np.where(power == 0, 1.0, np.where(power > 0, 0.0, np.nan))

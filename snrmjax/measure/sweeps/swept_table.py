@@ -5,11 +5,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
+from snrmjax.measure.recordings.channels import DERIVATIVE
 from snrmjax.measure.recordings.velocity_states import ChosenChannels, PhasorTable
 from snrmjax.measure.sweeps.sweep_correction import ModalBalance, SweptMotion, share_of_bias
 from snrmjax.measure.sweeps.swept_phasors import SweptPhasors, displacement_series
-
-_INTEGRATIONS = {"displacement": 0, "velocity": 1, "acceleration": 2}
 
 
 class Moment(NamedTuple):
@@ -26,7 +25,7 @@ def swept_moment(chosen: ChosenChannels, sweep: int, phasors: SweptPhasors) -> M
     motion, std = [], []
     rows = (chosen.responses, phasors.series[1:], phasors.std[1:])
     for channel, series, error in zip(*rows, strict=True):
-        times = _INTEGRATIONS[channel.quantity]
+        times = DERIVATIVE[channel.quantity]
         motion.append(displacement_series(series[None], phasors.rate, times)[0])
         std.append(error / phasors.rate[0] ** times)
     return Moment(sweep, phasors, np.array(motion), np.array(std))
@@ -79,7 +78,7 @@ def table_of(
     """Phasors relative to the force that holds each state, with their errors."""
     omega = np.array([moment.phasors.rate[0] for moment in moments])
     phasors = np.array([moment.phasors.harmonics[1:] for moment in moments])
-    times = np.array([_INTEGRATIONS[moment.quantity] for moment in chosen.responses])
+    times = np.array([DERIVATIVE[moment.quantity] for moment in chosen.responses])
     # A steady motion of the same displacement.
     steady = np.array([moment.motion[:, 0] for moment in moments])
     phasors[:, :, 0] = steady * (1j * omega[:, None]) ** times

@@ -115,7 +115,7 @@ def _result(found: WholeTest, stages: list[_Stage]) -> str:
     said = [f"{_check(found.checkup).capitalize()}."]
     said += [stage.report.result for stage in stages if stage.name == "Backbone"]
     if found.counts is not None and found.counts.reasons:
-        said.append(str(found.counts.fact))
+        said.append(f"{found.counts.fact}.")
     said += [stage.report.result for stage in stages if stage.name == "Diagnosis"]
     if found.left_out:
         said.append("The diagnosis was left out: the first note says why.")

@@ -20,9 +20,7 @@ from snrmjax.simulate.continuation.continuation import CurveStatus, StepControl,
 from snrmjax.simulate.continuation.events import with_events
 from snrmjax.simulate.continuation.stability import (
     Stability,
-    StabilityLoss,
     floquet_multipliers,
-    stability_loss,
     stability_of,
 )
 
@@ -93,13 +91,6 @@ class ResponseCurve(MotionCurve):
         """Which points are known to be unstable."""
         return self.stability == int(Stability.UNSTABLE)
 
-    @property
-    def stability_loss(self) -> tuple[StabilityLoss, ...]:
-        """By which kind of multiplier each point is unstable."""
-        if self.multipliers is None:
-            return (StabilityLoss.NOT_COMPUTED,) * len(self.frequency)
-        return stability_loss(self.multipliers)
-
     def at_events(self, kind: str) -> np.ndarray:
         """Indices of the points at which an event of this kind was located."""
         return np.array([k for k, e in enumerate(self.event) if kind in e.split("+")], dtype=int)
@@ -163,8 +154,8 @@ def assembled(
         balance, curve, truncation = taken(balances, number), labelled[number], None
         if stability:
             multipliers = floquet_multipliers(balance.model, *balance.motions(curve.points))
-            one = jax.tree.map(lambda a: np.asarray(a)[None] if eqx.is_array(a) else a, balance)
-            curve = with_bifurcations(one, curve, multipliers, steps)
+            stacked = jax.tree.map(lambda a: np.asarray(a)[None] if eqx.is_array(a) else a, balance)
+            curve = with_bifurcations(stacked, curve, multipliers, steps)
         motions = motions_of(balance, curve.points)
         if stability:
             (truncation,) = by_blocks(

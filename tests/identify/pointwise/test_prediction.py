@@ -8,6 +8,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.interpolate import PchipInterpolator
 from scipy.optimize import brentq
+from truths.shape_preserving import ShapePreservingCurve
 
 from snrmjax.identify.pointwise.backbone import Backbone
 from snrmjax.identify.pointwise.prediction import (
@@ -15,7 +16,6 @@ from snrmjax.identify.pointwise.prediction import (
     predict_response,
     resonances,
 )
-from snrmjax.methods.steady.mode_synthesis import ShapePreservingCurve
 from snrmjax.model.modes import RigidBodyModes, linear_modes, residual_velocity
 
 W0 = 500.0

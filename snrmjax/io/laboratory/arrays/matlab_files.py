@@ -48,7 +48,9 @@ def _tree_of_old(path: Path) -> tuple[dict[str, Node], list[Fact]]:
                 raise ValueError(f"{name} states {' by '.join(map(str, sides))} numbers")
         loaded: dict[str, Any] = scipy.io.loadmat(path, mat_dtype=False)
     notes: list[Fact] = []
-    nodes = {key: _node(one, key, notes) for key, one in loaded.items() if key[:2] != "__"}
+    nodes = {
+        key: _node(variable, key, notes) for key, variable in loaded.items() if key[:2] != "__"
+    }
     return {key: node for key, node in nodes.items() if node is not None}, notes
 
 

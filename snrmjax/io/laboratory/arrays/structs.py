@@ -57,12 +57,12 @@ def file_of_tree(
 ) -> LaboratoryFile:
     """All that is found in a tree; `notes` say what of the file is not in it."""
     contents = read_struct("", tree)
-    every = [*notes, *contents.notes]
-    if not (every or contents.recordings or contents.responses or contents.tables):
-        every = [Fact("nothing_measured", names=tuple(tree)[:_MOST_NAMED])]
+    known = [*notes, *contents.notes]
+    if not (known or contents.recordings or contents.responses or contents.tables):
+        known = [Fact("nothing_measured", names=tuple(tree)[:_MOST_NAMED])]
     return LaboratoryFile(
         *(name, kind, tuple(contents.recordings), tuple(contents.responses), contents.numbered()),
-        tuple(dict.fromkeys(every)),
+        tuple(dict.fromkeys(known)),
         tuple(np.nan for _ in contents.responses),
     )
 
