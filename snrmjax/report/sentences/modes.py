@@ -1,5 +1,7 @@
 """What fits of linear modes, scales of their shapes and calibrations of models have to tell."""
 
+import numpy as np
+
 from snrmjax.report.sentences import Wording
 
 
