@@ -24,10 +24,8 @@ pointwise curve are judged there: shares inside 95 % bands, bias over their half
 that neither holds, with and without a warning. One JSON line for every kind.
 """
 
-import argparse
 import csv
 import itertools
-import json
 import tempfile
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
@@ -36,6 +34,9 @@ from typing import NamedTuple
 
 import numpy as np
 import slip_integration as si
+from harness import options, teller
+
+tell = teller(__file__)
 
 KINDS = ("slip", "drift", "dropout", "all")
 SLIDERS, STATES = 30, 25
@@ -268,13 +269,7 @@ def warned(row: dict) -> dict[str, bool]:
 
 def main() -> None:
     """Integrate the beams, identify them and print one line for every kind."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--beams", type=int, default=40)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--unsettled", action="store_true", help="steps too short to settle")
-    parser.add_argument("--out", type=Path, help="keep the tables, models and truths here")
-    chosen = parser.parse_args()
+    chosen = options(__doc__, beams=40, seed=0, workers=2, unsettled=False, out=Path)
     kinds = ("unsettled",) if chosen.unsettled else KINDS
     named = [(kinds[k % len(kinds)], chosen.seed + k) for k in range(chosen.beams)]
     with (
@@ -288,10 +283,7 @@ def main() -> None:
         rows = list(pool.map(judged, [(folder, f"{kind}_{seed}") for kind, seed in named]))
     for kind in (*kinds, "every kind"):
         mine = [r for (own, _), r in zip(named, rows, strict=True) if kind in (own, "every kind")]
-        print(json.dumps({"benchmark": "bolted_beams", "kind": kind, **summary(mine)}), flush=True)
-    if chosen.out:
-        told = [{"name": f"{k}_{s}", **row} for (k, s), row in zip(named, rows, strict=True)]
-        (chosen.out / "rows.json").write_text(json.dumps(told, default=np.ndarray.tolist))
+        tell(kind=kind, **summary(mine))
 
 
 if __name__ == "__main__":

@@ -13,9 +13,7 @@ term (of a cubic spring within 1e-3 of the exact frequency here), over velocitie
 largest, and the points found.
 """
 
-import argparse
 import csv
-import json
 import subprocess
 import sys
 import tempfile
@@ -23,8 +21,11 @@ import time
 from pathlib import Path
 
 import numpy as np
+from harness import options, teller
 
 import snrmjax as sj
+
+tell = teller(__file__)
 
 HERTZ = 2 * np.pi
 REST, RATIO, CUBIC, MASS = 40 * HERTZ, 0.01, 3e9, 0.8
@@ -51,16 +52,12 @@ def recorded(path, record, *, forced=True):
     values = np.stack([np.asarray(one) for one in columns.values()], axis=1)
     np.savetxt(path, values, delimiter=",", header=",".join(columns), comments="", fmt="%.9g")
     seconds = float(values[-1, 0] - values[0, 0])
-    line = {"benchmark": "compare_records", "record": path.stem, "test_s": round(seconds, 2)}
-    print(json.dumps(line), flush=True)
+    tell(record=path.stem, test_s=seconds)
 
 
 def main() -> None:
     """Record, compare, score."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--out", type=Path)
-    parser.add_argument("--noise", type=float, default=0.002)
-    given = parser.parse_args()
+    given = options(__doc__, out=Path, noise=0.002)
     folder = given.out or Path(tempfile.mkdtemp())
     folder.mkdir(parents=True, exist_ok=True)
     bench = laboratory(given.noise)
@@ -87,7 +84,7 @@ def main() -> None:
         check=True,
     )
     wall = time.perf_counter() - begin
-    print(json.dumps({"benchmark": "compare_records", "command_s": round(wall, 1)}), flush=True)
+    tell(command_s=wall)
     with (folder / "compared" / "compare.csv").open() as file:
         rows = list(csv.DictReader(file))
     for method in dict.fromkeys(row["method"] for row in rows):
@@ -95,7 +92,7 @@ def main() -> None:
         columns = ("velocity_m_s", "frequency_hz", "damping_ratio")
         speed, hertz, ratio = (np.array([float(row[name]) for row in found]) for name in columns)
         kept = speed > 0.05 * speed.max(initial=0.0)
-        line = {"benchmark": "compare_records", "method": method, "points": len(found)}
+        line = {"method": method, "points": len(found)}
         if kept.any():
             half = REST**2 / 2
             true = np.sqrt(half + np.sqrt(half**2 + 0.75 * CUBIC * speed**2))
@@ -107,7 +104,7 @@ def main() -> None:
                 "damping_error_median": float(np.median(away)),
                 "damping_error_largest": float(away.max()),
             }
-        print(json.dumps(line), flush=True)
+        tell(**line)
 
 
 if __name__ == "__main__":

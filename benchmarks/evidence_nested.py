@@ -1,6 +1,6 @@
 """Is Laplace's evidence of an answer that of nested sampling, where that is doubtful?
 
-Run: python benchmarks/evidence_nested.py --sets DIR/sets SET:KIND[+KIND] … [--live 100]
+Run: python benchmarks/evidence_nested.py --sets DIR/sets --cases SET:KIND[+KIND] … [--live 100]
 with sets of `blind_sets/generate.py`; needs `pip install dynesty`.
 
 Evidence of an effect with thresholds, exponents or a further mode is an integral over parameters
@@ -10,13 +10,12 @@ Cauchy's of strengths, flat ones of what is bounded. One JSON line a case: both,
 its likelihood calls and seconds, and the odds of the effect to `none`.
 """
 
-import argparse
-import json
 import time
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from harness import options, teller
 
 from snrmjax.diagnose.evidence import marginal_of
 from snrmjax.diagnose.misfit.candidates import (
@@ -37,6 +36,8 @@ from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit, weighted_mis
 from snrmjax.io.models import read_model
 from snrmjax.io.tables import read_steady_states
 from snrmjax.model.effect_metadata import MotionScales
+
+tell = teller(__file__)
 
 _FARTHEST = 0.4999  # of a Cauchy distribution on each side
 
@@ -140,14 +141,10 @@ def compared(folder: Path, name: str, kinds: list[str], live: int) -> dict:
 
 def main() -> None:
     """One line a case."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--sets", type=Path, required=True)
-    parser.add_argument("--live", type=int, default=100)
-    parser.add_argument("cases", nargs="+", help="SET:KIND[+KIND]")
-    options = parser.parse_args()
-    for case in options.cases:
+    chosen = options(__doc__, sets=Path, live=100, cases=[""])
+    for case in chosen.cases:
         name, _, kinds = case.partition(":")
-        print(json.dumps(compared(options.sets, name, kinds.split("+"), options.live)), flush=True)
+        tell(**compared(chosen.sets, name, kinds.split("+"), chosen.live))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""All finite elements of a beam in periodic motion: harmonic balance and Newmark's rule.
+"""All finite elements of a beam in periodic motion: harmonic balance.
 
 M ü + C u̇ + f(u) = p cos Ωt for u = Σ_h a_h cos hΩt + b_h sin hΩt, with f the elements' internal
 force at samples of the period (alternating frequency-time). It shares the elements with a
@@ -15,8 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import snrmjax as sj
-from snrmjax.condense.elements.statics import free_force, free_tangent
-from snrmjax.condense.elements.strain_energy import mass_matrix
+from snrmjax.condense.elements.strain_energy import internal_force, mass_matrix, tangent_stiffness
 
 ORDER, SAMPLES = 9, 40  # exact for a cubic force
 FLAT = sj.condense.Beam(0.2286, 0.0127, 0.787e-3, young=204.8e9, density=7870.0, elements=20)
@@ -47,26 +46,16 @@ class Motion(NamedTuple):
     moved: jax.Array
 
 
-def cosines() -> Waves:
-    """cos hΩt, h = 0…`ORDER`: motions that start at rest."""
-    orders = np.arange(ORDER + 1)
-    value = np.cos(orders[:, None] * _phase())
-    weight = np.where(orders == 0, 1.0, 2.0)[:, None] * value / SAMPLES
-    return Waves(value, weight, np.zeros((orders.size, orders.size)), -np.diag(orders**2.0))
-
-
 def cosines_and_sines() -> Waves:
     """cos hΩt, h = 0…`ORDER`, then sin hΩt, h = 1…`ORDER`."""
-    even, h = cosines(), np.arange(1, ORDER + 1)
-    sines = np.sin(h[:, None] * _phase())
+    orders, h = np.arange(ORDER + 1), np.arange(1, ORDER + 1)
+    phase = 2 * np.pi * np.arange(SAMPLES) / SAMPLES
+    value = np.concatenate([np.cos(orders[:, None] * phase), np.sin(h[:, None] * phase)])
+    weight = 2 * value / SAMPLES
+    weight[0] /= 2
     first = np.zeros((2 * ORDER + 1, 2 * ORDER + 1))
     first[h, ORDER + h], first[ORDER + h, h] = h, -h
-    weight = np.concatenate([even.weight, 2 * sines / SAMPLES])
-    return Waves(np.concatenate([even.value, sines]), weight, first, first @ first)
-
-
-def _phase() -> np.ndarray:
-    return 2 * np.pi * np.arange(SAMPLES) / SAMPLES
+    return Waves(value, weight, first, first @ first)
 
 
 class Closing(NamedTuple):
@@ -121,53 +110,24 @@ def balanced(
     return Motion(*jax.lax.while_loop(goes_on, step, begin)[:3])
 
 
+def _all(beam: sj.condense.Beam, u: jax.Array) -> jax.Array:
+    """All degrees of freedom from those that are not held."""
+    return jnp.zeros(beam.n_dof).at[beam.free].set(u)
+
+
+def free_force(beam: sj.condense.Beam, u: jax.Array) -> jax.Array:
+    """Internal force on the degrees of freedom that are not held."""
+    return internal_force(beam, _all(beam, u))[beam.free]
+
+
+def free_tangent(beam: sj.condense.Beam, u: jax.Array) -> jax.Array:
+    """Tangent stiffness of the degrees of freedom that are not held."""
+    return tangent_stiffness(beam, _all(beam, u))[beam.free[:, None], beam.free]
+
+
 def free_mass(beam: sj.condense.Beam) -> jax.Array:
     """Mass matrix of the degrees of freedom that are not held."""
     return mass_matrix(beam)[beam.free[:, None], beam.free]
-
-
-@eqx.filter_jit
-def integrated(
-    beam: sj.condense.Beam,
-    damping: jax.Array,
-    load: jax.Array,
-    start: tuple[jax.Array, jax.Array],
-    frequency: jax.Array,
-    steps: int,
-    periods: int,
-) -> jax.Array:
-    """Displacement at the end of every step of the last period, by Newmark's rule.
-
-    Constant mean acceleration, `steps` a period. Arguments: `start` displacement and velocity.
-    """
-    mass = free_mass(beam)
-    dt = 2 * jnp.pi / frequency / steps
-
-    def step(carry, k):
-        u, v, a = carry
-        known = u + dt * v + 0.25 * dt**2 * a
-        push = load * jnp.cos(2 * jnp.pi * (k + 1) / steps)
-
-        def velocity(acceleration):
-            return v + 0.5 * dt * (a + acceleration)
-
-        def newton(_, new):
-            later = (new - known) * 4 / dt**2
-            residual = mass @ later + damping @ velocity(later) + free_force(beam, new) - push
-            tangent = free_tangent(beam, new) + 4 / dt**2 * mass + 2 / dt * damping
-            return new - jnp.linalg.solve(tangent, residual)
-
-        new = jax.lax.fori_loop(0, 3, newton, known)
-        later = (new - known) * 4 / dt**2
-        return (new, velocity(later), later), new
-
-    def period(carry, _):
-        return jax.lax.scan(step, carry, jnp.arange(steps))
-
-    u, v = start
-    begin = (u, v, jnp.linalg.solve(mass, load - damping @ v - free_force(beam, u)))
-    before, _ = jax.lax.scan(lambda c, k: (period(c, k)[0], None), begin, None, periods - 1)
-    return period(before, None)[1]
 
 
 class Reduced(NamedTuple):

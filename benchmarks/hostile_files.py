@@ -13,11 +13,9 @@ bad and is kept beside the temporary folder for a look.
 One JSON line: files, outcomes by kind, worst memory in MB, worst time in s, and the bad ones.
 """
 
-import argparse
 import collections
 import gzip
 import io
-import json
 import multiprocessing
 import os
 import resource
@@ -28,6 +26,9 @@ import zipfile
 from pathlib import Path
 
 import numpy as np
+from harness import options, teller
+
+tell = teller(__file__)
 
 SECONDS, MEGABYTES, GUARD = 10, 200, 2**30
 
@@ -274,11 +275,7 @@ def start_worker(folder, files):
 
 def main():
     """All runs and one line of figures."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--runs", type=int, default=20_000)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", default="")
-    told = parser.parse_args()
+    chosen = options(__doc__, runs=20_000, seed=0, only="")
     counts, bad = collections.Counter(), []
     by_format = collections.Counter()
     worst_time = worst_memory = 0.0
@@ -286,11 +283,11 @@ def main():
         folder = Path(text)
         (folder / "valid").mkdir()
         files = valid_files(folder / "valid")
-        names = [name for name in sorted(files) if told.only in name]
+        names = [name for name in sorted(files) if chosen.only in name]
         process, pipe = start_worker(text, files)
         began = time.perf_counter()
-        for k in range(told.runs):
-            rng = np.random.default_rng([told.seed, k])
+        for k in range(chosen.runs):
+            rng = np.random.default_rng([chosen.seed, k])
             name = names[k % len(names)]
             data, kind = mutated(files, name, rng)
             path = folder / f"hostile-{name}"
@@ -309,11 +306,10 @@ def main():
             worst_time, worst_memory = max(worst_time, spent), max(worst_memory, memory)
             if outcome.startswith("BAD"):
                 bad.append((k, name, kind, outcome))
-                print(json.dumps(bad[-1]), flush=True)
+                print(bad[-1], flush=True)
         pipe.send(None)
         figures = {
-            "benchmark": "hostile_files",
-            "files": told.runs,
+            "files": chosen.runs,
             "formats": len(names),
             "outcomes": dict(counts),
             "by_format": dict(sorted(by_format.items())),
@@ -323,7 +319,7 @@ def main():
             "bad": len(bad),
             "cores": os.cpu_count(),
         }
-    print(json.dumps(figures))
+    tell(**figures)
 
 
 if __name__ == "__main__":

@@ -9,38 +9,21 @@ velocity and frequency at phase resonance under the force of a left-out level ar
 that level's own states, interpolated to resonance. Suspended beam: force gain and phase free;
 frequency and damping from zero to the largest velocity; two halves of the levels fitted
 separately, compared in units of their bands. Both: whitened residuals and the notes of the fit.
-Then speed: a fit of all 328 points; `scipy.optimize.least_squares` with finite differences on the
-same residuals, and the fit's own solver from the same start; the derivative of the fitted curves
-by every measurement. One JSON line each.
+One JSON line each.
 """
 
-import argparse
 import itertools
-import json
 import time
 from pathlib import Path
 
-import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
-from scipy.optimize import least_squares
+from harness import options, teller
 
 import snrmjax as sj
-from snrmjax.identify.joint.family_fit import MOST_STEPS, SOLVER
-from snrmjax.identify.joint.free_unknowns import corrected_residuals
-from snrmjax.numerics.compiled import compiled
+
+tell = teller(__file__)
 
 HERTZ = 2 * np.pi
-
-
-def tell(**fields: object) -> None:
-    """One JSON line."""
-    print(json.dumps({"benchmark": "joint_fit_measured", **fields}, default=_plain), flush=True)
-
-
-def _plain(value: object) -> object:
-    array = np.asarray(value)
-    return [float(f"{x:.4g}") for x in array.reshape(-1)] if array.ndim else float(f"{array:.4g}")
 
 
 def load(folder: Path, table: str) -> tuple[sj.measure.SteadyStates, sj.model.Structure]:
@@ -121,7 +104,7 @@ def describe(name: str, fit: sj.identify.JointFit, seconds: float) -> None:
         noise_scale=fit.noise.scale,
         level_std=fit.noise.level_std,
         whitened_rms=np.sqrt(np.mean(fit.residuals**2)),
-        notes=[str(note) for note in fit.notes],
+        notes=list(map(str, fit.notes)),
     )
 
 
@@ -149,80 +132,13 @@ def halves(data: sj.measure.SteadyStates, model: sj.model.Structure, free: tuple
         **{f"{k}_within_2_std": np.mean(np.abs(np.asarray(v)) < 2) for k, v in gaps.items()},
         frequency_gap_hz=np.max(np.abs(one.natural_frequency - two.natural_frequency)) / HERTZ,
         damping_gap_relative=np.max(np.abs(one.modal_damping / two.modal_damping - 1)),
-        notes=[[str(note) for note in fit.notes] for fit in fits],
-    )
-
-
-@compiled
-def _residuals(vector, unravel, problem):
-    return corrected_residuals(vector, unravel, problem)
-
-
-@compiled
-def _solve(vector, unravel, problem, unit):
-    return optx.least_squares(
-        lambda y, _: corrected_residuals(y * unit, unravel, problem),
-        *(SOLVER, vector / unit),
-        max_steps=MOST_STEPS,
-    ).value * unit  # fmt: skip
-
-
-def speed(data: sj.measure.SteadyStates, model: sj.model.Structure) -> None:
-    """A fit with given families, SciPy on the same residuals, and all derivatives."""
-    settings = {"backbone": "spline:6@displacement", "damping": "spline:5@displacement"}
-
-    def fit_once() -> sj.identify.JointFit:
-        return sj.fit_jointly(data, model.modes, **settings)
-
-    fit = fit_once()
-    vector, unravel = fit.vector()
-    given = (unravel, fit.problem)
-    unit = np.sqrt(np.diag(fit.covariance))
-
-    def residuals(y: np.ndarray) -> np.ndarray:
-        return np.asarray(_residuals(jnp.asarray(vector + y * unit), *given))
-
-    start = np.zeros(len(vector))
-    start[:11] = 5.0  # standard deviations away in every parameter of both curves
-    residuals(start)
-
-    def solve() -> np.ndarray:
-        near = jnp.asarray(vector + start * unit)
-        return np.asarray(_solve(near, *given, jnp.asarray(100.0 * unit)))
-
-    found, best = (solve() - vector) / unit, least_squares(residuals, start, x_scale=1.0)
-    times: dict[str, list[float]] = {"fit": [], "solver": [], "scipy": []}
-    for _ in range(5):
-        for name, work in (
-            ("fit", fit_once),
-            ("solver", solve),
-            ("scipy", lambda: least_squares(residuals, start, x_scale=1.0)),
-        ):
-            begin = time.perf_counter()
-            work()
-            times[name].append(time.perf_counter() - begin)
-    medians = {name: float(np.median(values)) for name, values in times.items()}
-    tell(
-        measurement="speed",
-        points=len(fit.data.level),
-        unknowns=len(vector),
-        of_curves=11,
-        **{f"{k}_seconds": v for k, v in medians.items()},
-        scipy_over_fit=medians["scipy"] / medians["fit"],
-        scipy_over_solver=medians["scipy"] / medians["solver"],
-        derivatives_over_fit=medians["derivatives"] / medians["fit"],
-        # Both ends of the two: SciPy stops where its cost falls by less than 1e-8.
-        solver_cost_over_scipys_less_one=np.sum(residuals(found) ** 2) / (2 * best.cost) - 1,
-        solver_and_scipy_apart_in_std=np.max(np.abs(found - best.x)),
-        scipy_steps=best.nfev,
+        notes=[list(map(str, fit.notes)) for fit in fits],
     )
 
 
 def main() -> None:
-    """Both beams, then the speed."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", type=Path, required=True)
-    chosen = parser.parse_args()
+    """Both beams."""
+    chosen = options(__doc__, data=Path)
     brake, brake_model = load(chosen.data / "brake_reuss_beam", "response_controlled.csv")
     hung, hung_model = load(chosen.data / "suspended_beam", "lock_in_stepped_sine.csv")
     free = ("force_gain", "instrument_phase")
@@ -233,7 +149,6 @@ def main() -> None:
         begin = time.perf_counter()
         fit = sj.fit_jointly(data, model.modes, free=freed)
         describe(name, fit, time.perf_counter() - begin)
-    speed(brake, brake_model)
     held_out(brake, brake_model)
     halves(hung, hung_model, free)
 

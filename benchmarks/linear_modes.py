@@ -21,13 +21,12 @@ One JSON line a case: largest median error over the modes of frequency, damping 
 another number of modes was found.
 """
 
-import argparse
-import json
 import sys
 import time
 from pathlib import Path
 
 import numpy as np
+from harness import options, teller
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from truths.modal_structures import (
@@ -46,6 +45,8 @@ from snrmjax import identify
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.frequency_responses import frequency_responses
 from snrmjax.measure.recordings.time_recording import time_recording
+
+tell = teller(__file__)
 
 FINER = 8  # integration steps a sample
 FORCE = [Channel("hammer", "force", "N", point="1", direction="+z")]
@@ -150,11 +151,11 @@ def coverage(name, structure, make, fit, seeds, **more):
     median, tail = np.median(every, axis=0).max(axis=1), np.quantile(every, 0.9, axis=0).max(axis=1)
     line = {"case": name, "seeds": seeds, **more}
     for k, what in enumerate(("frequency", "damping", "shape")):
-        line[f"{what}_error_median_%"] = round(100 * float(median[k]), 5)
-        line[f"{what}_error_90_%"] = round(100 * float(tail[k]), 5)
-        line[f"{what}_coverage_%"] = round(100 * float(np.mean(inside[k])), 1)
-    line |= {"seconds_a_fit": round(seconds / seeds, 3), "other_number_of_modes": missed}
-    print(json.dumps(line), flush=True)
+        line[f"{what}_error_median_%"] = 100 * float(median[k])
+        line[f"{what}_error_90_%"] = 100 * float(tail[k])
+        line[f"{what}_coverage_%"] = 100 * float(np.mean(inside[k]))
+    line |= {"seconds_a_fit": seconds / seeds, "other_number_of_modes": missed}
+    tell(**line)
 
 
 def scaled(data, **settings):
@@ -182,7 +183,7 @@ def run_close(seeds):
         lambda rng: noisy(rng, structure, hertz, 1.0, 40),
         scaled,
         seeds,
-        **{"apart_%": round(100 * float(apart), 3)},
+        **{"apart_%": 100 * float(apart)},
     )
 
 
@@ -230,27 +231,21 @@ def run_measured(_):
         scale = None if volts else identify.DrivePoint(states.sensors[0])
         found, notes = identify.find_modes(states)
         modes = identify.scale_modes(found, scale)
-        print(
-            json.dumps(
-                {
-                    "case": f"{beam}, {table}",
-                    "modes": modes.n_modes,
-                    "frequency_hz": round(float(modes.natural_frequency[0]) / HERTZ, 4),
-                    "frequency_std_hz": round(float(modes.natural_frequency_std[0]) / HERTZ, 4),
-                    "stated_hz": float(stated.natural_frequency[0]) / HERTZ,
-                    "damping_ratio": round(float(modes.damping_ratio[0]), 6),
-                    "damping_ratio_std": round(float(modes.damping_ratio_std[0]), 6),
-                    "stated_damping_ratio": float(stated.damping_ratio[0]),
-                    "modal_mass_kg": None
-                    if volts
-                    else round(float(1 / modes.shape[0, 0] / modes.participation[0]), 3),
-                    "stated_modal_mass_kg": None
-                    if volts
-                    else round(float(1 / stated.mode_shape[0, 0] / stated.participation[0]), 3),
-                    "notes": [str(note) for note in notes],
-                }
-            ),
-            flush=True,
+        mass = {} if volts else {
+            "modal_mass_kg": 1 / modes.shape[0, 0] / modes.participation[0],
+            "stated_modal_mass_kg": 1 / stated.mode_shape[0, 0] / stated.participation[0],
+        }  # fmt: skip
+        tell(
+            case=f"{beam}, {table}",
+            modes=modes.n_modes,
+            frequency_hz=modes.natural_frequency[0] / HERTZ,
+            frequency_std_hz=modes.natural_frequency_std[0] / HERTZ,
+            stated_hz=stated.natural_frequency[0] / HERTZ,
+            damping_ratio=modes.damping_ratio[0],
+            damping_ratio_std=modes.damping_ratio_std[0],
+            stated_damping_ratio=stated.damping_ratio[0],
+            notes=list(map(str, notes)),
+            **mass,
         )
 
 
@@ -263,11 +258,13 @@ CASES = {
     "measured": run_measured,
 }
 
+
+def main() -> None:
+    """All cases, or some."""
+    chosen = options(__doc__, seeds=200, case=list(CASES))
+    for case in chosen.case:
+        CASES[case](chosen.seeds)
+
+
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--seeds", type=int, default=200)
-    parser.add_argument("--case", choices=CASES, default=None)
-    chosen = parser.parse_args()
-    for case, run in CASES.items():
-        if chosen.case in (None, case):
-            run(chosen.seeds)
+    main()

@@ -17,19 +17,19 @@ errors count at amplitudes that it covers.
 One JSON line a structure and method, as in `methods_table.py`, with the seconds of test.
 """
 
-import argparse
 import itertools
-import json
 from typing import NamedTuple
 
 import numpy as np
-from methods_table import HERTZ, STRUCTURES, true_mode, truth
-from scipy.interpolate import CubicSpline
+from harness import options, teller
+from methods_table import STRUCTURES, line_of, scored, truth_of
 
 import snrmjax as sj
 from snrmjax.measure import Channel, time_recording
 from snrmjax.methods.record_comparison import run_record_method
 from snrmjax.methods.records.recorded_test import recorded_test
+
+tell = teller(__file__)
 
 NOISE = {"low": 0.001, "middle": 0.005, "high": 0.02}
 METHODS = ("pll", "cbc", "resonant_decay", "restoring_force", "ssm", "pnlss")
@@ -131,63 +131,28 @@ def tests(bench, noise, model, forces, true, methods, seed):
 
 def main() -> None:
     """Print a line for every structure and method."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--seeds", type=int, default=20)
-    parser.add_argument("--structure", choices=list(STRUCTURES), nargs="*")
-    parser.add_argument("--noise", choices=list(NOISE), nargs="*", default=["middle"])
-    parser.add_argument("--method", choices=METHODS, nargs="*", default=METHODS)
-    given = parser.parse_args()
-    for name, noise in itertools.product(given.structure or STRUCTURES, given.noise):
-        make, forces, *ends = STRUCTURES[name]
-        model = make()
-        exact = true_mode if name == "two_modes" else truth
-        true = exact(model, forces, *(HERTZ * end for end in ends))
-        laws = [CubicSpline(true[0] ** 2, values) for values in (true[1] ** 2, true[2])]
-        found: dict[str, list] = {}
-        nothing: dict[str, int] = {}
-        seconds: dict[str, float] = {}
+    given = options(__doc__, seeds=20, structure=list(STRUCTURES), noise=["middle"], method=METHODS)
+    for name, noise in itertools.product(given.structure, given.noise):
+        model, forces, true, laws = truth_of(name)
+        found: dict[str, list] = {method: [] for method in given.method}
+        nothing, seconds = dict.fromkeys(given.method, 0), dict.fromkeys(given.method, 0.0)
         for seed in range(given.seeds):
-            each_test = tests(
-                *(BENCHES[name], NOISE[noise], model, forces, true, given.method), seed
-            )
-            for method, run in each_test:
-                rows = found.setdefault(method, [])
-                nothing.setdefault(method, 0)
+            bench = BENCHES[name], NOISE[noise], model, forces, true, given.method
+            for method, run in tests(*bench, seed):
                 try:
                     one = run()
                 except ValueError:  # counted as a failure of the method
                     nothing[method] += 1
                     continue
-                at = np.asarray(one.velocity)
+                rows = scored(one, true, laws)
+                nothing[method] += not rows
                 seconds[method] = float(one.test_seconds)
-                good = one.found & (at >= true[0, 0]) & (at <= true[0, -1])
-                nothing[method] += not good.any()
-                omega, ratio = np.sqrt(laws[0](at[good] ** 2)), laws[1](at[good] ** 2)
-                off = np.asarray(one.natural_frequency)[good] - omega
-                away = np.asarray(one.damping_ratio)[good] - ratio
-                rows += list(
-                    zip(
-                        *(off / omega, away / ratio),
-                        off / np.asarray(one.natural_frequency_std)[good],
-                        away / np.asarray(one.damping_ratio_std)[good],
-                        strict=True,
-                    )
-                )
+                found[method] += rows
         for method, rows in found.items():
-            line = {"benchmark": "methods_table", "structure": name, "noise": noise}
-            line |= {"method": method, "nothing_found": nothing[method] / given.seeds}
-            line["test_seconds"] = seconds.get(method)
-            if rows:
-                each = np.abs(np.array(rows))
-                for k, quantity in enumerate(("frequency", "damping")):
-                    line[f"{quantity}_error_median"] = float(np.median(each[:, k]))
-                    line[f"{quantity}_error_90"] = float(np.percentile(each[:, k], 90))
-                    score = each[np.isfinite(each[:, k + 2]), k + 2]
-                    line[f"{quantity}_coverage"] = (
-                        float(np.mean(score <= 1.96)) if score.size else None
-                    )
-                line["points_a_test"] = len(rows) / given.seeds
-            print(json.dumps(line), flush=True)
+            missed = nothing[method] / given.seeds
+            about = {"structure": name, "noise": noise, "method": method}
+            tell(**about, nothing_found=missed, test_seconds=seconds[method],
+                 **line_of(rows, given.seeds))  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -1,12 +1,11 @@
 """Each method against its own source: data, claims or formulas that its authors published.
 
-Run: python benchmarks/methods_sources.py [--pff FOLDER] [--pyvib FOLDER] [--nltest FOLDER]
+Run: python benchmarks/methods_sources.py [--pff FOLDER]
          [--only METHOD ...]
 
-The folders are copies of github.com/JustinPorter88/pff-analysis, github.com/pawsen/pyvib and
-github.com/maltekrack/NLtest, whose programs and data are used where they lie (they are not part of
-this project); NLtest needs Octave. pyvib takes some minutes. One JSON line a method, `kind`
-says what it was held against:
+The folder is a copy of github.com/JustinPorter88/pff-analysis, whose program and data are used
+where they lie (they are not part of this project). One JSON line a method, `kind` says what it was
+held against:
 
 - own_result: the authors' own numbers for the authors' own record (their Python program, run
   beside, and the stored result of their MATLAB program, which are also held against each other);
@@ -17,25 +16,16 @@ says what it was held against:
 - physics_only: no numbers of the source could be had; the method's central claim against harmonic
   balance, which it does not use.
 
-What could not be had: the worked examples of Arslan, Aykan & Özgüven (2011) and of Özer, Özgüven &
-Royston (2009), the structures of Karaağaçlı & Özgüven (2020, 2021), and the example of Carrella &
-Ewins (2011) — abstracts alone, without coefficients or tables; the record of the Silverbox, for
-which Paduart et al. (2010) state 0.26 mV (rms) of a polynomial state-space model: no package has it
-in itself; the response-controlled tests of the Tribomechadynamics challenge that NLtest works on
-(40 GB, not in its repository).
+What could not be had: the worked examples of Arslan, Aykan & Özgüven (2011), of Özer, Özgüven &
+Royston (2009), of Karaağaçlı & Özgüven (2020, 2021) and of Carrella & Ewins (2011).
 """
 
-import argparse
 import importlib.util
-import json
-import shutil
-import subprocess
-import tempfile
 from pathlib import Path
 
-import methods_state_space
 import numpy as np
 from contourpy import contour_generator
+from harness import options, teller
 from scipy.integrate import solve_ivp
 from scipy.linalg import eigh
 
@@ -43,14 +33,21 @@ import snrmjax as sj
 from snrmjax.methods.one_sensor import sensor_states
 from snrmjax.methods.steady.arslan_ozguven import describing_function
 
+tell = teller(__file__)
+
+METHODS = (
+    *("resonant_decay", "pll", "cbc", "rct", "harmonic_force_surface"),
+    *("concerto", "arslan_ozguven"),
+)
+
+
+def said(method: str, kind: str, source: str, **numbers: object) -> None:
+    """One line."""
+    tell(method=method, kind=kind, source=source, **numbers)
+
+
 HERTZ = 2 * np.pi
 REST, RATIO, MASS, CUBIC = 40 * HERTZ, 0.01, 0.8, 3e9  # cubic per modal mass, 1/(m² s²)
-
-
-def tell(method: str, kind: str, source: str, **numbers) -> None:
-    """One line."""
-    line = {"benchmark": "methods_sources", "method": method, "kind": kind, "source": source}
-    print(json.dumps({**line, **numbers}), flush=True)
 
 
 def duffing() -> sj.model.Structure:
@@ -65,7 +62,7 @@ def resonant_decay(folder: Path | None) -> None:
     """The authors' record of a bolted beam, band of their settings, against their result."""
     source = "Jin et al., J. Vib. Acoust. 142 (2020) 051111, doi:10.1115/1.4047416"
     if folder is None:
-        tell("resonant_decay", "own_result", source, not_run="--pff FOLDER is missing")
+        said("resonant_decay", "own_result", source, not_run="--pff FOLDER is missing")
         return
     from scipy.io import loadmat
 
@@ -104,7 +101,7 @@ def resonant_decay(folder: Path | None) -> None:
                 off = np.abs(answer[k][inside] / expected - 1)
                 numbers[f"{quantity}_from_{other}_median"] = float(np.median(off))
                 numbers[f"{quantity}_from_{other}_90"] = float(np.percentile(off, 90))
-        tell("resonant_decay", "own_result", source, reading=name, **numbers)
+        said("resonant_decay", "own_result", source, reading=name, **numbers)
 
 
 def _answer(result) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -137,7 +134,7 @@ def phase_locked_loop() -> None:
     good = found.found
     true = np.interp(found.velocity[good], speed[order], truth.frequency[order])
     omega = np.asarray(found.natural_frequency)[good]
-    tell(
+    said(
         *("pll", "own_claim"),
         "Hippold et al., Mech. Syst. Signal Process. 220 (2024) 111670, arXiv:2403.06639: fixed "
         "gains of the linear regime, a shift of 20 %, about 100 periods a point",
@@ -168,7 +165,7 @@ def continuation() -> None:
             law = sj.simulate.response_controlled(model, speed, 0.9 * omega, 1.1 * omega)
             true = np.interp(omega, law.frequency, np.abs(law.force))
             exact.append(abs(force - true) / needed.max())
-    tell(
+    said(
         *("cbc", "public_example"),
         "a public script of control-based continuation: forced Duffing equation with α = γ = 1, "
         "β = 0.04, δ = 0.1 and its one-term amplitudes; method of Sieber & Krauskopf 2008",
@@ -196,7 +193,7 @@ def held_displacements(model, sizes, frequencies=None):
     return sj.measure.join_steady_states(tables)
 
 
-def response_controlled(nltest: Path | None) -> None:
+def response_controlled() -> None:
     """Modal analysis of held levels: the line of inverse receptance beside a circle fit."""
     model, sizes = duffing(), np.array([4e-4, 8e-4, 1.2e-3, 1.6e-3])
     data = held_displacements(model, sizes)
@@ -206,7 +203,7 @@ def response_controlled(nltest: Path | None) -> None:
     true = np.sqrt(REST**2 + 0.75 * CUBIC * size**2)
     ratios = np.array([_circle(data, level) for level in np.asarray(found.level)[good]])
     ours = np.asarray(found.damping_ratio)[good]
-    tell(
+    said(
         *("rct", "own_formula"),
         "Karaağaçlı & Özgüven, Vibration 3 (2020) 266, doi:10.3390/vibration3030019; circle fit of "
         "Maia & Silva (1997), which NLtest uses for such tests, written out here",
@@ -218,62 +215,6 @@ def response_controlled(nltest: Path | None) -> None:
         circle_damping_error_max=float(np.abs(ratios * true / (RATIO * REST) - 1).max()),
         damping_difference_max=float(np.abs(ours / ratios - 1).max()),
     )
-    source = "NLtest (github.com/maltekrack/NLtest), circleFit.m, run under Octave"
-    octave = shutil.which("octave-cli") or shutil.which("octave")
-    if nltest is None or octave is None:
-        why = "--nltest FOLDER is missing" if nltest is None else "Octave is not installed"
-        tell("rct", "independent_program", source, not_run=why)
-        return
-    theirs = np.array(
-        [_their_circle(octave, nltest, data, level) for level in np.asarray(found.level)[good]]
-    )
-    # Theirs answers with the frequency of the state next to resonance: to the test's step at best.
-    middle = theirs[:, 0] * HERTZ
-    tell(
-        *("rct", "independent_program", source),
-        levels=len(theirs),
-        step_of_frequency=float(np.ptp(np.asarray(data.frequency)[:13]) / 12 / REST),
-        frequency_difference_max=float(
-            np.abs(np.asarray(found.natural_frequency)[good] / middle - 1).max()
-        ),
-        damping_difference_by_level=np.abs(ours / theirs[:, 1] - 1).tolist(),
-        their_damping_error_max=float(np.abs(theirs[:, 1] * true / (RATIO * REST) - 1).max()),
-        their_damping_std_by_level=(theirs[:, 2] / theirs[:, 1]).tolist(),
-    )
-
-
-def _their_circle(octave: str, folder: Path, data, level: int) -> tuple[float, float, float]:
-    """Frequency (Hz), damping ratio and its scatter by NLtest's `circleFit`.
-
-    It takes states from high to low frequency, a positive damping ratio coming out that way, and
-    phases within 90° of resonance as seen from the middle of the circle; as in its own scripts
-    states are left out whose displacement is 2 % off. `combvec` is of a toolbox that Octave does
-    not have.
-    """
-    rows = np.flatnonzero(np.asarray(data.level) == level)
-    omega = np.asarray(data.frequency)[rows]
-    velocity = np.asarray(data.velocity)[rows, 0]
-    receptance = velocity / (1j * omega) / np.asarray(data.force)[rows]
-    size = np.abs(velocity) / omega
-    kept = np.abs(np.angle(velocity)) < np.pi / 4
-    kept &= np.abs(size / np.median(size) - 1) < 0.02
-    order = np.flatnonzero(kept)[np.argsort(-omega[kept])]
-    table = np.stack([omega / HERTZ, receptance.real, receptance.imag], axis=1)[order]
-    with tempfile.TemporaryDirectory() as place:
-        np.savetxt(Path(place) / "states.txt", table, fmt="%.17g")
-        Path(place, "combvec.m").write_text(
-            "function c = combvec(a, b)\n[x, y] = meshgrid(a, b);\nc = [x(:)'; y(:)'];\nend\n"
-        )
-        script = (
-            f"addpath('{folder / 'SRC'}'); t = load('states.txt');"
-            "[f, d, s] = circleFit(t(:, 1), t(:, 2) + 1i * t(:, 3)); printf('%.17g\\n', f, d, s);"
-        )
-        said = subprocess.run(
-            *([octave, "--no-gui", "--quiet", "--eval", script],),
-            **{"cwd": place, "capture_output": True, "text": True, "check": True},
-        )
-    frequency, ratio, scatter = (float(one) for one in said.stdout.split())
-    return frequency, ratio, scatter
 
 
 def harmonic_force_surface() -> None:
@@ -294,7 +235,7 @@ def harmonic_force_surface() -> None:
         nearest = int(np.argmin(np.abs(each - one)))
         distance.append(abs(each[nearest] - one) / height.max())
         unstable += bool(exact.is_unstable[k[nearest]])
-    tell(
+    said(
         *("harmonic_force_surface", "physics_only"),
         "Karaağaçlı & Özgüven, Vibration 3 (2020) 266: unstable branches are ordinary points of "
         "the surface (no table of their structures was found)",
@@ -308,7 +249,7 @@ def harmonic_force_surface() -> None:
     drawn = contour_generator(surface.frequency, surface.amplitude, np.abs(surface.force))
     lines = [one / unit for one in drawn.lines(force)]
     apart = [min(_distance(at, line) for line in lines) for at in np.stack([omega, cut], 1) / unit]
-    tell(
+    said(
         *("harmonic_force_surface", "independent_program"),
         "ContourPy: contour lines of the sizes of the forces, on the same levels; distances in "
         "half-power widths and peak heights",
@@ -384,7 +325,7 @@ def concerto() -> None:
     theirs = np.array(theirs)
     true = np.sqrt(REST**2 + 0.75 * CUBIC * size**2)
     ours = np.asarray(found.natural_frequency)[good], np.asarray(found.damping_ratio)[good]
-    tell(
+    said(
         *("concerto", "own_formula"),
         "Carrella & Ewins, Mech. Syst. Signal Process. 25 (2011) 1011, "
         "doi:10.1016/j.ymssp.2010.09.011: their real formulas, written out here (their example's "
@@ -441,7 +382,7 @@ def spring_in_a_chain() -> None:
     ours = np.stack([result.natural_frequency, result.damping_ratio], axis=1)
     apart = np.abs(ours / mode - 1).max(axis=0)
     fitted = [float(np.sum(one.real * size**2) / np.sum(0.75 * size**4)) for one in (v, theirs)]
-    tell(
+    said(
         *("arslan_ozguven", "own_formula"),
         "Arslan, Aykan & Özgüven, Mech. Syst. Signal Process. 25 (2011) 1112, "
         "doi:10.1016/j.ymssp.2010.10.010: nonlinearity matrix and describing function, written out "
@@ -477,36 +418,18 @@ def _steady_motion(stiffness, damping, mass, cubic, force, omega) -> np.ndarray:
     return np.fft.fft(found.y[:count], axis=1)[:, 1] / 32
 
 
-def state_space(folder: Path | None) -> None:
-    """The same multisine records by two programs."""
-    source = (
-        "pyvib (github.com/pawsen/pyvib), after the authors' PNLSS toolbox; method of Paduart et "
-        "al., Automatica 46 (2010) 647, doi:10.1016/j.automatica.2010.01.001"
-    )
-    if folder is None:
-        tell("pnlss", "independent_program", source, not_run="--pyvib FOLDER is missing")
-        return
-    for numbers in methods_state_space.compared(folder):
-        tell("pnlss", "independent_program", source, **numbers)
-
-
 def main() -> None:
     """All methods in turn."""
-    parser = argparse.ArgumentParser()
-    for name in ("--pff", "--pyvib", "--nltest"):
-        parser.add_argument(name, type=lambda given: Path(given).resolve())
+    given = options(__doc__, only=METHODS, pff=Path)
     runs = {
         "resonant_decay": lambda: resonant_decay(given.pff),
         "pll": phase_locked_loop,
         "cbc": continuation,
-        "rct": lambda: response_controlled(given.nltest),
+        "rct": response_controlled,
         "harmonic_force_surface": harmonic_force_surface,
         "concerto": concerto,
         "arslan_ozguven": spring_in_a_chain,
-        "pnlss": lambda: state_space(given.pyvib),
     }
-    parser.add_argument("--only", nargs="*", choices=list(runs), default=list(runs))
-    given = parser.parse_args()
     for name in given.only:
         runs[name]()
 

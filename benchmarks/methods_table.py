@@ -19,15 +19,15 @@ share of points whose 95 % band holds the truth (of those with a band), points, 
 tests in which the method found nothing.
 """
 
-import argparse
-import json
-
 import numpy as np
+from harness import options, teller
 from scipy.interpolate import CubicSpline, PchipInterpolator
 
 import snrmjax as sj
 from snrmjax.methods import METHODS, compare_methods
 from snrmjax.simulate.virtual_test.recording import MeasurementErrors, Recording
+
+tell = teller(__file__)
 
 HERTZ = 2 * np.pi
 _CURVES, _ROUNDS = 16, 6  # exact responses that tell the truth
@@ -120,63 +120,67 @@ def true_mode(model, forces, low, high):
     return np.stack([speed, found.frequency, found.damping_ratio])[:, kept]
 
 
+Row = tuple[float, float, float, float]  # errors of frequency and damping, relative and over 1σ
+
+
+def scored(one: object, true: np.ndarray, laws: list) -> list[Row]:
+    """Errors of a method's points between the lowest and the highest true resonance."""
+    at = np.asarray(one.velocity)
+    good = one.found & (at >= true[0, 0]) & (at <= true[0, -1])
+    omega, ratio = np.sqrt(laws[0](at[good] ** 2)), laws[1](at[good] ** 2)
+    off = np.asarray(one.natural_frequency)[good] - omega
+    away = np.asarray(one.damping_ratio)[good] - ratio
+    stds = [np.asarray(s)[good] for s in (one.natural_frequency_std, one.damping_ratio_std)]
+    return list(zip(off / omega, away / ratio, off / stds[0], away / stds[1], strict=True))
+
+
+def line_of(rows: list[Row], seeds: int) -> dict[str, float | None]:
+    """Errors and coverage of all points of all tests."""
+    if not rows:
+        return {}
+    line: dict[str, float | None] = {}
+    each = np.abs(np.array(rows))
+    for k, quantity in enumerate(("frequency", "damping")):
+        line[f"{quantity}_error_median"] = float(np.median(each[:, k]))
+        line[f"{quantity}_error_90"] = float(np.percentile(each[:, k], 90))
+        score = each[np.isfinite(each[:, k + 2]), k + 2]
+        line[f"{quantity}_coverage"] = float(np.mean(score <= 1.96)) if score.size else None
+    return line | {"points_a_test": len(rows) / seeds}
+
+
+def truth_of(name: str) -> tuple[object, list, np.ndarray, list]:
+    """The structure of a name, its forces, true resonances, and the laws through them."""
+    make, forces, *ends = STRUCTURES[name]
+    model = make()
+    exact = true_mode if name == "two_modes" else truth
+    true = exact(model, forces, *(HERTZ * end for end in ends))
+    return model, forces, true, [CubicSpline(true[0] ** 2, v) for v in (true[1] ** 2, true[2])]
+
+
 def main() -> None:
     """Print a line for every structure, noise and method."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--seeds", type=int, default=20)
-    parser.add_argument("--structure", choices=list(STRUCTURES))
-    given = parser.parse_args()
-    for name in [given.structure] if given.structure else STRUCTURES:
-        make, forces, *ends = STRUCTURES[name]
-        model = make()
-        low, high = (HERTZ * end for end in ends)
-        true = (true_mode if name == "two_modes" else truth)(model, forces, low, high)
-        laws = [CubicSpline(true[0] ** 2, values) for values in (true[1] ** 2, true[2])]
+    given = options(__doc__, seeds=20, structure=list(STRUCTURES))
+    for name in given.structure:
+        model, forces, true, laws = truth_of(name)
         for noise, (amplitude, degrees) in NOISE.items():
             errors = MeasurementErrors(amplitude=amplitude, phase=np.radians(degrees))
-            found: dict[str, list] = {method: [] for method in METHODS}
+            found: dict[str, list[Row]] = {method: [] for method in METHODS}
             nothing = dict.fromkeys(METHODS, 0)
             for seed in range(given.seeds):
                 test = sj.phase_resonance_test(
-                    model,
-                    forces,
-                    low,
-                    high,
+                    *(model, forces, *(HERTZ * end for end in STRUCTURES[name][2:])),
                     appropriation=(np.cos(np.radians(75)) ** 2, 1.0),
                     points_per_level=12,
                     recording=Recording(errors, seed),
                 )
                 for one in compare_methods(test.steady_states, model.modes).results:
-                    at = np.asarray(one.velocity)
-                    good = one.found & (at >= true[0, 0]) & (at <= true[0, -1])
-                    if not good.any():
-                        nothing[one.method] += 1
-                        continue
-                    omega, ratio = np.sqrt(laws[0](at[good] ** 2)), laws[1](at[good] ** 2)
-                    off = np.asarray(one.natural_frequency)[good] - omega
-                    off_damping = np.asarray(one.damping_ratio)[good] - ratio
-                    found[one.method] += list(
-                        zip(
-                            *(off / omega, off_damping / ratio),
-                            off / np.asarray(one.natural_frequency_std)[good],
-                            off_damping / np.asarray(one.damping_ratio_std)[good],
-                            strict=True,
-                        )
-                    )
+                    rows = scored(one, true, laws)
+                    nothing[one.method] += not rows
+                    found[one.method] += rows
             for method, rows in found.items():
-                line = {"benchmark": "methods_table", "structure": name, "noise": noise}
-                line |= {"method": method, "nothing_found": nothing[method] / given.seeds}
-                if rows:
-                    each = np.abs(np.array(rows))
-                    for k, quantity in enumerate(("frequency", "damping")):
-                        line[f"{quantity}_error_median"] = float(np.median(each[:, k]))
-                        line[f"{quantity}_error_90"] = float(np.percentile(each[:, k], 90))
-                        score = each[np.isfinite(each[:, k + 2]), k + 2]
-                        line[f"{quantity}_coverage"] = (
-                            float(np.mean(score <= 1.96)) if score.size else None
-                        )
-                    line["points_a_test"] = len(rows) / given.seeds
-                print(json.dumps(line), flush=True)
+                missed = nothing[method] / given.seeds
+                about = {"structure": name, "noise": noise, "method": method}
+                tell(**about, nothing_found=missed, **line_of(rows, given.seeds))
 
 
 if __name__ == "__main__":

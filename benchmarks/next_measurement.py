@@ -11,14 +11,14 @@ repeated with the same noise, and the mean relative bands of both curves after a
 compared. One JSON line.
 """
 
-import argparse
-import json
-
 import numpy as np
+from harness import options, teller
 
 import snrmjax as sj
 
-OMEGA, CONSTANT = 500.0, 6.0
+tell = teller(__file__)
+
+OMEGA, CONSTANT = 500.0, 6.0  # rad/s at rest; of force over displacement, 1/kg
 NOISE = {"velocity": 0.01, "phase": 0.012, "force": 0.003, "gain": 0.01}
 FAMILIES = {"backbone": "polynomial:2@displacement", "damping": "viscous_quadratic@velocity"}
 FORCES = (0.3, 0.8, 1.6, 2.6)
@@ -164,13 +164,9 @@ def one_test(seed: int) -> list[float]:
 
 def main() -> None:
     """All tests and one line."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--tests", type=int, default=100)
-    parser.add_argument("--seed", type=int, default=0)
-    chosen = parser.parse_args()
+    chosen = options(__doc__, tests=100, seed=0)
     ratios = np.array([one_test(chosen.seed + k) for k in range(chosen.tests)])
     line: dict[str, object] = {
-        "benchmark": "next_measurement",
         "tests": len(ratios),
         "band_after_advised": round(float(np.median(ratios[:, 0])), 3),
     }
@@ -182,7 +178,7 @@ def main() -> None:
             "share_at_least_1_5": round(float(np.mean(gain >= 1.5)), 2),
             "share_better": round(float(np.mean(gain > 1)), 2),
         }
-    print(json.dumps(line), flush=True)
+    tell(**line)
 
 
 if __name__ == "__main__":

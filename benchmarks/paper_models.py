@@ -11,8 +11,6 @@ seconds; `--table` writes all coefficients side by side. Jobs found in the folde
 Without CalculiX its columns are left out.
 """
 
-import argparse
-import json
 import shutil
 import tempfile
 import time
@@ -21,6 +19,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from harness import options, teller
 
 from snrmjax.condense import Beam as FiniteElements
 from snrmjax.condense import (
@@ -38,6 +37,8 @@ from snrmjax.io import calculix
 from snrmjax.model.beams import curved_beam, flat_beam
 from snrmjax.model.potential import monomial_key
 from snrmjax.model.structures import Structure
+
+tell = teller(__file__)
 
 HERTZ = 2 * np.pi
 
@@ -259,14 +260,13 @@ def path_of(beam: PaperBeam, folder: Path) -> dict[str, object]:
     fitted = np.linalg.lstsq(terms, (loads - moved)[there], rcond=None)[0]
     between = np.linspace(1.0, 4.0, 301)
     line: dict[str, object] = {
-        "benchmark": "paper_models",
         "beam": "curved",
         "model": "path by shells S8R",
         "load": loads[there],
         "displacement": moved[there],
         "lowest_between": float(np.min(between + between[:, None] ** powers @ fitted)),
     }
-    return {key: _rounded(value) for key, value in line.items()}
+    return line
 
 
 def line_of(name: str, model: str, beam: PaperBeam, found: Condensed) -> dict[str, object]:
@@ -276,7 +276,6 @@ def line_of(name: str, model: str, beam: PaperBeam, found: Condensed) -> dict[st
     large = [cubic[key] for key in cubic if len(set(key)) <= 2]
     values = beam.printed.modes
     line: dict[str, object] = {
-        "benchmark": "paper_models",
         "beam": name,
         "model": model,
         "frequency_ratio": found.frequency / np.asarray(values.natural_frequency) * HERTZ,
@@ -293,13 +292,7 @@ def line_of(name: str, model: str, beam: PaperBeam, found: Condensed) -> dict[st
         line["participation"] = found.participation
     if name == "curved":
         line["quadratic_ratio"] = found.force["111"] / printed["111"]
-    return {key: _rounded(value) for key, value in line.items()}
-
-
-def _rounded(value: object) -> object:
-    if isinstance(value, (np.ndarray, list)):
-        return [float(f"{x:.5g}") for x in value]
-    return float(f"{value:.5g}") if isinstance(value, float) else value
+    return line
 
 
 def table_of(name: str, beam: PaperBeam, found: dict[str, Condensed]) -> str:
@@ -323,16 +316,11 @@ def table_of(name: str, beam: PaperBeam, found: dict[str, Condensed]) -> str:
 
 def main() -> None:
     """Every beam by every kind of element."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--scale", type=float, default=None, help="thicknesses")
-    parser.add_argument("--folder", type=Path, default=None, help="of CalculiX's jobs")
-    parser.add_argument("--table", type=Path, default=None)
-    parser.add_argument("--only", choices=tuple(BEAMS), default=None)
-    chosen = parser.parse_args()
+    chosen = options(__doc__, scale=float, folder=Path, table=Path, only=list(BEAMS))
     folder = chosen.folder or Path(tempfile.mkdtemp(prefix="paper-models-"))
     tables = []
     for name, beam in BEAMS.items():
-        if chosen.only not in (None, name):
+        if name not in chosen.only:
             continue
         found: dict[str, Condensed] = {}
         if shutil.which("ccx") is not None:
@@ -340,12 +328,12 @@ def main() -> None:
                 place = folder / f"{name}-{kind}-{mesh[0]}-{'p' if has_poisson else '0'}"
                 poisson = beam.poisson if has_poisson else 0.0
                 found[model] = by_calculix(beam, kind, mesh, poisson, chosen.scale, place)
-                print(json.dumps(line_of(name, model, beam, found[model])), flush=True)
+                tell(**line_of(name, model, beam, found[model]))
             if name == "curved":
                 place = folder / "curved-S8R-60-p"
-                print(json.dumps(path_of(beam, place)), flush=True)
+                tell(**path_of(beam, place))
         found["built-in"] = built_in(beam, chosen.scale)
-        print(json.dumps(line_of(name, "built-in", beam, found["built-in"])), flush=True)
+        tell(**line_of(name, "built-in", beam, found["built-in"]))
         tables.append(table_of(name, beam, found))
     if chosen.table is not None:
         chosen.table.write_text("\n".join(tables), encoding="utf-8")

@@ -18,14 +18,11 @@ The decks are written here, of quadratic solids (C3D20R), and go through `snrmja
 straight beams also through the built-in elements. A third structure is the clamped beam of the
 Applied Force Reduction Tool (github.com/MaxDB/Applied-Force-Reduction-Tool, GPL: read, not
 copied), 120 Abaqus elements B32, of which no numbers are printed: frequency and cubic coefficient
-by both codes. Its other clamped beam is the flat one of paper_models.py. `--deck` condenses a deck
-of a checkout beside ours.
+by both codes. Its other clamped beam is the flat one of paper_models.py.
 
 One JSON line a model; ratios are ours over the published.
 """
 
-import argparse
-import json
 import shutil
 import subprocess
 import sys
@@ -35,9 +32,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from harness import options, teller
 
 import snrmjax as sj
 from snrmjax.io import calculix
+
+tell = teller(__file__)
 
 HERTZ = 2 * np.pi
 _MICRO = {"young": 160e9, "poisson": 0.22, "density": 2320.0}  # polysilicon
@@ -208,7 +208,6 @@ def line_of(name: str, case: Case, model: sj.model.Structure, seconds: float) ->
     one = case.strip.thickness / largest  # modal displacement of one thickness
     squared = frequency[0] ** 2
     line: dict[str, object] = {
-        "benchmark": "peer_structures",
         "structure": name,
         "frequency_hz": frequency / HERTZ,
         "quadratic_force": 3 * terms.get((0, 0, 0), 0.0) * one / squared,
@@ -239,28 +238,13 @@ def line_of(name: str, case: Case, model: sj.model.Structure, seconds: float) ->
     return line
 
 
-def printed(line: dict[str, object], model: str) -> None:
-    """One JSON line with five digits."""
-
-    def rounded(value):
-        if isinstance(value, np.ndarray):
-            return [float(f"{x:.5g}") for x in value]
-        return float(f"{value:.5g}") if isinstance(value, float) else value
-
-    print(json.dumps({"model": model} | {k: rounded(v) for k, v in line.items()}), flush=True)
-
-
 def main() -> None:
     """Every structure by solids through the command, straight ones by built-in elements."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--folder", type=Path, default=None, help="of decks and CalculiX's jobs")
-    parser.add_argument("--only", choices=tuple(CASES), default=None)
-    parser.add_argument("--deck", type=Path, default=None, help="a deck of another's checkout")
-    chosen = parser.parse_args()
+    chosen = options(__doc__, folder=Path, only=list(CASES))
     folder = chosen.folder or Path(tempfile.mkdtemp(prefix="peer-structures-"))
     folder.mkdir(parents=True, exist_ok=True)
     for name, case in CASES.items():
-        if chosen.only not in (None, name):
+        if name not in chosen.only:
             continue
         if shutil.which("ccx") is not None:
             deck = folder / f"{name.replace(' ', '_')}.inp"
@@ -269,16 +253,11 @@ def main() -> None:
             for count in case.counts:
                 model, seconds = by_command(deck, modes[:count])
                 kept = ", ".join(map(str, modes[:count]))
-                printed(line_of(name, case, model, seconds), f"C3D20R, modes {kept}")
+                tell(model=f"C3D20R, modes {kept}", **line_of(name, case, model, seconds))
         if not case.strip.rise:
             for count in case.counts:
                 model, seconds = by_elements(case.strip, count)
-                printed(line_of(name, case, model, seconds), f"built-in, {count} modes")
-    if chosen.deck is not None:
-        copy = folder / "peer.inp"
-        shutil.copyfile(chosen.deck, copy)
-        model, seconds = by_command(copy, [1])
-        printed(line_of("AFR beam", CASES["AFR beam"], model, seconds), f"deck {chosen.deck.name}")
+                tell(model=f"built-in, {count} modes", **line_of(name, case, model, seconds))
     if chosen.folder is None:
         shutil.rmtree(folder)
 

@@ -13,18 +13,12 @@ peak's; null where the condensed model's phase turns back, in an internal resona
 the end of the bent resonance. `holds_to_thicknesses`:
 the largest peak among the forces whose peak frequency is right to 1 %, and the next beyond.
 
-One state on the upper branch, 5 % off in amplitude, is integrated by Newmark's rule over 80
-periods: how far its last period is from the balanced one (relative to its largest displacement),
-with steps of two sizes.
 One JSON line a case.
 
-    python benchmarks/rom_forced_response.py [--out FOLDER] [--only flat]
+    python benchmarks/rom_forced_response.py [--only flat]
 """
 
-import argparse
-import json
 import time
-from pathlib import Path
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -38,21 +32,21 @@ from full_order import (
     condensed,
     cosines_and_sines,
     free_mass,
-    integrated,
+    free_tangent,
 )
+from harness import options, teller
 from scipy.interpolate import CubicSpline
 from scipy.linalg import eigh
 
 import snrmjax as sj
-from snrmjax.condense.elements.statics import free_tangent
 from snrmjax.condense.elements.strain_energy import shape_rows, uniform_load
+
+tell = teller(__file__)
 
 HERTZ = 2 * np.pi
 _RATIO = 0.02  # damping ratio of the first mode
 _PHASES = np.deg2rad(np.linspace(80.0, -80.0, 81))  # of the midspan velocity
 _COMPARED = np.deg2rad(np.linspace(78.0, -78.0, 60))
-_CHECK_PERIODS, _CHECK_STEPS = 80, (200, 400)
-_OFF = 1.05  # times the balanced state, from which integration starts
 _BAR = 0.01  # of the peak's frequency
 # Forces in N, uniform, for peaks of about 0.3, 0.6, 1 and 1.5 (curved: 0.85 and 1) thicknesses.
 _CASES = {
@@ -104,8 +98,8 @@ def full_model(beam: sj.condense.Beam, kind: str) -> FullModel:
     return FullModel(beam, damping, frequency, ratio, load, middle)
 
 
-def full_response(full: FullModel, force: float) -> tuple[Response, list]:
-    """The response of all elements through resonance, and its balanced motions."""
+def full_response(full: FullModel, force: float) -> Response:
+    """The response of all elements through resonance."""
     waves, n = cosines_and_sines(), full.load.size
     basis = sj.condense.beam_modes(full.beam, (1,))
     shape = np.asarray(basis.shapes)[full.beam.free, 0]
@@ -137,7 +131,7 @@ def full_response(full: FullModel, force: float) -> tuple[Response, list]:
         ahead = motions[-1] if len(motions) == 1 else motions[-2]
         c = 2 * np.asarray(found.coefficients) - np.asarray(ahead.coefficients)
         omega = 2 * float(found.frequency) - float(ahead.frequency)
-    return response_of(full, motions), motions
+    return response_of(full, motions)
 
 
 def response_of(full: FullModel, motions: list) -> Response:
@@ -202,83 +196,34 @@ def errors_of(full: Response, reduced: Response) -> dict[str, float]:
     }
 
 
-def integration_check(full: FullModel, force: float, motion) -> list[float]:
-    """How far the last of many periods of Newmark's rule is from a balanced motion."""
-    c, omega = np.asarray(motion.coefficients), float(motion.frequency)
-    h = np.arange(1, ORDER + 1)
-    u = _OFF * c[: ORDER + 1].sum(axis=0)
-    v = _OFF * omega * (h @ c[ORDER + 1 :])
-    system = full.beam, jnp.asarray(full.damping), jnp.asarray(force * full.load)
-    start = jnp.asarray(u), jnp.asarray(v)
-    errors = []
-    for steps in _CHECK_STEPS:
-        last = integrated(*system, start, jnp.asarray(omega), steps, _CHECK_PERIODS)
-        phase = h[:, None] * 2 * np.pi * np.arange(1, steps + 1) / steps
-        value = np.concatenate([np.ones((1, steps)), np.cos(phase), np.sin(phase)])
-        wanted, got = value.T @ c @ full.middle, np.asarray(last) @ full.middle
-        errors.append(float(np.max(np.abs(got - wanted)) / np.max(np.abs(wanted))))
-    return errors
-
-
-def on_upper_branch(response: Response, first: float) -> int:
-    """A state between the peak and the side from which the bent resonance is reached."""
-    side = 1.0 if response.features.peak_frequency > first else -1.0
-    return int(np.argmin(np.abs(response.phase - side * np.deg2rad(45.0))))
-
-
-def rounded(values) -> list:
-    """Two digits of errors; None for NaN."""
-    return [None if np.isnan(one) else float(f"{one:.2g}") for one in np.ravel(values)]
-
-
 def main() -> None:
     """Both beams, all forces, with one mode and with more, both kinds of damping."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--out", type=Path, help="folder for a figure")
-    parser.add_argument("--only", choices=tuple(_CASES))
-    options = parser.parse_args()
-    curves: dict = {}
-    for name, (beam, forces, sets) in _CASES.items():
-        if options.only not in (None, name):
-            continue
+    chosen = options(__doc__, only=list(_CASES))
+    for name in chosen.only:
         for kind in ("mass", "stiffness"):
-            curves[name, kind] = compared(name, kind, beam, forces, sets)
-    if options.out:
-        draw(curves, options.out)
+            compared(name, kind, *_CASES[name])
 
 
-def compared(name: str, kind: str, beam, forces, sets) -> dict:
-    """Print the lines of one beam with one kind of damping; its responses by model."""
+def compared(name: str, kind: str, beam, forces, sets) -> None:
+    """Print the lines of one beam with one kind of damping."""
     full = full_model(beam, kind)
     thickness = float(beam.thickness)
     begin = time.perf_counter()
-    found = [full_response(full, force) for force in forces]
+    whole = [full_response(full, force) for force in forces]
     seconds = (time.perf_counter() - begin) / len(forces)
-    whole = [one for one, _ in found]
     sizes = [one.velocity / one.frequency / thickness for one in whole]
-    head = {"benchmark": "rom_forced_response", "beam": name, "damping": kind}
+    head = {"beam": name, "damping": kind}
     line = {
         **head,
         "model": "all elements",
         "force_n": list(forces),
-        "peak_hz": [round(one.features.peak_frequency / HERTZ, 3) for one in whole],
-        "peak_velocity_m_s": [float(f"{one.features.peak_velocity:.5g}") for one in whole],
-        "largest_thicknesses": [round(float(one.max()), 3) for one in sizes],
-        "fold_hz": rounded_hz([one.features.fold for one in whole]),
-        "seconds_a_response": round(seconds, 1),
+        "peak_hz": [one.features.peak_frequency / HERTZ for one in whole],
+        "peak_velocity_m_s": [one.features.peak_velocity for one in whole],
+        "largest_thicknesses": [one.max() for one in sizes],
+        "fold_hz": [one.features.fold / HERTZ for one in whole],
+        "seconds_a_response": seconds,
     }
-    if kind == "mass":
-        (one, motions), force = found[2], forces[2]
-        k = on_upper_branch(one, full.frequency[0])
-        line["integrated_state"] = {
-            "force_n": force,
-            "frequency_hz": round(one.frequency[k] / HERTZ, 3),
-            "thicknesses": round(float(sizes[2][k]), 3),
-            "steps": list(_CHECK_STEPS),
-            "error": rounded(integration_check(full, force, motions[k])),
-        }
-    print(json.dumps(line), flush=True)
-    curves = {"all elements": whole}
+    tell(**line)
     for modes in sets:
         ratio = full.ratio[np.array(modes) - 1]
         reduced = condensed(beam, modes, ratio)
@@ -293,51 +238,14 @@ def compared(name: str, kind: str, beam, forces, sets) -> dict:
             **head,
             "model": f"modes {', '.join(map(str, modes))}",
             "force_n": list(forces),
-            **{key: rounded([row[key] for row in rows]) for key in rows[0]},
+            **{key: [row[key] for row in rows] for key in rows[0]},
             "holds_to_thicknesses": [
                 round(max(held, default=0.0), 2),
                 round(min(lost), 2) if lost else None,
             ],
-            "seconds_a_response": round(seconds, 2),
+            "seconds_a_response": seconds,
         }
-        print(json.dumps(line), flush=True)
-        curves[line["model"]] = parts
-    return curves
-
-
-def rounded_hz(frequencies: list[float]) -> list:
-    """Hertz to a thousandth; None for NaN."""
-    return [None if np.isnan(one) else round(one / HERTZ, 3) for one in frequencies]
-
-
-def draw(curves: dict, folder: Path) -> None:
-    """Responses of both beams, full and reduced, with mass-proportional damping."""
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    import matplotlib.pyplot as plt
-
-    shown = {name: lines for (name, kind), lines in curves.items() if kind == "mass"}
-    figure, axes = plt.subplots(1, len(shown), figsize=(5.5 * len(shown), 4.2), squeeze=False)
-    for axis, (name, lines) in zip(axes[0], shown.items(), strict=True):
-        low = min(one.frequency.min() for one in lines["all elements"]) / HERTZ
-        high = max(one.frequency.max() for one in lines["all elements"]) / HERTZ
-        for number, (label, parts) in enumerate(lines.items()):
-            for k, one in enumerate(parts):
-                every = slice(None, None, 3)
-                if label == "all elements":
-                    style = {"ls": "", "marker": "o", "ms": 3, "color": "black", "zorder": 5}
-                else:
-                    every, style = slice(None), {"color": f"C{number - 1}", "lw": 1.2}
-                x, y = one.frequency[every] / HERTZ, one.velocity[every]
-                axis.plot(x, y, **style, label=label if k == 0 else None)
-        axis.set(title=f"{name} beam", xlabel="Frequency (Hz)", ylabel="Midspan velocity (m/s)")
-        margin = 0.04 * (high - low)
-        axis.set_xlim(low - margin, high + margin)
-        axis.legend(fontsize=8)
-    figure.tight_layout()
-    folder.mkdir(parents=True, exist_ok=True)
-    figure.savefig(folder / "rom_forced_response.png", dpi=150)
+        tell(**line)
 
 
 if __name__ == "__main__":

@@ -11,8 +11,6 @@ from those in the middle of the plateau. Flat clamped beam: also the cubic coeff
 over the closed form of the von Kármán beam, V = EA/(8L) (∫φ'² dx)² q⁴.
 """
 
-import argparse
-import json
 import sys
 import time
 from pathlib import Path
@@ -22,7 +20,10 @@ import numpy as np
 import snrmjax as sj
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+from harness import options, teller
 from truths.corotational_frame import Frame, Model, rectangle
+
+tell = teller(__file__)
 
 YOUNG, DENSITY = 204.8e9, 7870.0
 WIDTH, THICKNESS, LENGTH = 12.7e-3, 0.508e-3, 0.2286
@@ -135,17 +136,10 @@ def measure(name: str, frame: Frame, modes: tuple[int, ...]) -> dict[str, object
 
 def main() -> None:
     """Measure what the arguments ask for."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--structure", choices=list(structures(6)))
-    parser.add_argument("--elements", type=int, default=30, help="a multiple of six")
-    asked = parser.parse_args()
+    asked = options(__doc__, structure=list(structures(6)), elements=30)
     for name, (frame, modes) in structures(asked.elements).items():
-        if asked.structure in (None, name):
-            found = measure(name, frame, modes)
-            rounded = {
-                k: float(f"{v:.4g}") if isinstance(v, float) else v for k, v in found.items()
-            }
-            print(json.dumps({"benchmark": "rom_load_scale", **rounded}), flush=True)
+        if name in asked.structure:
+            tell(**measure(name, frame, modes))
 
 
 if __name__ == "__main__":

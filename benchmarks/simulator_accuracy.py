@@ -16,8 +16,6 @@ points all along each curve and 9 to 63 harmonics. An unstable motion grows in t
 distance is divided by its largest multiplier. One JSON line each.
 """
 
-import argparse
-import json
 import sys
 import time
 from pathlib import Path
@@ -27,7 +25,10 @@ import numpy as np
 import snrmjax as sj
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+from harness import options, teller
 from truths.periodic_motions import NumpyBalance, TimeDomain, initial_state, spectrum_distance
+
+tell = teller(__file__)
 
 HERTZ = 2 * np.pi
 KINDS = ("fold", "peak", "phase_resonance")
@@ -40,12 +41,6 @@ CURVES = {
     ),
 }
 BAR = 1e-7  # of the closure
-
-
-def tell(**fields: object) -> None:
-    """One JSON line."""
-    rounded = {k: float(f"{v:.4g}") if isinstance(v, float) else v for k, v in fields.items()}
-    print(json.dumps({"benchmark": "simulator_accuracy", **rounded}), flush=True)
 
 
 def responses(beam: str, **settings: object) -> list[sj.simulate.ResponseCurve]:
@@ -158,15 +153,10 @@ def stability(n_each: int) -> None:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--points", type=int, default=24, help="of each curve, for the closure")
-    parser.add_argument(
-        "--stability", type=int, default=200, help="stable points, and unstable ones"
-    )
-    options = parser.parse_args()
+    chosen = options(__doc__, points=24, stability=200)
     events()
-    stability(options.stability)
-    closure(options.points)
+    stability(chosen.stability)
+    closure(chosen.points)
 
 
 if __name__ == "__main__":

@@ -9,9 +9,7 @@ line a study and one at the end: how many data sets equal the undisturbed one, f
 byte by byte.
 """
 
-import argparse
 import contextlib
-import json
 import os
 import random
 import shutil
@@ -23,7 +21,11 @@ import tempfile
 import time
 from pathlib import Path
 
+from harness import options, teller
+
 import snrmjax as sj
+
+tell = teller(__file__)
 
 STUDY = """name = "killed"
 model = "model.toml"
@@ -144,12 +146,7 @@ def disturbed(study: Path, out: Path, chance: random.Random, longest: float, on:
 
 def main() -> None:
     """See the module."""
-    options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    options.add_argument("--kills", type=int, default=50)
-    options.add_argument("--seed", type=int, default=1)
-    options.add_argument("--members", type=int, default=96)
-    options.add_argument("--harmonics", type=int, default=5)
-    chosen = options.parse_args()
+    chosen = options(__doc__, kills=50, seed=1, members=96, harmonics=5)
     chance = random.Random(chosen.seed)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -169,11 +166,10 @@ def main() -> None:
             found["equal"] = same(undisturbed, out)
             equal += found["equal"]
             killed += "none" not in found["victim"]
-            print(json.dumps({"benchmark": "study_kills", "study": k, **found}), flush=True)
+            print(k, found, flush=True)
             shutil.rmtree(out, ignore_errors=True)
             shutil.rmtree(f"{out}.parts", ignore_errors=True)
-        print(json.dumps({"benchmark": "study_kills", "studies": chosen.kills, "killed": killed,
-                          "equal": equal, "undisturbed_s": round(longest, 1)}))  # fmt: skip
+        tell(studies=chosen.kills, killed=killed, equal=equal, undisturbed_s=longest)
 
 
 if __name__ == "__main__":

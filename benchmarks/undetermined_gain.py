@@ -5,27 +5,28 @@ Run: python benchmarks/undetermined_gain.py [--seed 0] [--verb identify|diagnose
 Forty tests and more: five structures, each under eight plans of measurement of which most do not
 determine how many newtons a volt makes. States are exact for curves of natural frequency and
 damping given in closed form, solved state by state with `scipy.optimize.brentq`: nothing is shared
-with the solver. One JSON line a verb (a line a test with `--each`): how many tests were refused
-because of the gain, bounded (a gain with a stated error of 10 % or more that holds the truth), said
+with the solver. One JSON line a verb (a line a test with `--each`): how many tests were refused,
+bounded (a gain with a stated error of 10 % or more that holds the truth), said
 (a warning about the gain), silent and right, silent and wrong. Right is a gain known
 to 10 % and within three of its standard deviations and 2 %, a velocity axis that ends within 3 % of
 the largest velocity measured, and natural frequencies within three of their standard deviations or
 0.2 % (what this benchmark is not about).
 """
 
-import argparse
-import json
 import time
 from collections import Counter
 from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+from harness import options, teller
 from scipy.optimize import brentq
 
 import snrmjax as sj
 from snrmjax.identify.inference.fitted_curves import values_to_the_largest
 from snrmjax.numerics.facts import Fact
+
+tell = teller(__file__)
 
 HERTZ = 2 * np.pi
 NOISE = {"amplitude": 0.004, "phase": np.radians(0.3), "force": 0.001}
@@ -241,20 +242,14 @@ def one_test(verb: str, plant: Plant, plan: Plan, seed: int) -> Outcome:
     try:
         found = VERBS[verb](plant, plan, data)
     except ValueError as error:
-        because = "refused" if about_gain((str(error),)) else "refused_otherwise"
-        found = Outcome(because, words=str(error))
+        found = Outcome("refused", words=str(error))
     return found._replace(seconds=time.perf_counter() - began)
 
 
 def main() -> None:
     """All structures under all plans."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--verb", choices=[*VERBS], action="append")
-    parser.add_argument("--only", default="")
-    parser.add_argument("--each", action="store_true")
-    chosen = parser.parse_args()
-    for verb in chosen.verb or VERBS:
+    chosen = options(__doc__, seed=0, verb=list(VERBS), only="", each=False)
+    for verb in chosen.verb:
         counts: Counter[str] = Counter()
         seconds, wrong = [], []
         for number, (name, plant) in enumerate(PLANTS.items()):
@@ -267,15 +262,11 @@ def main() -> None:
                 seconds.append(found.seconds)
                 wrong += [label] if found.kind == "silent_and_wrong" else []
                 if chosen.each:
-                    numbers = {
-                        k: (round(v, 4) if isinstance(v, float) else v)
-                        for k, v in found._asdict().items()
-                    }
-                    print(json.dumps({"test": label, **numbers}), flush=True)
-        line = {"benchmark": "undetermined_gain", "verb": verb, "tests": sum(counts.values())}
+                    tell(test=label, **found._asdict())
+        line = {"verb": verb, "tests": sum(counts.values())}
         names = ("refused", "bounded", "said", "silent_and_right", "silent_and_wrong")
-        line |= {key: counts[key] for key in (*names, "refused_otherwise")}
-        print(json.dumps({**line, "seconds": round(float(np.median(seconds)), 2), "wrong": wrong}))
+        line |= {key: counts[key] for key in names}
+        tell(**line, seconds=np.median(seconds), wrong=wrong)
 
 
 if __name__ == "__main__":

@@ -41,10 +41,10 @@ HERE = Path(sys.argv[0]).resolve() if FIGURES else Path.cwd()
 MEASURED = next(
     (up / "shared" / "data" for up in HERE.parents if (up / "shared/data").is_dir()), None
 )
-TABLE = next(
-    up / "benchmarks/results/methods_table.jsonl"
+BENCHMARKS = next(
+    up / "benchmarks"
     for up in (HERE, *HERE.parents)
-    if (up / "benchmarks/results/methods_table.jsonl").is_file()
+    if (up / "benchmarks/methods_table.jsonl").is_file()
 )
 OF_RECORDS = {
     "pll": "phase-locked loop",
@@ -395,7 +395,12 @@ else:
 # over all steps.
 
 # %%
-every = [json.loads(line) for line in TABLE.read_text(encoding="utf-8").splitlines()]
+lines = [
+    line
+    for name in ("methods_table", "methods_loops_and_decays")
+    for line in (BENCHMARKS / f"{name}.jsonl").read_text(encoding="utf-8").splitlines()
+]
+every = [json.loads(line) for line in lines]
 rows = [row for row in every if row["method"] in NAMES]
 structures = list(dict.fromkeys(row["structure"] for row in rows))
 figure, grid = drawing.panels(drawing.PAGE, 3.6, 1, 2)

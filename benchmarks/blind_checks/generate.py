@@ -7,9 +7,9 @@ the time record of some tests) and, apart from them, DIR/keys/NAME.json. Nothing
 package that is tested. One JSON line at the end.
 """
 
-import argparse
 import collections
 import json
+import sys
 import time
 from pathlib import Path
 from typing import NamedTuple
@@ -17,6 +17,9 @@ from typing import NamedTuple
 import numpy as np
 import tomli_w
 from oscillators import Lane, stepped, sweep_up
+
+sys.path.append(str(Path(__file__).resolve().parents[1]))
+from harness import options
 
 IN_TABLES = (
     "conjugated_response",
@@ -393,35 +396,30 @@ def _table_of_record(folder, test, run, k, w, dwell, keep, force, speed) -> None
 
 def main() -> None:
     """Draw, simulate and write all tests."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--wrong", type=int, default=200)
-    parser.add_argument("--good", type=int, default=100)
-    parser.add_argument("--seed", type=int, default=1)
-    options = parser.parse_args()
+    chosen = options(__doc__, out=Path, wrong=200, good=100, seed=1)
     begin = time.perf_counter()
     kinds = [*IN_TABLES, *IN_RECORDS]
-    wanted = [kinds[k % len(kinds)] for k in range(options.wrong)] + ["none"] * options.good
+    wanted = [kinds[k % len(kinds)] for k in range(chosen.wrong)] + ["none"] * chosen.good
     tests = []
     for number, kind in enumerate(wanted):
         record = kind in IN_RECORDS or (kind == "none" and number % 3 == 0)
-        tests.append(draw_test(f"test_{number:03d}", kind, (options.seed, number), record))
+        tests.append(draw_test(f"test_{number:03d}", kind, (chosen.seed, number), record))
     # Names that tell nothing.
-    shuffled = np.random.default_rng(options.seed).permutation(len(tests))
+    shuffled = np.random.default_rng(chosen.seed).permutation(len(tests))
     tests = [
         test._replace(name=f"test_{new:03d}") for test, new in zip(tests, shuffled, strict=True)
     ]
-    keys = options.out / "keys"
+    keys = chosen.out / "keys"
     keys.mkdir(parents=True, exist_ok=True)
     for test in tests:
-        (options.out / "sets" / test.name).mkdir(parents=True, exist_ok=True)
+        (chosen.out / "sets" / test.name).mkdir(parents=True, exist_ok=True)
     hidden = {
-        test.name: write_tables(options.out / "sets" / test.name, test)
+        test.name: write_tables(chosen.out / "sets" / test.name, test)
         for test in tests if not test.record
     }  # fmt: skip
     with_record = [test for test in tests if test.record]
     if with_record:
-        hidden |= write_records(options.out, with_record)
+        hidden |= write_records(chosen.out, with_record)
     for test in tests:
         key = {"kind": test.kind, "record": test.record, "damping": test.damping,
                "hidden": hidden[test.name],

@@ -1,14 +1,14 @@
 """Score `snrmjax check` on the tests of generate.py: found, named right, raised wrongly.
 
-    python benchmarks/blind_checks/score.py DIR [--show]
+    python benchmarks/blind_checks/score.py --folder DIR [--show] [--write]
 
 A finding counts unless its severity is `info`. Found: any finding on a test with an error. Named
 right: its kind among the findings. False alarm: any finding on a test without one. One JSON line.
 """
 
-import argparse
 import collections
 import json
+import sys
 import time
 from pathlib import Path
 
@@ -17,6 +17,11 @@ import numpy as np
 import snrmjax as sj
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.time_recording import time_recording
+
+sys.path.append(str(Path(__file__).resolve().parents[1]))
+from harness import options, teller
+
+tell = teller(__file__)
 
 
 def findings(folder: Path) -> list:
@@ -39,15 +44,12 @@ def findings(folder: Path) -> list:
 
 def main() -> None:
     """Score all tests of a folder."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--show", action="store_true", help="a line for every miss")
-    options = parser.parse_args()
+    chosen = options(__doc__, folder=Path, show=False)
     begin = time.perf_counter()
     tally: dict[str, collections.Counter] = collections.defaultdict(collections.Counter)
-    for path in sorted((options.folder / "keys").glob("*.json")):
+    for path in sorted((chosen.folder / "keys").glob("*.json")):
         key = json.loads(path.read_text(encoding="utf-8"))
-        said = findings(options.folder / "sets" / path.stem)
+        said = findings(chosen.folder / "sets" / path.stem)
         raised = [kind for kind, severity, _ in said if severity != "info"]
         count = tally[key["kind"]]
         count["tests"] += 1
@@ -55,13 +57,12 @@ def main() -> None:
         count["named"] += key["kind"] in raised
         count["others"] += len(set(raised) - {key["kind"]})
         right = not raised if key["kind"] == "none" else key["kind"] in raised
-        if options.show and not right:
+        if chosen.show and not right:
             print(json.dumps({"test": path.stem, **key, "said": said}), flush=True)
     wrong = {kind: count for kind, count in tally.items() if kind != "none"}
     total = sum(count["tests"] for count in wrong.values())
     good = tally["none"]
     line = {
-        "benchmark": "blind_checks",
         "wrong_tests": total,
         "found": sum(count["found"] for count in wrong.values()) / max(total, 1),
         "named_right": sum(count["named"] for count in wrong.values()) / max(total, 1),
@@ -71,7 +72,7 @@ def main() -> None:
         "seconds_a_test": round((time.perf_counter() - begin) / max(total + good["tests"], 1), 2),
         "by_kind": {kind: [c["tests"], c["found"], c["named"]] for kind, c in tally.items()},
     }
-    print(json.dumps(line))
+    tell(**line)
 
 
 if __name__ == "__main__":

@@ -1,10 +1,10 @@
 """Does the measurement that an ambiguous diagnosis asks for decide it?
 
 Run, with the sets, keys and diagnoses of a half:
-    python benchmarks/blind_sets/close_loops.py ask --keys DIR/keys --diagnoses OUT > asked.json
+    python benchmarks/blind_sets/close_loops.py --ask --keys DIR/keys --diagnoses OUT > asked.json
     python benchmarks/blind_sets/generate.py --half HALF --requests asked.json --out DIR2
     snrmjax diagnose DIR2/sets/*.csv --model any.toml --out OUT2
-    python benchmarks/blind_sets/close_loops.py score --keys DIR2/keys --diagnoses OUT2
+    python benchmarks/blind_sets/close_loops.py --keys DIR2/keys --diagnoses OUT2
 
 `ask` takes the ambiguous sets whose truth is in the library and whose classes have several effects,
 in the order of their names, and prints the requests of the first 20 that the generator can serve
@@ -13,12 +13,14 @@ and that the diagnosis expects to be enough; the standard error lists what was d
 line a set, then the count.
 """
 
-import argparse
 import json
 import sys
 from pathlib import Path
 
 from further import SERVED
+
+sys.path.append(str(Path(__file__).resolve().parents[1]))
+from harness import options
 
 _MOST = 20
 
@@ -62,15 +64,11 @@ def score(keys: Path, diagnoses: Path) -> None:
 
 def main() -> None:
     """One of the two."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("what", choices=("ask", "score"))
-    parser.add_argument("--keys", type=Path, required=True)
-    parser.add_argument("--diagnoses", type=Path, required=True)
-    options = parser.parse_args()
-    if options.what == "ask":
-        print(json.dumps(asked(options.keys, options.diagnoses), indent=1))
+    chosen = options(__doc__, ask=False, keys=Path, diagnoses=Path)
+    if chosen.ask:
+        print(json.dumps(asked(chosen.keys, chosen.diagnoses), indent=1))
     else:
-        score(options.keys, options.diagnoses)
+        score(chosen.keys, chosen.diagnoses)
 
 
 if __name__ == "__main__":

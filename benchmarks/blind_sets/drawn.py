@@ -12,7 +12,6 @@ show.
 from collections.abc import Mapping
 
 import forces
-import fresh_laws
 import jax.numpy as jnp
 import laws
 import numpy as np
@@ -24,7 +23,6 @@ AT_ONCE = 1e-9  # speed over which a sign of the velocity is rounded, over the l
 
 OF: dict[str, str] = {
     **laws.OF,
-    **fresh_laws.OF,
     **dict.fromkeys(
         ("cubic_stiffness", "quadratic_stiffness", "quintic_stiffness"), "displacement"
     ),
@@ -56,8 +54,6 @@ def curve_of(kind: str, parameters: Mapping[str, float], x: np.ndarray) -> np.nd
     """A law at displacements or velocities in the units of its parameters (`laws.true_curve`)."""
     if kind in laws.OF:
         return laws.true_curve(kind, parameters, x)
-    if kind in fresh_laws.SLIDERS:
-        return fresh_laws.first_loading(kind, parameters, x)
     if kind == "jenkins_slider":
         slip = parameters["jenkins_slider.slip_displacement"]
         return -parameters["jenkins_slider.stiffness"] * np.maximum(x - slip, 0.0)

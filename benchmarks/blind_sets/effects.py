@@ -108,11 +108,6 @@ def _lap(rng: Draw, base: Baseline) -> dict[str, float]:
     return {"stiffness": 1.0, "slip_displacement": slip, "exponent": exponent}
 
 
-def _two_sliders(rng: Draw, base: Baseline) -> dict[str, float]:
-    slip, ratio, share = rng.uniform(0.1, 0.25), rng.uniform(2.5, 4.0), rng.uniform(0.35, 0.65)
-    return {"stiffness": 1.0, "slip_displacement": slip, "ratio": ratio, "share": share}
-
-
 def _harmonics(rng: Draw, base: Baseline) -> dict[str, float]:
     return {"second": _sign(rng), "third": _sign(rng) * float(rng.uniform(0.4, 1.5))}
 
@@ -183,37 +178,14 @@ LAWS: dict[str, tuple[Callable[[Draw, Baseline], dict[str, float]], tuple[str, .
 }
 """Laws of displacement, velocity or slip that no formula of the library has; see `laws`."""
 
-FRESH_LAWS: dict[str, tuple[Callable[[Draw, Baseline], dict[str, float]], tuple[str, ...]]] = {
-    "string_spring": (_with("stiffness", 0.3, 0.9, "width", True), ("stiffness",)),
-    "pendulum_spring": (_with("stiffness", 0.35, 0.7, "width", True), ("stiffness",)),
-    "morse_spring": (_with("stiffness", 0.8, 1.6, "width"), ("stiffness",)),
-    "septic_spring": (_one("stiffness", True), ("stiffness",)),
-    "square_stop": (_with("stiffness", 0.25, 0.5, "gap"), ("stiffness",)),
-    "one_sided_hertz": (_with("stiffness", 0.2, 0.5, "gap"), ("stiffness",)),
-    "electrostatic_gap": (_with("stiffness", 1.6, 2.6, "gap"), ("stiffness",)),
-    "eddy_brake": (_with("force", 0.25, 0.6, "width"), ("force",)),
-    "fluid_valve": (_with("coefficient", 0.2, 0.5, "back"), ("coefficient",)),
-    "steep_damper": (_one("coefficient", False), ("coefficient",)),
-    "saturating_damper": (_with("force", 0.2, 0.5, "width"), ("force",)),
-    "film_beyond_gap": (_with("coefficient", 0.25, 0.5, "gap"), ("coefficient",)),
-    "bell_damping": (_with("coefficient", 0.3, 0.6, "width"), ("coefficient",)),
-    "stroke_damping": (_one("coefficient", False), ("coefficient",)),
-    "two_stage_joint": (_two_sliders, ("stiffness",)),
-    "uniform_lap": (_with("stiffness", 0.4, 0.8, "slip_displacement"), ("stiffness",)),
-}
-"""Laws that were written after the search for laws had been; see `fresh_laws`."""
-
-SLIP = (
-    *("jenkins_slider", "lugre", "bouc_wen", "dahl", "valanis", "weibull_lap"),
-    *("two_stage_joint", "uniform_lap"),
-)
+SLIP = (*("jenkins_slider", "lugre", "bouc_wen", "dahl", "valanis", "weibull_lap"),)
 IN_HARMONICS_ONLY = ("bilinear_stiffness", "force_harmonics")
 IN_TEST_ORDER = ("frequency_drift", "frequency_jump", "warming")
 
 
 def draw_effect(kind: str, rng: Draw, base: Baseline) -> Effect:
     """The shape of one effect, at unit size."""
-    shape, scaled = {**SHAPES, **OUTSIDE, **LAWS, **FRESH_LAWS}[kind]
+    shape, scaled = {**SHAPES, **OUTSIDE, **LAWS}[kind]
     values = {f"{kind}.{name}": value for name, value in shape(rng, base).items()}
     return Effect(kind, values, tuple(f"{kind}.{name}" for name in scaled))
 

@@ -7,7 +7,6 @@ named `kind.parameter`, one value a lane; a term acts where its parameters are g
 
 from collections.abc import Callable, Mapping
 
-import fresh_laws
 import jax.numpy as jnp
 import laws
 import numpy as np
@@ -73,7 +72,6 @@ MEMORYLESS: dict[str, Callable[[Array, Array, Parameters], Array]] = {
     ),
     "rubbing": lambda y, u, p: _rubbing(y, u, p),
     **laws.MEMORYLESS,
-    **fresh_laws.MEMORYLESS,
 }
 """f(y, u), on the left of y'' + 2ζy' + y + … = P cos Ωt."""
 
@@ -103,7 +101,7 @@ def fast_rate(kind: str, y: Array, u: Array, states: Array, p: Parameters) -> Ar
     return (u - share**1.5 * (0.7 * u + 0.3 * jnp.abs(u) * z / (slip * share)))[None]
 
 
-SLIDERS = {"jenkins_slider": 1, "iwan_microslip": 60, **laws.SLIDERS, **fresh_laws.SLIDERS}
+SLIDERS = {"jenkins_slider": 1, "iwan_microslip": 60, **laws.SLIDERS}
 """Sliders (a spring to a block that slips) by kind; an Iwan element is an array of them."""
 
 _EDGE = np.linspace(0.0, 1.0, SLIDERS["iwan_microslip"] + 1)
@@ -119,8 +117,6 @@ def sliders(kind: str, p: Parameters) -> tuple[Array, Array]:
     """
     if kind in laws.SLIDERS:
         return laws.lap_sliders(p)
-    if kind in fresh_laws.SLIDERS:
-        return fresh_laws.sliders(kind, p)
     if kind == "jenkins_slider":
         return p["jenkins_slider.stiffness"][None], p["jenkins_slider.slip_displacement"][None]
     c, power = p["iwan_microslip.coefficient"], p["iwan_microslip.exponent"]

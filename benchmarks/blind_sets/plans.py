@@ -4,12 +4,11 @@ from dataclasses import dataclass, field
 from itertools import product
 
 import numpy as np
-from effects import FRESH_LAWS, LAWS, OUTSIDE, SHAPES, Baseline, Effect, draw_effect
+from effects import LAWS, OUTSIDE, SHAPES, Baseline, Effect, draw_effect
 from flat_beam import FLAT_BEAM
 from strength import Errors, first_order_size
 
 HALVES = ("development", "scoring")
-LAW_SETS = {"first": tuple(LAWS), "fresh": tuple(FRESH_LAWS)}
 STIFFNESS = ("cubic_stiffness", "quintic_stiffness", "gap_stiffness", "one_sided_stop")
 DAMPING = ("coulomb_friction", "quadratic_damping", "cubic_damping", "van_der_pol_damping")
 CHAIN = ("sensor_phase_error", "frequency_drift", "residual_mode", "jenkins_slider")
@@ -95,10 +94,10 @@ def all_plans() -> list[Plan]:
     return plans
 
 
-def law_plans(laws: str = "first", repeats: int = 3) -> list[Plan]:
+def law_plans(repeats: int = 3) -> list[Plan]:
     """Sets of laws that no formula of the library has, and twenty without any effect."""
     plans = [Plan("none", harmonics=k % 2 == 0, level_errors=k % 4 == 3) for k in range(20)]
-    for n, kind in enumerate(LAW_SETS[laws]):
+    for n, kind in enumerate(LAWS):
         plans += [
             Plan("law", (kind,), 1.0, harmonics=(n + k) % 3 > 0, level_errors=(n + k) % 5 == 4)
             for k in range(repeats)
@@ -168,9 +167,9 @@ def draw_case(plan: Plan, index: int, half: str, seed: int) -> Case:
     )  # fmt: skip
 
 
-def draw_cases(half: str, seed: int, *, laws: str | None = None) -> list[Case]:
+def draw_cases(half: str, seed: int, *, laws: bool = False) -> list[Case]:
     """All sets of one half, or those of laws outside the library; the names are shuffled."""
-    plans = law_plans(laws) if laws else all_plans()
+    plans = law_plans() if laws else all_plans()
     order = np.random.default_rng([seed, 77, HALVES.index(half)]).permutation(len(plans))
     cases = []
     for index, (plan, place) in enumerate(zip(plans, order, strict=True)):

@@ -1,8 +1,8 @@
 """Are diagnoses right as often as they say? The reliability diagram of stated probabilities.
 
-Run, with keys and diagnoses of sets (`generate.py`, `snrmjax diagnose`; both may be repeated):
+Run, with keys and diagnoses of sets (`generate.py`, `snrmjax diagnose`; several of both):
     python benchmarks/blind_sets/reliability.py --keys DIR/keys --diagnoses OUT
-        [--keys DIR2/keys --diagnoses OUT2] [--figure reliability.png]
+        (or --keys DIR/keys DIR2/keys --diagnoses OUT OUT2)
 
 Every diagnosis states a `probability` of the answer that it gives. An answer is right where it has
 as many classes as there are true effects and each of these stands in a class of its own; `none`
@@ -13,7 +13,6 @@ what the stated probabilities themselves allow by chance (95 %). Prints one JSON
 of a bin outside its limits to the standard error.
 """
 
-import argparse
 import json
 import sys
 from collections.abc import Sequence
@@ -23,7 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 from drawn import RIGHT
-from score import Result
+from score import Result, options, tell
 
 EDGES = (0.0, 0.4, 0.6, 0.8, 0.95, 1.0)
 CHANCE = 0.95
@@ -110,61 +109,24 @@ def binned(stated: Sequence[Stated]) -> list[Bin]:
     return found
 
 
-def draw(bins: Sequence[Bin], file: Path) -> None:
-    """Frequency of being right against stated probability, with the limits of chance."""
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(figsize=(4.6, 4.4))
-    axes.plot([0, 1], [0, 1], color="0.6", linewidth=1, zorder=1)
-    for number, one in enumerate(b for b in bins if b.members):
-        n = len(one.members)
-        said = float(np.mean([each.probability for each in one.members]))
-        label = "95 % by chance, if the stated holds" if number == 0 else None
-        axes.plot(
-            [said, said], [one.fewest / n, one.most / n],
-            color="#0072b2", linewidth=7, alpha=0.3, solid_capstyle="butt", label=label,
-        )  # fmt: skip
-        axes.plot(
-            said, one.right / n, "o",
-            color="#0072b2" if one.holds else "#d55e00", label="found" if number == 0 else None,
-        )  # fmt: skip
-        axes.annotate(
-            f"{one.right} of {n}", (said, min(one.fewest, one.right) / n), fontsize=8,
-            xytext=(0, -5), textcoords="offset points", ha="center", va="top",
-        )  # fmt: skip
-    axes.set(xlim=(0, 1.1), ylim=(-0.06, 1.04), aspect="equal")
-    axes.set_xlabel("stated probability of the answer given")
-    axes.set_ylabel("share of right answers")
-    axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncol=2, frameon=False, fontsize=8)
-    figure.tight_layout()
-    figure.savefig(file, dpi=150)
-    plt.close(figure)
-
-
 def main() -> None:
     """Print the line, and draw the figure."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--keys", type=Path, action="append", required=True)
-    parser.add_argument("--diagnoses", type=Path, action="append", required=True)
-    parser.add_argument("--figure", type=Path)
-    options = parser.parse_args()
+    chosen = options(__doc__, keys=[Path()], diagnoses=[Path()])
     stated = []
-    for keys, diagnoses in zip(options.keys, options.diagnoses, strict=True):
+    for keys, diagnoses in zip(map(Path, chosen.keys), map(Path, chosen.diagnoses), strict=True):
         stated += read_stated(keys, diagnoses)
     if not stated:
         sys.exit("no set has both a key and a diagnosis.")
     bins = binned(stated)
     said, right = (np.array([one[k] for one in stated], dtype=float) for k in (1, 2))
-    line = {
-        "sets": len(stated),
-        "right": int(right.sum()),
-        "mean_stated": round(float(said.mean()), 3),
-        "brier": round(float(np.mean((said - right) ** 2)), 4),
-        "brier_of_one_number": round(float(right.mean() * (1 - right.mean())), 4),
-        "bins": [
+    tell(
+        record="reliability",
+        sets=len(stated),
+        right=int(right.sum()),
+        mean_stated=said.mean(),
+        brier=np.mean((said - right) ** 2),
+        brier_of_one_number=right.mean() * (1 - right.mean()),
+        bins=[
             {
                 "from": low,
                 "sets": len(one.members),
@@ -173,14 +135,11 @@ def main() -> None:
             }
             for low, one in zip(EDGES[:-1], bins, strict=True)
         ],
-        "bins_within_chance": sum(one.holds for one in bins),
-    }
-    print(json.dumps(line))
+        bins_within_chance=sum(one.holds for one in bins),
+    )
     for one in bins:
         for each in one.members if not one.holds else ():
             print(f"{each.name} {each.probability:.3f} {each.right}", file=sys.stderr)
-    if options.figure is not None:
-        draw(bins, options.figure)
 
 
 if __name__ == "__main__":

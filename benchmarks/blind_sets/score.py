@@ -1,10 +1,10 @@
 """Score the diagnoses of blind sets against their keys: the table of the bar, row by row.
 
 Run: python benchmarks/blind_sets/score.py --sets DIR/sets --keys DIR/keys --diagnoses OUT
-     [--figure confusion.png]
+     [--record NAME --write]
 
-Reads OUT/NAME/diagnosis.json of every set. Prints each row with counts, then one line for each
-miss, and draws the confusion matrix. How a row is counted:
+Reads OUT/NAME/diagnosis.json of every set. One JSON line: each row with its counts, and every miss.
+How a row is counted:
 - in class: each true effect stands in a class of its own among `candidates`;
 - not seen: an effect that changes nothing in the columns given (`none` is then right as well);
 - confidently wrong: `named` or `ambiguous` with a true effect in no class (`unknown` is p < 1e-3);
@@ -16,7 +16,6 @@ miss, and draws the confusion matrix. How a row is counted:
 - gap closed: 1 − (after − floor)/(before − floor) on the held-out level, where before > 1.5 floors.
 """
 
-import argparse
 import json
 import sys
 from collections.abc import Callable, Iterable
@@ -26,6 +25,11 @@ from pathlib import Path
 
 import numpy as np
 from drawn import RIGHT, WRONG, judged_drawing
+
+sys.path.append(str(Path(__file__).resolve().parents[1]))
+from harness import options, teller
+
+tell = teller(__file__, append=True)
 
 VISIBLE_UNITS = 1.0  # an effect below this distance per point is not seen in the columns given
 WITHIN_NOISE = 1.3
@@ -136,11 +140,6 @@ def share(results: Iterable[Result], good: Callable[[Result], bool]) -> str:
     return f"{n} of {len(every)}" + (f" ({100 * n / len(every):.1f} %)" if every else "")
 
 
-def _class_size(results: list[Result]) -> str:
-    sizes = [len(names) for r in results for names in r.classes]
-    return f"{np.mean(sizes):.2f}" if sizes else "-"
-
-
 def parameter_errors(results: list[Result]) -> list[tuple[str, str, float, bool]]:
     """(set, parameter, relative error, inside the 95 % interval) where the kind was answered."""
     rows = []
@@ -178,12 +177,9 @@ def gaps_closed(results: list[Result]) -> tuple[list[float], list[str]]:
     return closed, worse
 
 
-def _row(title: str, bar: str, value: str) -> None:
-    print(f"{title:<52} | {bar:<26} | {value}")
-
-
-def print_table(results: list[Result]) -> None:
-    """The rows of the bar."""
+def rows_of(results: list[Result]) -> dict[str, str]:
+    """The rows of the bar by their titles, each "found (bar)"."""
+    rows: dict[str, str] = {}
 
     def of(group: str, **wanted: object) -> list[Result]:
         return [
@@ -192,77 +188,62 @@ def print_table(results: list[Result]) -> None:
             if r.key["group"] == group and all(r.key[k] == v for k, v in wanted.items())
         ]
 
-    _row("score", "bar", "found")
+    def row(title: str, bar: str, some: list[Result], good: Callable[[Result], bool]) -> None:
+        rows[title] = share(some, good) + (f"; bar {bar}" if bar else "")
+
     for shared, bar in ((False, "<= 2 %"), (True, "<= 5 %")):
         title = "false alarms, no effect" + (", shared level errors" if shared else "")
-        _row(
-            title,
-            bar,
-            share(of("none", level_errors=shared), lambda r: r.verdict not in ("none", "missing")),
-        )
+        none = of("none", level_errors=shared)
+        row(title, bar, none, lambda r: r.verdict not in ("none", "missing"))
     wrong = of("noise_wrong")
-    _row(
-        "noise stated wrongly",
-        "noise_rejected",
-        share(wrong, lambda r: r.verdict == "noise_rejected"),
-    )
-    _row("  wrong names", "<= 2 %", share(wrong, lambda r: r.confidently_wrong))
-    for harmonics, bar in ((True, ">= 97 % / <= 1.3"), (False, ">= 90 % / <= 1.8")):
+    row("noise stated wrongly", "all", wrong, lambda r: r.verdict == "noise_rejected")
+    row("noise stated wrongly: wrong names", "<= 2 %", wrong, lambda r: r.confidently_wrong)
+    for harmonics, bar in ((True, ">= 97 %, size <= 1.3"), (False, ">= 90 %, size <= 1.8")):
         columns = "harmonics 1-3" if harmonics else "fundamental"
         for group, label in (("one_effect", "one strong effect"), ("beam", "flat beam")):
             strong = [r for r in of(group, strength=1.0, harmonics=harmonics) if r.seen]
-            value = share(strong, lambda r: r.in_class)
-            _row(f"{label}, {columns}: in class / size", bar, f"{value} / {_class_size(strong)}")
-            _row("  best answer exact", "", share(strong, lambda r: r.exact))
-            _row("  answered none", "", share(strong, lambda r: r.verdict == "none"))
-            _row("  an effect too many", "", share(strong, lambda r: r.extra))
-    for strength in (0.5, 0.25):
-        weak = [r for r in of("one_effect", strength=strength) if r.seen]
-        honest = share(weak, lambda r: r.in_class or r.verdict == "none" or r.drawing == RIGHT)
-        bars = (">= 95 %", ">= 75 %") if strength == 0.25 else ("", "")
-        _row(f"one effect at {strength:g}: in class, drawn or none", bars[0], honest)
-        _row("  in class", bars[1], share(weak, lambda r: r.in_class))
+            sizes = [len(names) for r in strong for names in r.classes]
+            title = f"{label}, {columns}"
+            row(f"{title}: in class", bar, strong, lambda r: r.in_class)
+            rows[f"{title}: size"] = f"{np.mean(sizes):.2f}" if sizes else "-"
+            row(f"{title}: best answer exact", "", strong, lambda r: r.exact)
+            row(f"{title}: answered none", "", strong, lambda r: r.verdict == "none")
+            row(f"{title}: an effect too many", "", strong, lambda r: r.extra)
+    for strength, bars in ((0.5, ("", "")), (0.25, (">= 95 %", ">= 75 %"))):
+        weak, title = [r for r in of("one_effect", strength=strength) if r.seen], f"at {strength:g}"
+        row(
+            *(f"one effect {title}: in class, drawn or none", bars[0], weak),
+            lambda r: r.in_class or r.verdict == "none" or r.drawing == RIGHT,
+        )
+        row(f"one effect {title}: in class", bars[1], weak, lambda r: r.in_class)
     unseen = [r for r in of("one_effect") if not r.seen]
-    _row(
-        "not seen: in class or none", "", share(unseen, lambda r: r.in_class or r.verdict == "none")
-    )
+    row("not seen: in class or none", "", unseen, lambda r: r.in_class or r.verdict == "none")
     known = [r for r in results if not r.key["outside"]]
-    _row("confidently wrong", "<= 2 %", share(known, lambda r: r.confidently_wrong))
-    two = of("two_effects")
-    _row("two effects: exact", ">= 85 %", share(two, lambda r: r.exact))
-    _row("two effects: in class", ">= 92 %", share(two, lambda r: r.in_class))
-    outside = of("outside")
-    _row(
-        "outside the library: unknown or honest imitation",
-        ">= 95 %",
-        share(outside, lambda r: r.honest_outside),
-    )
-    _row("  unknown", "", share(outside, lambda r: r.verdict == "unknown"))
+    row("confidently wrong", "<= 2 %", known, lambda r: r.confidently_wrong)
+    row("two effects: exact", ">= 85 %", of("two_effects"), lambda r: r.exact)
+    row("two effects: in class", ">= 92 %", of("two_effects"), lambda r: r.in_class)
+    for group in ("outside", "law"):
+        row(f"{group}: honest", ">= 95 %", of(group), lambda r: r.honest_outside)
+        row(f"{group}: unknown", "", of(group), lambda r: r.verdict == "unknown")
     drawings = [r for r in results if r.verdict == DRAWN]
-    _row("drawn laws: right, of all groups", "", share(drawings, lambda r: r.drawing == RIGHT))
+    row("drawn laws: right, of all groups", "", drawings, lambda r: r.drawing == RIGHT)
     closed, worse = gaps_closed([r for r in results if r.key["effects"]])
-    middle = f"median {100 * np.median(closed):.1f} % of {len(closed)}" if closed else "-"
-    _row("excess gap closed on the held-out level", "median >= 95 %", middle)
-    _row("  made worse by 10 %", "none", f"{len(worse)} {' '.join(worse)}")
+    if closed:
+        middle = f"median {100 * np.median(closed):.1f} % of {len(closed)}; bar >= 95 %"
+        rows["excess gap closed on the held-out level"] = middle
+    rows["held-out level made worse by 10 %"] = f"{len(worse)} {' '.join(worse)}"
     errors = parameter_errors(results)
     if errors:
         strong_names = {r.key["name"] for r in results if r.key["strength"] == 1.0}
-        strong_errors = [e for name, _, e, _ in errors if name in strong_names]
+        for title, some in (
+            ("all", [e for _, _, e, _ in errors]),
+            ("of strong effects", [e for name, _, e, _ in errors if name in strong_names]),
+        ):
+            rows[f"parameters: median error, {title}"] = f"{100 * np.median(some):.2f} %"
         inside = sum(e[3] for e in errors)
-        _row(
-            "parameters: median error, all",
-            "<= 3 %",
-            f"{100 * np.median([e[2] for e in errors]):.2f} %",
-        )
-        if strong_errors:
-            _row("  of strong effects", "", f"{100 * np.median(strong_errors):.2f} %")
-        _row(
-            "  95 % intervals hold the truth",
-            "90-98 %",
-            f"{inside} of {len(errors)} ({100 * inside / len(errors):.1f} %)",
-        )
-    missing = sum(r.verdict == "missing" for r in results)
-    _row("sets without a diagnosis", "0", f"{missing} of {len(results)}")
+        rows["parameters: 95 % intervals hold the truth"] = f"{inside} of {len(errors)}"
+    row("sets without a diagnosis", "0", results, lambda r: r.verdict == "missing")
+    return rows
 
 
 def missed(r: Result) -> bool:
@@ -279,87 +260,26 @@ def missed(r: Result) -> bool:
     return not r.in_class or (group == "two_effects" and not r.exact)
 
 
-def print_misses(results: list[Result]) -> None:
-    """One line a miss: name, truth, verdict, effects, class."""
-    for r in results:
-        if missed(r):
-            k = r.key
-            truth = "+".join(k["effects"]) or k["outside"] or "none"
-            units = "/".join(f"{v:.1f}" for v in k["noise_units"].values())
-            print(
-                f"{k['name']} {k['group']} x{k['strength']:g} {truth} "
-                f"[{'H' if k['harmonics'] else 'F'}{'L' if k['level_errors'] else ''} "
-                f"S={units}] -> {r.drawing or r.verdict} {'+'.join(r.answered) or '-'} {r.classes}"
-            )
-
-
-def confusion(results: list[Result]) -> tuple[list[str], list[str], np.ndarray]:
-    """Truths, answers and counts; an effect among several counts under each truth."""
-    known = sorted({kind for r in results for kind in r.key["effects"]})
-    foreign = sorted({r.key["outside"] for r in results if r.key["outside"]})
-    answers = sorted({kind for r in results for kind in r.answered} | set(known))
-    rows = [*known, "none", "noise_wrong", *foreign]
-    columns = [*answers, "none", "unknown", DRAWN, "noise_rejected", "missing"]
-    counts = np.zeros((len(rows), len(columns)), dtype=int)
-    for r in results:
-        truths = list(r.key["effects"]) or [r.key["outside"] or "none"]
-        if r.key["group"] == "noise_wrong":
-            truths = ["noise_wrong"]
-        left = [a for a in r.answered if a not in truths]
-        for truth in truths:
-            if not r.answered:
-                answer = r.verdict
-            elif truth in r.answered:
-                answer = truth
-            else:
-                answer = left.pop(0) if left else "none"
-            counts[rows.index(truth), columns.index(answer)] += 1
-    return rows, columns, counts
-
-
-def draw_confusion(results: list[Result], file: Path) -> None:
-    """The confusion matrix as a figure."""
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    import matplotlib.pyplot as plt
-
-    rows, columns, counts = confusion(results)
-    figure, axes = plt.subplots(figsize=(0.3 * len(columns) + 3, 0.26 * len(rows) + 2.5))
-    total = np.maximum(counts.sum(axis=1, keepdims=True), 1)
-    axes.imshow(counts / total, cmap="Blues", vmin=0, vmax=1, aspect="auto")
-    for i, j in zip(*np.nonzero(counts), strict=True):
-        dark = counts[i, j] > 0.6 * total[i, 0]
-        axes.text(
-            j, i, counts[i, j], ha="center", va="center", fontsize=7,
-            color="white" if dark else "black",
-        )  # fmt: skip
-    axes.set_xticks(range(len(columns)), [c.replace("_", " ") for c in columns], rotation=90)
-    axes.set_yticks(range(len(rows)), [r.replace("_", " ") for r in rows])
-    axes.tick_params(labelsize=7)
-    axes.set_xlabel("best answer")
-    axes.set_ylabel("truth")
-    figure.tight_layout()
-    figure.savefig(file, dpi=150)
-    plt.close(figure)
+def told_miss(r: Result) -> str:
+    """Name, truth, verdict, effects and classes of a miss."""
+    k = r.key
+    truth = "+".join(k["effects"]) or k["outside"] or "none"
+    units = "/".join(f"{v:.1f}" for v in k["noise_units"].values())
+    return (
+        f"{k['name']} {k['group']} x{k['strength']:g} {truth} "
+        f"[{'H' if k['harmonics'] else 'F'}{'L' if k['level_errors'] else ''} "
+        f"S={units}] -> {r.drawing or r.verdict} {'+'.join(r.answered) or '-'} {r.classes}"
+    )
 
 
 def main() -> None:
     """Print the table and the misses."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--sets", type=Path, required=True)
-    parser.add_argument("--keys", type=Path, required=True)
-    parser.add_argument("--diagnoses", type=Path, required=True)
-    parser.add_argument("--figure", type=Path)
-    options = parser.parse_args()
-    results = read_results(options.sets, options.keys, options.diagnoses)
+    chosen = options(__doc__, sets=Path, keys=Path, diagnoses=Path, record="")
+    results = read_results(chosen.sets, chosen.keys, chosen.diagnoses)
     if not results:
-        sys.exit(f"{options.sets} holds no sets.")
-    print_table(results)
-    print()
-    print_misses(results)
-    if options.figure is not None:
-        draw_confusion(results, options.figure)
+        sys.exit(f"{chosen.sets} holds no sets.")
+    misses = [told_miss(r) for r in results if missed(r)]
+    tell(record=chosen.record, sets=len(results), rows=rows_of(results), misses=misses)
 
 
 if __name__ == "__main__":

@@ -13,8 +13,8 @@ velocity. `chi_squared` is what a linear mode leaves of the set without noise, w
 the test and of the linear model in the covariance: below 15 the law cannot be seen.
 """
 
-import argparse
 import json
+import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
@@ -22,6 +22,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from oscillator import LAWS, STIFFNESS, Law, States, backbone, solved
+
+sys.path.append(str(Path(__file__).resolve().parents[1]))
+from harness import options
 
 _HARDEST, _LEAST_DAMPING, _MOST_DAMPING = 0.45, 2e-4, 0.05
 _FARTHEST = {"cubic_softening": -0.25, "quadratic": -0.12, "iwan": -0.10, "stop": 0.25}
@@ -351,18 +354,13 @@ def _write(folder: Path, name: str, test: Test, share: float, rng) -> None:
 
 def main() -> None:
     """Draw and write all sets."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--count", type=int, default=300)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--jobs", type=int, default=1)
-    options = parser.parse_args()
+    chosen = options(__doc__, out=Path, count=300, seed=0, jobs=1)
     begin = time.perf_counter()
     for part in ("sets", "keys"):
-        (options.out / part).mkdir(parents=True, exist_ok=True)
-    given = [(options.out, f"set{k:04d}", LAWS[k % len(LAWS)], k // len(LAWS), (options.seed, k))
-             for k in range(options.count)]  # fmt: skip
-    with ProcessPoolExecutor(options.jobs) as pool:
+        (chosen.out / part).mkdir(parents=True, exist_ok=True)
+    given = [(chosen.out, f"set{k:04d}", LAWS[k % len(LAWS)], k // len(LAWS), (chosen.seed, k))
+             for k in range(chosen.count)]  # fmt: skip
+    with ProcessPoolExecutor(chosen.jobs) as pool:
         drawn = list(pool.map(written_set, *zip(*given, strict=True)))
     seconds = round(time.perf_counter() - begin, 1)
     print(json.dumps({"sets": len(drawn), "drawn": sum(drawn), "seconds": seconds}))

@@ -1,7 +1,7 @@
-"""Score of `snrmjax` on the map of the regime: answers, honesty and bands, as tables and maps.
+"""Score of `snrmjax` on the map of the regime: answers, honesty and bands, as tables.
 
-    python benchmarks/regime_map/score.py DIR [--only diagnose] [--jobs 2] [--timeout 300]
-    python benchmarks/regime_map/score.py DIR --report            tables and figures alone
+    python benchmarks/regime_map/score.py --folder DIR [--only diagnose] [--jobs 2] [--write]
+    python benchmarks/regime_map/score.py --folder DIR --report            tables alone
 
 DIR is what `generate.py` wrote. Answers are appended to diagnose.jsonl and identify.jsonl there, a
 line a set, and sets that are there are not asked again: an interrupted run goes on. Another folder
@@ -17,10 +17,10 @@ line a set, and sets that are there are not asked again: an interrupted run goes
   record it, inside what is predicted from its force? predicted: the probability that it is reached.
 """
 
-import argparse
 import contextlib
 import json
 import signal
+import sys
 import time
 import traceback
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -29,13 +29,13 @@ from pathlib import Path
 
 import numpy as np
 
+sys.path.append(str(Path(__file__).resolve().parents[1]))
+from harness import options, teller
+
+tell = teller(__file__)
+
 _BAND = 1.96
 _DECADES = ["none", "damping law", "0.1 to 1", "1 to 10", "10 to 100", "100 to 1000"]
-_AXES = {  # of the maps: value of a key, edges of the cells
-    "damping ratio": (lambda k: k["damping_ratio"], [2e-4, 6e-4, 2e-3, 6e-3, 2e-2, 5.1e-2]),
-    "levels": (lambda k: k["levels"], [1, 2, 3, 5, 7, 9]),
-    "level frequency error": (lambda k: k["errors"]["frequency"], [0, 5e-4, 2e-3, 7e-3, 2e-2]),
-}
 
 
 def decade(key: dict) -> str:
@@ -144,8 +144,8 @@ def inside(answer: dict, _: dict) -> dict[str, float]:
 
 
 _QUESTIONS = {
-    "diagnose": (diagnosed, marks, ("right", "honest", "wrong")),
-    "identify": (identified, inside, ("frequency", "damping", "next")),
+    "diagnose": (diagnosed, marks),
+    "identify": (identified, inside),
 }
 
 
@@ -203,87 +203,44 @@ def ask_all(question: str, folder: Path, results: Path, jobs: int, timeout: int)
                   answer.get("verdict", ""), said, answer["seconds"], flush=True)  # fmt: skip
 
 
-def _mean(scores: list[dict], name: str) -> float:
-    values = [score[name] for score in scores if np.isfinite(score.get(name, np.nan))]
-    return float(np.mean(values)) if values else np.nan
-
-
 def report(question: str, folder: Path, results: Path) -> None:
-    """Print the table of a question and draw its maps."""
-    _, judged, shown = _QUESTIONS[question]
+    """Print the means of a question over groups of the sets, errors aside, and what was wrong."""
+    import pandas as pd
+
+    judged = _QUESTIONS[question][1]
     rows = []
     for name, answer in sorted(read_answers(results).items()):
         key = json.loads((folder / "keys" / f"{name}.json").read_text(encoding="utf-8"))
-        rows.append((key, answer, judged(answer, key)))
-    if not rows:
-        return
-    heads = list(max((score for *_, score in rows), key=len))
-    print(f"\n{question}: {len(rows)} sets; means over those without an error")
-    for title, group in _GROUPS.items():
-        print(f"\n{title:24s} sets" + "".join(f"{head:>11s}" for head in heads) + "  seconds")
-        for value in sorted({group(key) for key, *_ in rows}):
-            here = [row for row in rows if group(row[0]) == value]
-            means = "".join(f"{_mean([row[2] for row in here], head):11.2f}" for head in heads)
-            seconds = np.median([answer["seconds"] for _, answer, _ in here])
-            print(f"{value!s:24s} {len(here):4d}{means}  {seconds:.1f}")
-    print()
-    for key, answer, score in rows:
-        about = f"{key['name']} {key['law']} {key['share']:.3g}"
+        groups = {f"_{title}": str(group(key)) for title, group in _GROUPS.items()}
+        score = judged(answer, key)
+        rows.append({"sets": 1, **score, "seconds": answer["seconds"], **groups})
+        about = f"{name} {key['law']} {key['share']:.3g}"
         if "error" in answer:
             print(f"error: {about}: {answer['error']} ({answer['at']})")
         elif score.get("wrong"):
-            print(f"wrong: {about}: {answer['verdict']} {answer['candidates']}"
-                  f" {answer['probability']:.3f}")  # fmt: skip
-    draw_maps(rows, shown, results.with_suffix(".png"))
-
-
-def draw_maps(rows: list[tuple[dict, dict, dict]], shown: tuple[str, ...], file: Path) -> None:
-    """Heat maps over shift and, side by side, the other axes; a line a score."""
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, panels = plt.subplots(len(shown), len(_AXES), figsize=(16, 4.4 * len(shown)))
-    for line, head in zip(panels, shown, strict=True):
-        for panel, (label, (value, edges)) in zip(line, _AXES.items(), strict=True):
-            cells = np.full((len(_DECADES), len(edges) - 1), np.nan)
-            for i, j in np.ndindex(cells.shape):
-                here = [score for key, _, score in rows if decade(key) == _DECADES[i]
-                        and edges[j] <= value(key) < edges[j + 1]]  # fmt: skip
-                cells[i, j] = _mean(here, head)
-                if np.isfinite(cells[i, j]):
-                    text = f"{100 * cells[i, j]:.0f} %\nof {len(here)}"
-                    panel.text(j, i, text, ha="center", va="center", fontsize=8)
-            colours = "Reds" if head == "wrong" else "RdYlGn"
-            panel.imshow(cells, colours, vmin=0, vmax=1, alpha=0.6, aspect="auto", origin="lower")
-            panel.set_xticks(np.arange(len(edges)) - 0.5, [f"{edge:g}" for edge in edges])
-            panel.set_yticks(range(len(_DECADES)), _DECADES)
-            panel.set(xlabel=label, title=head)
-        line[0].set_ylabel("shift in half-power bandwidths")
-    figure.tight_layout()
-    figure.savefig(file, dpi=110)
-    plt.close(figure)
-    print(f"\nmaps: {file}")
+            print(f"wrong: {about}: {answer['verdict']} {answer['candidates']}")
+    table = pd.DataFrame(rows)
+    for title in _GROUPS if len(table) else ():
+        groups = table.groupby(f"_{title}")
+        means = groups.mean(numeric_only=True).assign(sets=groups.size())
+        print(f"\n{question}, {title}\n{means.round(2).to_string()}")
 
 
 def main() -> None:
     """Ask, and report."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--only", choices=tuple(_QUESTIONS))
-    parser.add_argument("--results", type=Path, help="folder of the answers, in place of DIR")
-    parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--timeout", type=int, default=300, help="seconds a set")
-    parser.add_argument("--report", action="store_true", help="no new answers")
-    given = parser.parse_args()
+    given = options(
+        __doc__, folder=Path, only=list(_QUESTIONS), results=Path, jobs=2, timeout=300, report=False
+    )
     place = given.results or given.folder
     place.mkdir(parents=True, exist_ok=True)
-    for question in (given.only,) if given.only else tuple(_QUESTIONS):
+    for question in given.only:
         results = place / f"{question}.jsonl"
         if not given.report:
             ask_all(question, given.folder, results, given.jobs, given.timeout)
         report(question, given.folder, results)
+        if given.write:
+            for name, answer in sorted(read_answers(results).items()):
+                tell(question=question, **answer | {"name": name})
 
 
 if __name__ == "__main__":

@@ -55,22 +55,22 @@ def case_names(cases: StaticCases, rows: np.ndarray | tuple[int, ...]) -> str:
     return ", ".join(listed[:_SHOWN]) + more
 
 
-def case_warnings(every: StaticCases, fit: FitView) -> tuple[Fact, ...]:
+def case_warnings(all_cases: StaticCases, fit: FitView) -> tuple[Fact, ...]:
     """All that the load cases show against themselves, to be known before the model is used.
 
     Facts on some cases have their rows in `cases`, and names of the first few.
-    Arguments: `every` the load cases as they came, those without a solution included.
+    Arguments: `all_cases` as they came, those without a solution included.
     """
-    used, failed = np.flatnonzero(every.usable), np.flatnonzero(~every.usable)
+    used, failed = np.flatnonzero(all_cases.usable), np.flatnonzero(~all_cases.usable)
 
     def of(rows: np.ndarray) -> dict[str, Any]:
         cases = tuple(int(row) for row in rows)
-        return {"cases": cases, "names": case_names(every, cases)}
+        return {"cases": cases, "names": case_names(all_cases, cases)}
 
     found = []
     if failed.size:
-        found.append(Fact("not_converged", n_all=len(every.force), **of(failed)))
-    twice = _repeated(np.asarray(every.force)[used])
+        found.append(Fact("not_converged", n_all=len(all_cases.force), **of(failed)))
+    twice = _repeated(np.asarray(all_cases.force)[used])
     if twice:
         found.append(Fact("repeated_case", **of(used[list(twice)])))
     strange = _inconsistent(fit)
@@ -106,8 +106,8 @@ def linear_stiffness_ratio(fit: FitView) -> Float[np.ndarray, " mode"]:
         return np.full(n, np.nan)
     system = fit_system(fit.basis, fit.cases, monomials)
     values = np.asarray(solve_scaled(system) * system.column_scale)
-    own = np.array([values[monomials.index((m, m))] for m in range(n)])
-    return 1.0 + 2.0 * own / np.asarray(fit.basis.frequency) ** 2
+    quadratic = np.array([values[monomials.index((m, m))] for m in range(n)])
+    return 1.0 + 2.0 * quadratic / np.asarray(fit.basis.frequency) ** 2
 
 
 def energy_error(

@@ -254,24 +254,24 @@ def _quality(fit: FitView, used: np.ndarray, n_cases: int) -> FitQuality:
     linear = np.linalg.norm(force - target, axis=1)
     size = np.sqrt(np.mean(force**2, axis=0))
 
-    def every(values: np.ndarray) -> np.ndarray:
+    def by_case(values: np.ndarray) -> np.ndarray:
         rows = np.full(n_cases, np.nan)
         rows[used] = values
         return rows
 
     known = np.all(np.isfinite(left_out.held_out))
     held_out = left_out.held_out if known else np.full(target.shape, np.nan)
-    own = np.linalg.norm(target, axis=1)
+    nonlinear = np.linalg.norm(target, axis=1)
     energy = None
     if fit.cases.energy is not None:
-        energy = every(energy_error(fit.basis, fit.cases, fit.potential))
+        energy = by_case(energy_error(fit.basis, fit.cases, fit.potential))
     return FitQuality(
         misfit=fit.misfit,
         cross_validated=rms(held_out) / rms(target),
         equation_residual=np.sqrt(np.mean(left_out.residual**2, axis=0)) / size,
         equation_cross_validated=np.sqrt(np.mean(held_out**2, axis=0)) / size,
-        case_error=every(np.linalg.norm(left_out.held_out, axis=1) / own),
-        nonlinear_ratio=every(own / linear),
+        case_error=by_case(np.linalg.norm(left_out.held_out, axis=1) / nonlinear),
+        nonlinear_ratio=by_case(nonlinear / linear),
         linear_stiffness_ratio=linear_stiffness_ratio(fit),
         condition=left_out.condition,
         energy_error=energy,

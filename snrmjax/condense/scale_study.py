@@ -105,11 +105,11 @@ def load_scale_study(
     misfit, ratio = np.full(scale.size, np.nan), np.full(scale.size, np.nan)
     typical = np.ones(len(basis.numbers))
     nearest = int(np.argmin(np.abs(np.log(scale))))
-    for k, one in enumerate(scale):
-        loads = modal_loads(basis, one * np.asarray(displacement), degree=degree)
+    for k, factor in enumerate(scale):
+        loads = modal_loads(basis, factor * np.asarray(displacement), degree=degree)
         cases = solve(np.asarray(loads.force))
         if k == nearest:
-            typical = typical_displacement(cases) / one
+            typical = typical_displacement(cases) / factor
         if cases.usable.all():
             coefficient[k], misfit[k], ratio[k] = _fitted(basis, cases, monomials)
         if report is not None:
@@ -120,7 +120,7 @@ def load_scale_study(
         coefficient=coefficient,
         misfit=misfit,
         nonlinear_ratio=ratio,
-        leading=tuple(bool(one) for one in leading),
+        leading=tuple(bool(leads) for leads in leading),
         plateau=plateau_of(scale, coefficient[:, leading]),
         monomials=monomials,
     )
@@ -175,7 +175,7 @@ def leading_terms(
     """The coefficients whose terms have a tenth of the energy of the largest of their degree."""
     size = np.array([np.prod(typical[list(m)]) for m in monomials]) * np.abs(coefficient)
     degree = np.array([len(m) for m in monomials])
-    every = np.nan_to_num(size)
-    largest = np.array([every[degree == d].max() for d in degree])
+    known = np.nan_to_num(size)
+    largest = np.array([known[degree == d].max() for d in degree])
     # An odd term of a flat structure is rounding: no term of a degree that hardly acts leads.
-    return (every >= _LEADING * largest) & (largest >= _LEADING**2 * every.max())
+    return (known >= _LEADING * largest) & (largest >= _LEADING**2 * known.max())

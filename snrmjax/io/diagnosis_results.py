@@ -30,7 +30,7 @@ def summarise_diagnosis(diagnosis: Diagnosis, predicted: Sequence[LevelResponse]
     """
     gap = diagnosis.gap
     inner, outer = gap.interpolated, gap.extrapolated
-    laws = [_law(one) for one in diagnosis.answer.laws]
+    laws = [_law(law) for law in diagnosis.answer.laws]
     if laws[1:]:
         laws[0]["further"] = laws[1:]
     return {

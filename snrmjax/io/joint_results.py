@@ -45,13 +45,15 @@ def write_next(path: FilePath, advice: Sequence[NextMeasurement] | NextMeasureme
     fit found.
     """
     columns: dict[str, Sequence[object]] = {
-        "rank": [one.rank for one in advice],
-        "force_n": [one.force for one in advice],
-        "frequency_hz": [one.frequency / HERTZ for one in advice],
-        "expected_band_ratio": [one.expected_band_ratio for one in advice],
-        "reason": [f"expected {one.expected}: {one.reason}" for one in advice],
+        "rank": [measurement.rank for measurement in advice],
+        "force_n": [measurement.force for measurement in advice],
+        "frequency_hz": [measurement.frequency / HERTZ for measurement in advice],
+        "expected_band_ratio": [measurement.expected_band_ratio for measurement in advice],
+        "reason": [
+            f"expected {measurement.expected}: {measurement.reason}" for measurement in advice
+        ],
     }
-    drives = [one.drive for one in advice if one.drive is not None]
+    drives = [measurement.drive for measurement in advice if measurement.drive is not None]
     if drives or (isinstance(advice, NextMeasurements) and advice.drive_known_only):
         columns["drive_v"] = drives
     write_table(path, columns)
@@ -92,7 +94,7 @@ def summarise_fit(
             "damping_std_relative": level["damping"],
         },
         "modal_mass": _modal_mass(fit),
-        "contributions": [one._asdict() for one in shares],
+        "contributions": [share._asdict() for share in shares],
         "resonances": [_point(p) for r in responses for p in r.resonances],
         "folds": [_point(p) for r in responses for p in r.folds],
         "not_located": [

@@ -137,18 +137,18 @@ def _modes(top: TomlTable, file: str) -> LinearModes:
         )
 
     def stds(key: str, default: float = 0.0) -> list[float]:
-        return [one.get(key, default) for one in flexible]
+        return [mode.get(key, default) for mode in flexible]
 
-    known_mass = any("modal_mass_std" in one for one in flexible)
+    known_mass = any("modal_mass_std" in mode for mode in flexible)
     return linear_modes(
-        [one["frequency_hz"] * HERTZ for one in flexible],
-        [one["damping_ratio"] for one in flexible],
+        [mode["frequency_hz"] * HERTZ for mode in flexible],
+        [mode["damping_ratio"] for mode in flexible],
         mode_shape[:, : len(flexible)],
-        [one["participation"] for one in flexible],
+        [mode["participation"] for mode in flexible],
         sensors=sensors,
         mode_of_interest=of_interest - 1,
         rigid_body=RigidBodyModes(
-            mode_shape[:, len(flexible) :], np.array([one["participation"] for one in rigid])
+            mode_shape[:, len(flexible) :], np.array([mode["participation"] for mode in rigid])
         ),
         std=LinearModesStd(
             [std * HERTZ for std in stds("frequency_std_hz")],
@@ -198,18 +198,18 @@ def _potential(table: TomlTable, n_modes: int) -> PolynomialPotential:
 def _effect(table: TomlTable) -> AbstractEffect:
     if "kind" not in table.entries:
         raise ValueError(f"{table.place} lacks the key `kind`.")
-    kind, every = table.text("kind"), (*EFFECTS, *LAWS)
-    if kind not in every:
-        near = suggestion(kind, every) or f" (known are {', '.join(sorted(every))})"
+    kind, known_kinds = table.text("kind"), (*EFFECTS, *LAWS)
+    if kind not in known_kinds:
+        near = suggestion(kind, known_kinds) or f" (known are {', '.join(sorted(known_kinds))})"
         raise ValueError(f"{table.place} has the unknown kind {shown(kind)}{near}.")
     wanted = effect_class(kind).parameters()
     table = TomlTable(table.entries, f"{table.place} ({kind})")
     table.check_keys(("kind", *wanted))
     values: dict[str, float | np.ndarray] = {
-        name: table.number(name, *one.rules)
-        if one.entries is Entries.ONE
-        else np.array(table.numbers(name, *one.rules))
-        for name, one in wanted.items()
+        name: table.number(name, *parameter.rules)
+        if parameter.entries is Entries.ONE
+        else np.array(table.numbers(name, *parameter.rules))
+        for name, parameter in wanted.items()
     }
     try:
         return make_effect(kind, values)
@@ -290,9 +290,11 @@ def _effect_entry(effect: AbstractEffect) -> dict[str, object]:
     if effect.kind not in (*EFFECTS, *LAWS):
         raise ValueError(f"an effect to be written must be of a known kind, not {effect.kind!r}.")
     entry: dict[str, object] = {"kind": effect.kind}
-    for name, one in effect_class(effect.kind).parameters().items():
+    for name, parameter in effect_class(effect.kind).parameters().items():
         value = getattr(effect, name)
-        entry[name] = _one(name, value) if one.entries is Entries.ONE else np.ravel(value).tolist()
+        entry[name] = (
+            _one(name, value) if parameter.entries is Entries.ONE else np.ravel(value).tolist()
+        )
     return entry
 
 

@@ -127,6 +127,6 @@ class TomlTable(NamedTuple):
         """A list of tables at the top of a file."""
         value = self.entries.get(key, [])
         if not isinstance(value, list) or not all(isinstance(entry, dict) for entry in value):
-            found = f"[{key}]" if isinstance(value, dict) else shown(value)
-            raise ValueError(f"`{key}` must be tables under [[{key}]], but {file} has {found}.")
+            given = f"[{key}]" if isinstance(value, dict) else shown(value)
+            raise ValueError(f"`{key}` must be tables under [[{key}]], but {file} has {given}.")
         return [TomlTable(entry, f"{key} {k + 1} of {file}") for k, entry in enumerate(value)]

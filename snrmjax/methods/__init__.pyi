@@ -2,7 +2,6 @@ from .comparison import METHODS, compare_methods, snrm
 from .records.pnlss import pnlss
 from .records.resonant_decay import resonant_decay
 from .records.restoring_force import fit_restoring_force, restoring_force
-from .records.ring_down_decays import ring_down_decays
 from .records.ssm import ssm
 from .records.state_space_fit import fit_state_space
 from .result import MethodStatus
@@ -10,7 +9,6 @@ from .steady.arslan_ozguven import arslan_ozguven
 from .steady.concerto import concerto
 from .steady.harmonic_force_surface import force_surface, harmonic_force_surface
 from .steady.held_resonances import control_based_continuation, phase_locked_loop
-from .steady.mode_synthesis import backbone_of, synthesised_response
 from .steady.phase_resonance import phase_resonance
 from .steady.rct import rct
 
@@ -18,7 +16,6 @@ __all__ = [
     "METHODS",
     "MethodStatus",
     "arslan_ozguven",
-    "backbone_of",
     "compare_methods",
     "concerto",
     "control_based_continuation",
@@ -32,8 +29,6 @@ __all__ = [
     "rct",
     "resonant_decay",
     "restoring_force",
-    "ring_down_decays",
     "snrm",
     "ssm",
-    "synthesised_response",
 ]

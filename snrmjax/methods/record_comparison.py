@@ -97,7 +97,7 @@ def _pnlss_of(tests: Sequence[RecordedTest], modes: LinearModes) -> MethodResult
     records = [test.recording for test in tests]
     if len(records) == 1:
         return pnlss(records, force, tests[0].channels.reference, modes)
-    size = [float(np.std(one.values([force], 0, _LONGEST))) for one in records]
+    size = [float(np.std(record.values([force], 0, _LONGEST))) for record in records]
     first, second, *others = np.argsort(size)[::-1]
     ordered = [records[k] for k in (first, *others, second)]
     found = pnlss(ordered, force, tests[0].channels.reference, modes)
@@ -133,20 +133,20 @@ def run_record_method(name: str, tests: Sequence[RecordedTest], modes: LinearMod
     can read none.
     """
     method = RECORD_METHODS[name]
-    own = [test for test in tests if test.kind in method.kinds]
-    if not own:
+    readable = [test for test in tests if test.kind in method.kinds]
+    if not readable:
         wanted = " or ".join(kind.value for kind in method.kinds)
         return Found(None, f"a time record ({wanted}) is needed, and the data have none.", False)
     found: list[MethodResult] = []
     reasons: list[str] = []
     apart: list[Fact] = []
     read: list[RecordedTest] = []
-    if method.together is not None and len(own) > 1:
+    if method.together is not None and len(readable) > 1:
         try:
-            found, read, own = [method.together(own, modes)], own, []
+            found, read, readable = [method.together(readable, modes)], readable, []
         except ValueError as error:
             apart = [Fact("records_apart", why=str(error))]
-    for test in own:
+    for test in readable:
         try:
             if test.recording.n_samples > _LONGEST:
                 raise ValueError(f"the record has more than {_LONGEST} samples: cut it.")

@@ -23,7 +23,7 @@ from .solutions.time_integration import (
     settled_motion,
     stepped_sine,
 )
-from .virtual_test.controlled_test import phase_controlled_test, response_controlled_test
+from .virtual_test.controlled_test import phase_controlled_test
 from .virtual_test.equipment import Instruments, Shaker
 from .virtual_test.laboratory import AbstractController, Laboratory, run_test
 from .virtual_test.phase_loop import LoopGains, phase_sweep
@@ -76,7 +76,6 @@ __all__ = [
     "phase_sweep",
     "response_at_velocities",
     "response_controlled",
-    "response_controlled_test",
     "run_test",
     "s_curve",
     "settled_motion",

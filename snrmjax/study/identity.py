@@ -4,7 +4,6 @@ import dataclasses
 import hashlib
 import importlib.metadata
 import inspect
-import json
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -32,13 +31,6 @@ def description(study: Study) -> dict[str, Any]:
         "study": {**parts, "members_a_chunk": study.chunk_size},
         "versions": {name: importlib.metadata.version(name) for name in _PACKAGES},
     }
-
-
-def model_hash(study: Study) -> str:
-    """A hash of the base model alone."""
-    beam = isinstance(study.model_of, BeamModels)
-    text = json.dumps({"model": _plain(study.model_of if beam else study.model)}, sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def differences(here: Any, there: Any) -> dict[str, tuple[object, object]]:

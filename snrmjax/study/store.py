@@ -19,7 +19,7 @@ import numpy as np
 
 from snrmjax.io.files import write_atomically
 from snrmjax.study.computations.base import MEMBER, TEXT, Output, joined
-from snrmjax.study.identity import differences, model_hash
+from snrmjax.study.identity import differences
 from snrmjax.study.study import FORCE, Ensemble
 
 _BLOCK = 1 << 16  # rows of a ragged variable that are one file
@@ -208,7 +208,6 @@ def _write_store(
             "title": study.name,
             "computed": study.computation.kind,
             "study": json.dumps(described, sort_keys=True),
-            "model_hash": model_hash(study),
             **{f"{name}_version": v for name, v in described["versions"].items()},
         }
     )

@@ -36,7 +36,7 @@ _RANGE = ("from_hz", "to_hz")
 _ERRORS = ("amplitude", "phase_deg", "force", "level_gain", "level_phase_deg")
 # Keys that each kind of computation needs and may have, beside those of every study.
 _KEYS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
-    "peaks": (_RANGE, ("forces_n", "harmonics", "stability", "grid_points", "isolated")),
+    "peaks": (_RANGE, ("forces_n", "harmonics", "stability", "grid_points")),
     "curves": (_RANGE, ("forces_n", "harmonics", "stability")),
     "nnm": (("to_hz",), ("harmonics",)),
     "damped_nnm": (("to_velocity_m_s",), ("harmonics",)),
@@ -187,8 +187,7 @@ def _computation(
         raise ValueError(f"{top.place} lacks the key `forces_n`, and {FORCE} does not vary.")
     if kind == "curves":
         return Curves(within, OfForces(forces))
-    grid = top.whole("grid_points", 0, 0)
-    return Peaks(within, OfForces(forces), grid, _flag(top, "isolated", False))
+    return Peaks(within, OfForces(forces), top.whole("grid_points", 0, 0))
 
 
 def _forces(top: TomlTable) -> np.ndarray | None:

@@ -1,10 +1,8 @@
 """Structures on a moving base: the linear oscillator's own formula, and four ways to excite one."""
 
-import importlib.util
-from pathlib import Path
-
 import numpy as np
 import pytest
+from truths.excitations import errors_of
 
 import snrmjax as sj
 
@@ -12,7 +10,6 @@ HERTZ = 2 * np.pi
 OWN, RATIO, MASS = 50 * HERTZ, 0.02, 0.4
 OMEGA = HERTZ * np.array([49.0, 50.0, 51.5])
 BASE = np.array([2.0, 1.5j, -1.0 + 1.0j])  # m/s², phasors of any reference
-BENCHMARK = Path(__file__).resolve().parents[2] / "benchmarks" / "kinds_of_excitation.py"
 
 
 def relative_velocity(along=1.0):
@@ -56,10 +53,7 @@ def test_shapes_that_disagree_are_said():
 def test_four_ways_to_excite_a_duffing_oscillator_in_time_give_one_backbone(
     way, frequency, damping
 ):
-    spec = importlib.util.spec_from_file_location("kinds_of_excitation", BENCHMARK)
-    rig = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(rig)
-    speed, off, off_damping, failed = rig.errors_of(way, 2)
+    speed, off, off_damping, failed = errors_of(way, 2)
     assert failed == 0
     assert len(speed) == 6
     assert np.abs(off).max() < frequency

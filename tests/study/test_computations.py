@@ -10,7 +10,7 @@ from snrmjax.study.analysis.digest import digest
 from snrmjax.study.computations.base import HIGHEST_AT_END, NO_PEAK
 from snrmjax.study.computations.responses import velocity_bounds
 
-from .conftest import OMEGA, PARTICIPATION, SHAPE, InThisProcess, peak_velocity
+from .conftest import OMEGA, PARTICIPATION, SHAPE, InThisProcess
 
 CUBIC = 1e6  # of q⁴ in the potential
 HERTZ = 2 * np.pi
@@ -134,18 +134,6 @@ def test_a_member_that_cannot_be_computed_says_why_and_the_others_are_untouched(
     assert data.status.values[1].startswith("refused: ")
     assert np.all(np.isnan(data.damping_ratio[1]))
     np.testing.assert_allclose(data.damping_ratio[0], 0.02, rtol=1e-3)
-
-
-def test_peaks_of_a_study_are_those_of_the_formula_with_isolated_ones_asked_for(
-    linear_model, tmp_path
-):
-    within = sj.study.ResponseRange(0.8 * OMEGA, 1.2 * OMEGA, harmonic_order=1)
-    computation = sj.study.Peaks(within, [0.5], isolated=True)
-    varied = (sj.study.Discrete("mode_1.damping_ratio", [0.02]),)
-    data = computed(linear_model, computation, varied, tmp_path)
-    np.testing.assert_allclose(data.peak_velocity_m_s, peak_velocity(0.5, [0.02]), rtol=1e-9)
-    assert data.n_isolated.values.tolist() == [0]  # a linear structure has one response
-    assert np.isnan(data.isolated_peak_velocity_m_s[0])
 
 
 def test_a_range_without_the_resonance_has_a_status_of_its_own(linear_model, tmp_path):

@@ -8,9 +8,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from snrmjax.model.modes import have_values
+from snrmjax.numerics.rules import NOT_NEGATIVE, POSITIVE, Rule
 
 Number = float | Float[Array, ""]
 SupportName = Literal["clamped", "pinned", "free"]
+_POISSON = Rule("above -1 and below 0.5", lambda value: -1 < value < 0.5)
 
 
 def _number(value: Number) -> Float[Array, ""]:
@@ -22,6 +24,18 @@ def _stiffness(value: Number | None) -> Float[Array, ""] | None:
     if value is None or (isinstance(value, (int, float)) and value == np.inf):
         return None
     return _number(value)
+
+
+def _check(part: eqx.Module, rule: Rule, *names: str) -> None:
+    """Raises `ValueError` for a number that breaks the rule, where it has a value."""
+    for name in names:
+        value = getattr(part, name)
+        if value is None or not have_values(value):
+            continue
+        if np.ndim(value):
+            raise ValueError(f"`{name}` must be one number, but has shape {np.shape(value)}.")
+        if not (np.isfinite(value) and rule.good(value)):
+            raise ValueError(f"`{name}` must be {rule.expected}, but is {float(value):g}.")
 
 
 class Support(eqx.Module):
@@ -37,12 +51,7 @@ class Support(eqx.Module):
 
     def __check_init__(self) -> None:
         """Raises `ValueError` for a stiffness that is negative or not a number."""
-        for name in ("axial", "transverse", "rotation"):
-            value = getattr(self, name)
-            if value is not None and have_values(value) and not np.all(value >= 0):
-                raise ValueError(
-                    f"`{name}` stiffness must be zero or positive, but is {float(value):g}."
-                )
+        _check(self, NOT_NEGATIVE, "axial", "transverse", "rotation")
 
     @property
     def springs(self) -> tuple[Number | None, ...]:
@@ -76,10 +85,7 @@ class PointMass(eqx.Module):
         """Raises `ValueError` for a place off the beam or a negative mass."""
         if not 0 <= self.at <= 1:
             raise ValueError(f"`at` must be a fraction of the length, but is {self.at:g}.")
-        for name in ("mass", "inertia"):
-            value = getattr(self, name)
-            if have_values(value) and not (np.isfinite(value) and value >= 0):
-                raise ValueError(f"`{name}` must be zero or positive, but is {float(value):g}.")
+        _check(self, NOT_NEGATIVE, "mass", "inertia")
 
 
 class Beam(eqx.Module):
@@ -116,13 +122,9 @@ class Beam(eqx.Module):
             raise ValueError(f"`elements` must be a whole number, but is {self.elements!r}.")
         if self.elements < 2:
             raise ValueError(f"`elements` must be at least 2, but is {self.elements}.")
-        for name in ("length", "width", "thickness", "rise", "young", "density", "poisson"):
-            value = getattr(self, name)
-            if value is None or not have_values(value):
-                continue
-            if np.ndim(value):
-                raise ValueError(f"`{name}` must be one number, but has shape {np.shape(value)}.")
-            _check_number(name, float(value))
+        _check(self, POSITIVE, "length", "width", "thickness", "young", "density")
+        _check(self, NOT_NEGATIVE, "rise")
+        _check(self, _POISSON, "poisson")
 
     @property
     def half_angle(self) -> Float[Array, ""]:
@@ -204,14 +206,3 @@ def rise_of_radius(length: Number, radius: Number) -> Float[Array, ""]:
     """
     half = 0.5 * jnp.asarray(length)
     return half**2 / (radius + jnp.sqrt(jnp.asarray(radius) ** 2 - half**2))
-
-
-def _check_number(name: str, value: float) -> None:
-    if name == "poisson":
-        good, wanted = -1 < value < 0.5, "above -1 and below 0.5"
-    elif name == "rise":
-        good, wanted = value >= 0, "zero or positive"
-    else:
-        good, wanted = value > 0, "positive"
-    if not (np.isfinite(value) and good):
-        raise ValueError(f"`{name}` must be {wanted}, but is {value:g}.")

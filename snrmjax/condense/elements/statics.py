@@ -69,15 +69,15 @@ def static_solutions(beam: Beam, load: Float[Array, "case dof"]) -> StaticSoluti
     fixed_beam = jax.lax.stop_gradient(beam)
     loads = load[:, free]
     start, stiffness, status, fraction = mapped(
-        lambda one: _followed(fixed_beam, one), jax.lax.stop_gradient(loads)
+        lambda load: _followed(fixed_beam, load), jax.lax.stop_gradient(loads)
     )
 
-    def polished(u: Array, k: Array, one: Array, good: Array) -> tuple[Array, Array]:
+    def polished(u: Array, k: Array, load: Array, good: Array) -> tuple[Array, Array]:
         # Newton steps with a fixed matrix: nothing but rounding in value, and each makes one more
         # order of derivatives whole.
         factor = jax.scipy.linalg.lu_factor(k)
         for _ in range(2):
-            u = u - jax.scipy.linalg.lu_solve(factor, _free_force(beam, u) - one)
+            u = u - jax.scipy.linalg.lu_solve(factor, _free_force(beam, u) - load)
         whole = jnp.where(good, jnp.zeros(beam.n_dof).at[free].set(u), jnp.nan)
         return whole, strain_energy(beam, whole)
 

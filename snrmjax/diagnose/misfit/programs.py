@@ -31,7 +31,7 @@ from snrmjax.numerics.blocks import mapped
 from snrmjax.numerics.compiled import compiled
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance
 from snrmjax.simulate.balance.harmonics import displacement_phasors, harmonic_basis
-from snrmjax.simulate.balance.prescribed_motion import Secants, nothing_of, start_of
+from snrmjax.simulate.balance.prescribed_motion import Secants, batched_zero, start_of
 
 HARMONICS = 5
 """Of the motions: three that are compared, and two more that influence those."""
@@ -147,7 +147,7 @@ def missed(
             place = jnp.arange(n_directions + 1) == number
             return start, jnp.where(place, own_columns[:, None], columns)
 
-        none = nothing_of(near) + jnp.zeros((measured.known.shape[0], n_directions + 1))
+        none = batched_zero(near) + jnp.zeros((measured.known.shape[0], n_directions + 1))
         columns = jax.lax.fori_loop(
             0, n_wanted + 1, lambda k, now: found(k, *now), (start_of(near), none)
         )[1]

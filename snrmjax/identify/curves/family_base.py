@@ -25,7 +25,7 @@ _KIND_WORDS = {
     "viscous_microslip": "viscous and microslip damping",
 }
 _FAR = 1e6  # (amplitude/scale)² of a knot that is none
-_SIZE = 12  # parameters in programs; a larger family takes a multiple of it
+_SIZE = 12  # parameters and powers in programs; a larger family takes a multiple of it
 
 
 class Coefficient(NamedTuple):
@@ -62,7 +62,16 @@ class Linearised(NamedTuple):
     by_amplitude: Any
 
 
-def _drawn(x: Any, parameters: Any, terms: Terms, xp: Any) -> Linearised:
+class _Drawn(NamedTuple):
+    """A curve at some x, and what its derivatives are made of."""
+
+    value: Any
+    basis: Any  # one more axis
+    by_x: Any
+    by_third: Any  # by the third parameter, beside what it does to the coefficients
+
+
+def _drawn(x: Any, parameters: Any, terms: Terms, xp: Any) -> _Drawn:
     """By NumPy or JAX, as `xp` says."""
     n, has_third = len(terms.exponents), parameters.shape[0] > 2
     bent, by_u = hats(x**2, terms.knots, xp)
@@ -74,19 +83,16 @@ def _drawn(x: Any, parameters: Any, terms: Terms, xp: Any) -> Linearised:
     powers = inside**exponents
     at_rest = xp.where(exponents == 0, 1.0, 0.0)
     rising = xp.where(known, exponents * powers / inside, xp.where(exponents == 1, 1.0, 0.0))
-    values = xp.concatenate([xp.where(known, powers, at_rest), bent], axis=-1)
+    basis = xp.concatenate([xp.where(known, powers, at_rest), bent], axis=-1)
     slopes = xp.concatenate([rising, 2 * x * by_u], axis=-1)
     coefficients = terms.mix @ parameters
-    value, columns = values @ coefficients, values @ terms.mix
-    if has_third:
-        by_exponent = xp.where(known & terms.is_free, powers * xp.log(inside), 0.0)
-        by_logit = terms.largest_exponent * share * (1 - share) * (by_exponent @ coefficients[:n])
-        columns = columns + by_logit[..., None] * (xp.arange(parameters.shape[0]) == 2)
+    by_exponent = xp.where(known & terms.is_free, powers * xp.log(inside), 0.0) @ coefficients[:n]
+    by_third = terms.largest_exponent * share * (1 - share) * by_exponent
     # Dry friction: its equivalent damping grows without bound towards rest.
     dry = xp.sum(xp.where(terms.exponents < 0, coefficients[:n], 0.0))
     endless = (dry != 0) & (x[..., 0] <= 0)
-    value = xp.where(endless, xp.copysign(xp.inf, dry), value)
-    return Linearised(value, columns, slopes @ coefficients)
+    value = xp.where(endless, xp.copysign(xp.inf, dry), basis @ coefficients)
+    return _Drawn(value, basis, slopes @ coefficients, by_third)
 
 
 @jax.custom_jvp
@@ -100,12 +106,12 @@ def _value_and_slope(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
 
     Terms have no derivative: they are chosen, not fitted.
     """
-    by_x, by_parameters, _ = tangents
-    x, parameters, terms = primals
+    (x, parameters, terms), (by_x, by_parameters, _) = primals, tangents
     drawn = _drawn(x, parameters, terms, jnp)
-    return _value(
-        x, parameters, terms
-    ), drawn.by_amplitude * by_x + drawn.by_parameters @ by_parameters
+    slope = drawn.by_x * by_x + drawn.basis @ (terms.mix @ by_parameters)
+    if parameters.shape[0] > 2:
+        slope = slope + drawn.by_third * by_parameters[2]
+    return _value(x, parameters, terms), slope
 
 
 def hats(u: Any, knots: Any, xp: Any) -> tuple[Any, Any]:
@@ -211,7 +217,10 @@ class AbstractFamily(AbstractCurve):
         """See `AbstractCurve`; nothing compiles."""
         scale, terms = float(self.scale), jax.tree.map(np.asarray, self.terms())
         drawn = _drawn(np.asarray(amplitude) / scale, np.asarray(self.parameters), terms, np)
-        return drawn._replace(by_amplitude=drawn.by_amplitude / scale)
+        columns = drawn.basis @ terms.mix
+        if columns.shape[-1] > 2:
+            columns[..., 2] += drawn.by_third
+        return Linearised(drawn.value, columns, drawn.by_x / scale)
 
     def amplitude(self, displacement: Array, velocity: Array) -> Array:
         """The one of the two amplitudes that this curve is a function of."""
@@ -249,7 +258,7 @@ def packed(family: AbstractFamily, room: int = 0) -> PackedCurve:
     traced = any(isinstance(a, jax.core.Tracer) for a in jax.tree.leaves((terms, parameters)))
     xp: Any = jnp if traced else np
     n, k, h = parameters.shape[0], len(terms.exponents), max(len(terms.knots) - 2, 0)
-    size = -(-max(n, room) // _SIZE) * _SIZE
+    size, powers = (-(-most // _SIZE) * _SIZE for most in (max(n, room), k))
 
     def filled(rows: Any, *lengths: int) -> Array:
         rows = xp.asarray(rows)
@@ -257,13 +266,13 @@ def packed(family: AbstractFamily, room: int = 0) -> PackedCurve:
         return jnp.asarray(xp.pad(rows, added))
 
     far = _FAR * np.arange(1.0, size + 3)[len(terms.knots) :]
-    mix = [filled(part, size, size) for part in (terms.mix[:k], terms.mix[k : k + h])]
+    mix = [filled(terms.mix[:k], powers, size), filled(terms.mix[k : k + h], size, size)]
     return PackedCurve(
         parameters=filled(parameters, size),
         scale=family.scale,
         made_of=Terms(
-            exponents=filled(terms.exponents, size),
-            is_free=filled(terms.is_free, size),
+            exponents=filled(terms.exponents, powers),
+            is_free=filled(terms.is_free, powers),
             largest_exponent=jnp.asarray(terms.largest_exponent),
             knots=jnp.asarray(xp.concatenate([terms.knots, far])),
             mix=jnp.asarray(xp.concatenate(mix)),

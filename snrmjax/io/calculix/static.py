@@ -103,7 +103,7 @@ def run_static_cases(
     places = [model.parent / f"case-{deck_digest(model.name + step)}.npz" for step in steps]
     results = {place: result for place in places if (result := _stored(place, deck)) is not None}
     todo = {place: step for place, step in zip(places, steps, strict=True) if place not in results}
-    found = sum(place in results for place in places)
+    known = sum(place in results for place in places)
     with ThreadPoolExecutor(max_workers=workers or os.cpu_count() or 1) as pool:
         running = {
             pool.submit(_compute, calculix, model, step, place, modes): place
@@ -113,7 +113,7 @@ def run_static_cases(
             for done, future in enumerate(as_completed(running), start=1):
                 results[running[future]] = future.result()
                 if progress is not None:
-                    progress(found + done, len(places))
+                    progress(known + done, len(places))
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
     rows = [results[place] for place in places]
@@ -135,7 +135,7 @@ def run_static_cases(
         tuple(row.status for row in rows),
         np.array([row.seconds for row in rows]),
         tuple(row.error for row in rows),
-        found,
+        known,
     )
 
 

@@ -31,11 +31,11 @@ def numbered_levels(
     file has, then one level a file, then groups of the force.
     Raises `ValueError` for a rule that the data do not have.
     """
-    lengths = [len(one.frequency) for one in parts]
+    lengths = [len(part.frequency) for part in parts]
     files = np.repeat(np.arange(1, len(parts) + 1), lengths)
-    force = np.concatenate([one.force for one in parts])
-    frequency = np.concatenate([one.frequency for one in parts])
-    keyed = all(one.key is not None for one in parts)
+    force = np.concatenate([part.force for part in parts])
+    frequency = np.concatenate([part.frequency for part in parts])
+    keyed = all(part.key is not None for part in parts)
     if level not in ("", "file", "force", "runs") or (not level and keyed):
         keys = np.concatenate([np.full(0, 0.0) if p.key is None else p.key for p in parts])
         if not keyed:

@@ -77,8 +77,8 @@ def _with_force(states: SteadyStates, mapping: ImportMap) -> SteadyStates:
     if not mapping.force_unit:
         drive, newtons = states.drive * AMPLITUDE_FACTORS[mapping.amplitude], states.force * factor
     else:
-        every = factor * jnp.where(known, states.force, states.drive)
-        drive, newtons = (every, missing) if force.is_voltage else (missing, every)
+        loads = factor * jnp.where(known, states.force, states.drive)
+        drive, newtons = (loads, missing) if force.is_voltage else (missing, loads)
     std = missing if force.is_voltage else states.force_std * factor
     return dataclasses.replace(states, force=newtons, drive=drive, force_std=std)
 

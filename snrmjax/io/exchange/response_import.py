@@ -34,21 +34,21 @@ class _Sets(NamedTuple):
 
     def references(self) -> list[int]:
         """Which reference of each set the responses are over."""
-        force, file, found = self.mapping.force, self.file, []
+        force, file, places = self.mapping.force, self.file, []
         for each in self.sets:
             names = _names(each.references)
             if force and not self.has_force:
                 what = f"responses {', '.join(_names(each.responses))}, and over the references"
                 require_name("--force", force, names, what, file)
-                found.append(names.index(force))
+                places.append(names.index(force))
             elif len(names) > 1:
                 listed = ", ".join(names)
                 raise ValueError(
                     f"which reference of {file} is the force? --force names it, of {listed}."
                 )
             else:
-                found.append(0)
-        return found
+                places.append(0)
+        return places
 
     def column(self, name: str, unit: str, option: str) -> tuple[np.ndarray, Channel]:
         """All lines of a response, in SI or, where its unit is stated, as the file has them."""
@@ -154,7 +154,7 @@ def import_responses(
         if channel.quantity not in ("unknown", "voltage"):
             units[name] = channel.unit if response.unit else channel.si_unit
     table = NumberTable(file, columns, {name: unit for name, unit in units.items() if unit})
-    part, found, force, notes = import_table(table, as_table, file, assumed)
+    part, used, force, notes = import_table(table, as_table, file, assumed)
     del assumed["frequency_unit"]
     if not source.has_force:
         del assumed["force_unit"]
@@ -162,7 +162,7 @@ def import_responses(
             assumed.add("force_unit", Fact("reference_without_unit"), "N")
     if not mapping.level:
         assumed.add("level", Fact("level_a_set"))
-    mapping = mapping._replace(responses=found.responses, level=mapping.level or "order")
+    mapping = mapping._replace(responses=used.responses, level=mapping.level or "order")
     return part, mapping, force, notes
 
 

@@ -96,7 +96,7 @@ class UnitMeaning(NamedTuple):
     def quantity(self) -> Quantity:
         """The quantity of a channel in that unit."""
         known: tuple[Quantity, ...] = get_args(Quantity)
-        return next((one for one in known if one == self.dimension), "unknown")
+        return next((quantity for quantity in known if quantity == self.dimension), "unknown")
 
 
 @functools.lru_cache(maxsize=1024)
@@ -156,9 +156,11 @@ def _not_understood(text: str, why: str = "") -> ValueError:
     return ValueError(f"{shown(text)} is not understood as a unit{why}.")
 
 
-def _product(one: _Powers, other: _Powers, power: int) -> _Powers:
+def _product(first_powers: _Powers, other: _Powers, power: int) -> _Powers:
     """The powers of `one` times `other` to a power."""
-    first, second, third, fourth, fifth = (a + power * b for a, b in zip(one, other, strict=True))
+    first, second, third, fourth, fifth = (
+        a + power * b for a, b in zip(first_powers, other, strict=True)
+    )
     return first, second, third, fourth, fifth
 
 

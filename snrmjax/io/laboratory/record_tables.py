@@ -45,7 +45,7 @@ def read_record_table(path: FilePath) -> TimeRecording:
     channels, notes = _channels(cells.names, file)
     cells.require_rows()
     time = cells.numbers("time_s")
-    values = np.stack([cells.numbers(one.name) for one in channels])
+    values = np.stack([cells.numbers(channel.name) for channel in channels])
     if len(time) < _FEWEST:
         raise ValueError(
             f"a time record needs {_FEWEST} samples at least, but {file} has {len(time)}."
@@ -63,7 +63,7 @@ def with_named_channels(recording: TimeRecording, file: str) -> TimeRecording:
     """
     return dataclasses.replace(
         recording,
-        channels=tuple(_named(one) for one in recording.channels),
+        channels=tuple(_named(channel) for channel in recording.channels),
         name=f"{recording.name} of {file}" if recording.name else file,
     )
 
@@ -94,7 +94,7 @@ def _channels(names: list[str], file: str) -> tuple[list[Channel], list[Fact]]:
             continue
         quantity = _COLUMNS[column]
         channels.append(Channel(name, quantity, column.split("_", 1)[1], 1.0, sensor))
-    places = [one.point for one in channels if one.quantity not in ("force", "voltage")]
+    places = [channel.point for channel in channels if channel.quantity not in ("force", "voltage")]
     if not places:
         near = "".join(suggestion(name, _MOTIONS) for name in others[:1])
         raise ValueError(

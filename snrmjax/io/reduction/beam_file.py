@@ -106,11 +106,11 @@ def read_beam_description(path: FilePath) -> BeamDescription:
     if missing is not None:
         raise ValueError(f"{supports.place} leave a mechanism: {missing}.")
     masses_at = []
-    for k, one in enumerate(top.tables(_POINT_MASS, file), 1):
-        one.check_keys(("at", "mass_kg"), ("inertia_kg_m2",))
-        masses_at.append(one.number("at", FRACTION))
-        numbers[f"point_mass_{k}.mass_kg"] = one.number("mass_kg", NOT_NEGATIVE)
-        inertia = one.number("inertia_kg_m2", NOT_NEGATIVE, default=0.0)
+    for k, mass in enumerate(top.tables(_POINT_MASS, file), 1):
+        mass.check_keys(("at", "mass_kg"), ("inertia_kg_m2",))
+        masses_at.append(mass.number("at", FRACTION))
+        numbers[f"point_mass_{k}.mass_kg"] = mass.number("mass_kg", NOT_NEGATIVE)
+        inertia = mass.number("inertia_kg_m2", NOT_NEGATIVE, default=0.0)
         numbers[f"point_mass_{k}.inertia_kg_m2"] = inertia
     elements = geometry.whole("elements", 2)
     if elements > MOST_ELEMENTS:

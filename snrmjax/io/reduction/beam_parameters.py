@@ -63,7 +63,7 @@ def check_beam_name(beam: BeamDescription, name: str, file: str, further: tuple[
         why = f"{name} cannot vary in {file}: {_HELD.format(side=side, key=key)}."
     else:
         # "thickness_m" alone, too, is near to "section.thickness_m".
-        ends = {one.rpartition(".")[2]: one for one in reversed(known)}
+        ends = {parameter.rpartition(".")[2]: parameter for parameter in reversed(known)}
         near = suggestion(ends.get(name, name), known, 0.5) or f"; it has {', '.join(known[:6])}, …"
         why = f"the beam of {file} does not have the parameter {name!r}{near}."
     raise ValueError(why)

@@ -141,5 +141,5 @@ def _in_blocks(solve: StaticSolver, force: Float[np.ndarray, "case mode"]) -> St
     count = len(force)
     rows = np.resize(np.arange(count), -(-count // _BLOCK) * _BLOCK)
     blocks = [solve(np.asarray(force)[part]) for part in rows.reshape(-1, _BLOCK)]
-    found: StaticCases = jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *blocks)
-    return found
+    joined: StaticCases = jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *blocks)
+    return joined

@@ -52,7 +52,7 @@ class ReductionSource(NamedTuple):
     lines: ShapeLines | None = None
     notes: tuple[Fact, ...] = ()
 
-    def structure(self, found: Condensation) -> Structure:
+    def structure(self, condensation: Condensation) -> Structure:
         """The reduced model as a structure that a model file can hold."""
         traced = isinstance(self.participation, jax.core.Tracer)
         xp: Any = jnp if traced else np
@@ -60,7 +60,7 @@ class ReductionSource(NamedTuple):
         # A file has no zeros here; a mode that the force does not drive gets next to nothing.
         least = _TINY * xp.where(size.max() > 0, size.max(), 1.0)
         driven = xp.where(size > 0, self.participation, least)
-        return found.structure(
+        return condensation.structure(
             self.damping_ratio, sensors=self.sensors, participation=driven, name=self.name
         )
 

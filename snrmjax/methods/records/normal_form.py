@@ -145,8 +145,8 @@ def _slow_flow(
         size = state[2 : 3 + terms]
         d_size, d_phase = (form.decay @ bent) * size, (form.frequency @ bent) * size
         d_size[1:] += known
-        own = [form.decay @ known, form.frequency @ known]
-        return np.concatenate([own, d_size, d_phase, known])
+        rates = [form.decay @ known, form.frequency @ known]
+        return np.concatenate([rates, d_size, d_phase, known])
 
     begin = np.zeros(4 + 3 * terms)
     begin[:2], begin[2] = form.start, 1.0

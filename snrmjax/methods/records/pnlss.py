@@ -93,7 +93,7 @@ def _curves(
     """Natural frequency (rad/s), damping ratio, and 1σ of each."""
     flat, rebuild = ravel_pytree(fit.model)
     constant, by_coefficients = jax.value_and_grad(
-        lambda one: modal_constant(rebuild(one), fit.mode)
+        lambda coefficients: modal_constant(rebuild(coefficients), fit.mode)
     )(flat)
     ratio = float(constant) * force * hold(angle) / (2 * angle)
     by_angle, by_force = np.asarray(slopes)
@@ -103,7 +103,7 @@ def _curves(
         - by_angle / angle[:, None]
     )
     angle_std, relative_std = (
-        np.sqrt(np.maximum(np.einsum("ki,ij,kj->k", one, fit.covariance, one), 0))
-        for one in (by_angle, relative)
+        np.sqrt(np.maximum(np.einsum("ki,ij,kj->k", slope, fit.covariance, slope), 0))
+        for slope in (by_angle, relative)
     )
     return np.stack([angle * fit.rate, ratio, angle_std * fit.rate, relative_std * np.abs(ratio)])

@@ -125,16 +125,16 @@ def recorded_test(recording: TimeRecording, modes: LinearModes) -> RecordedTest:
 def _channels(recording: TimeRecording, modes: LinearModes) -> RecordChannels:
     """Channels by quantity, and the sensors that they are of."""
     kept = {
-        kind: [one for one in recording.channels if one.quantity == kind]
+        kind: [channel for channel in recording.channels if channel.quantity == kind]
         for kind in ("force", "voltage")
     }
     for kind, found in kept.items():
         if len(found) > 1:
             raise ValueError(
                 f"{recording.name} has several channels of {kind} "
-                f"({', '.join(one.name for one in found)}): keep the one that drives the mode."
+                f"({', '.join(each.name for each in found)}): keep the one that drives the mode."
             )
-    motions = [one for one in recording.channels if one.quantity in _MOTIONS]
+    motions = [channel for channel in recording.channels if channel.quantity in _MOTIONS]
     if not motions:
         listed = ", ".join(map(str, recording.channels))
         raise ValueError(
@@ -142,21 +142,22 @@ def _channels(recording: TimeRecording, modes: LinearModes) -> RecordChannels:
             "velocity_m_s, acceleration_m_s2 or displacement_m."
         )
     at: dict[str, str] = {}
-    for one in motions:
+    for channel in motions:
         for sensor in modes.sensors:
-            place = f"{one.point}{one.direction}"
-            if sensor in (one.point, one.name, place, f"{one.name}:{place}"):  # as UFF names it
-                at.setdefault(sensor, one.name)
+            place = f"{channel.point}{channel.direction}"
+            names = (channel.point, channel.name, place, f"{channel.name}:{place}")
+            if sensor in names:  # the last as UFF names it
+                at.setdefault(sensor, channel.name)
     reference = modes.sensors[reference_sensor(modes)]
     if not at and len(motions) == 1 and not motions[0].point:
         at = {reference: motions[0].name}
     if reference not in at:
         raise ValueError(
             f"{recording.name} has no motion of the sensor {reference}, where the mode moves most, "
-            f"but {', '.join(one.name for one in motions)}."
+            f"but {', '.join(channel.name for channel in motions)}."
         )
-    names = [found[0].name if found else None for found in kept.values()]
-    return RecordChannels(names[0], names[1], tuple(at.values()), tuple(at), at[reference])
+    force, drive = (found[0].name if found else None for found in kept.values())
+    return RecordChannels(force, drive, tuple(at.values()), tuple(at), at[reference])
 
 
 class _Fall(NamedTuple):
@@ -207,8 +208,8 @@ def _free_stretches(
     except ValueError:  # the drive never stops: its only other reasons were looked at before
         return ()
     return tuple(
-        (one.start + int(np.ceil(_HERTZ * recording.sampling_rate / one.frequency)), one.stop)
-        for one in found
+        (free.start + int(np.ceil(_HERTZ * recording.sampling_rate / free.frequency)), free.stop)
+        for free in found
     )
 
 
@@ -228,11 +229,11 @@ def _tone(recording: TimeRecording, guide: str) -> ToneTrack | None:
 def _of_tone(recording: TimeRecording, guide: str, track: ToneTrack) -> tuple[RecordKind, Fact]:
     rate = recording.sampling_rate
     steps = [
-        one
-        for one in recognise_steps(track, rate, least_amplitude_step=0.05, least_step=0.0)
-        if (one.stop - one.start) * one.frequency / _HERTZ / rate >= _STEP_CYCLES
+        step
+        for step in recognise_steps(track, rate, least_amplitude_step=0.05, least_step=0.0)
+        if (step.stop - step.start) * step.frequency / _HERTZ / rate >= _STEP_CYCLES
     ]
-    covered = sum(one.stop - one.start for one in steps) / max(float(np.ptp(track.middle)), 1.0)
+    covered = sum(step.stop - step.start for step in steps) / max(float(np.ptp(track.middle)), 1.0)
     stays = moves_within_steps(steps, track, rate) < _MOVES
     if len(steps) > 1 and covered >= _STEPS_COVER and stays:
         return RecordKind.STEPPED_SINE, Fact("tone_in_steps", channel=guide, n=len(steps))
@@ -267,7 +268,7 @@ def _of_fall(motion: Float[np.ndarray, " sample"], fall: _Fall, rate: float) -> 
 def _band(force: Float[np.ndarray, " sample"], rate: float) -> tuple[float, float]:
     omega, power = _spectrum(force, rate)
     share = np.cumsum(power) / np.sum(power)
-    low, high = (float(omega[np.searchsorted(share, one)]) for one in _BAND)
+    low, high = (float(omega[np.searchsorted(share, edge)]) for edge in _BAND)
     return low, high
 
 

@@ -8,7 +8,6 @@ from jaxtyping import Float
 from snrmjax.measure.recordings.channels import channel_number
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.methods.records.resonant_decay import even_record
-from snrmjax.methods.records.ring_down_decays import above_noise, white_noise
 from snrmjax.numerics.facts import Fact
 
 _HERTZ = 2 * np.pi
@@ -75,6 +74,24 @@ def recorded_velocity(
         )  # fmt: skip
         signal = sosfiltfilt(sections, signal)[ends:-ends]
         time, start = time[ends:-ends], start + ends
-    floor = _ABOVE_NOISE * white_noise(signal)
-    kept = signal if forced else above_noise(signal, floor, cycle)
+    floor = _ABOVE_NOISE * _white_noise(signal)
+    kept = signal if forced else _above(signal, floor, cycle)
     return RecordedVelocity(time[: len(kept)], kept, start, floor, notes)
+
+
+def _white_noise(signal: Float[np.ndarray, " sample"]) -> float:
+    """1σ of white noise by the median of the spectrum."""
+    from scipy.signal import welch
+
+    density = welch(signal, nperseg=min(len(signal), 4096))[1]
+    return float(np.sqrt(np.median(density) / np.log(2) / 2))
+
+
+def _above(
+    signal: Float[np.ndarray, " sample"], least: float, cycle: int
+) -> Float[np.ndarray, " sample"]:
+    """A decay as long as the largest value of each cycle is above noise."""
+    count = len(signal) // cycle
+    sizes = np.abs(signal[: count * cycle]).reshape(count, cycle).max(axis=1)
+    quiet = np.flatnonzero(sizes < least)
+    return signal[: (int(quiet[0]) + 1) * cycle] if quiet.size else signal

@@ -80,7 +80,7 @@ def resonant_decay(
     if reading not in get_args(Reading):
         raise ValueError(f"`reading` must be one of {get_args(Reading)}, but is {reading!r}.")
     step = float(np.mean(np.diff(times)))
-    every, settled = times, slice(None)
+    whole, settled = times, slice(None)
     if band is not None:
         signal, settled = _filtered(signal, step, band)
         times, signal = times[settled], signal[settled]
@@ -94,10 +94,10 @@ def resonant_decay(
     notes = [Fact("decay_read_by", reading=reading)]
     if band is not None:
         # The decay that was read, read with and without the filter: nothing else differs.
-        decay = _fitted_decay(lines, every)
+        decay = _fitted_decay(lines, whole)
         with_filter, without = (
-            _at_times(_local_lines(_TRACES[reading](times, one[settled]), None, window), lines)
-            for one in (_filtered(decay, step, band)[0], decay)
+            _at_times(_local_lines(_TRACES[reading](times, record[settled]), None, window), lines)
+            for record in (_filtered(decay, step, band)[0], decay)
         )
         bias = with_filter - without
         notes.append(_of_bias(bias, lines))

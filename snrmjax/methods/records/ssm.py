@@ -197,7 +197,7 @@ def _selected(
     starts: list[NormalForm] = []
     for terms in range(1, (wanted or _MOST_TERMS) + 1):
         starts.append(_started(times, coordinate, orders, terms))
-        tried = [_with_terms(one, terms) for one in starts]
+        tried = [_with_terms(form, terms) for form in starts]
         fit = _fitted(times, signal, tried if best is None else [*tried, best.form])
         if fit is None:
             return best
@@ -240,7 +240,7 @@ def _started(
 
 def _fitted(times: np.ndarray, signal: np.ndarray, starts: list[NormalForm]) -> _Fit | None:
     """The trajectory that fits best from the best of some starts, or None where there is none."""
-    squares = [float(np.mean(_trial(one, times, signal, 1.0).residuals ** 2)) for one in starts]
+    squares = [float(np.mean(_trial(form, times, signal, 1.0).residuals ** 2)) for form in starts]
     if not np.isfinite(squares).any():
         return None
     form = starts[int(np.nanargmin(squares))]
@@ -251,8 +251,8 @@ def _fitted(times: np.ndarray, signal: np.ndarray, starts: list[NormalForm]) -> 
 
         def evaluate(points: np.ndarray, unit: float = unit) -> list[_Trial]:
             return [
-                _trial(form_of(one, terms, orders, form.scale), times, signal, unit)
-                for one in points
+                _trial(form_of(point, terms, orders, form.scale), times, signal, unit)
+                for point in points
             ]
 
         [fit] = minimise(

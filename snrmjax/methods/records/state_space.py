@@ -112,12 +112,14 @@ def model_resonances(
 
     def residual(unknowns: Array, coefficients: Array, amplitude: Array) -> Array:
         """Balance of the map over an angle of Ω/rate, per unit of the amplitude."""
-        own = rebuild(coefficients)
+        model_at = rebuild(coefficients)
         angle, force = unknowns[0], unknowns[1]
         shapes = unknowns[2:].reshape(states, 2 * _HARMONICS + 1)
         push = force * jnp.cos(theta)
         now = amplitude * shapes @ waves.T
-        later = jax.vmap(lambda x, u: _next(own, x, u, exponents), (1, 0), 1)(now, amplitude * push)
+        later = jax.vmap(lambda x, u: _next(model_at, x, u, exponents), (1, 0), 1)(
+            now, amplitude * push
+        )
         cosines, sines = shapes[:, 1 : _HARMONICS + 1], shapes[:, _HARMONICS + 1 :]
         c, s = jnp.cos(order[1:] * angle), jnp.sin(order[1:] * angle)
         moved = jnp.concatenate(
@@ -125,7 +127,7 @@ def model_resonances(
         )
         balance = (later @ project.T) / amplitude - moved
         seen = jnp.sum(shapes[0::2], axis=0)
-        held = jnp.stack([seen[1] + own.feedthrough * force - 1.0, seen[_HARMONICS + 1]])
+        held = jnp.stack([seen[1] + model_at.feedthrough * force - 1.0, seen[_HARMONICS + 1]])
         return jnp.concatenate([balance.ravel(), held])
 
     by_unknowns = jax.jacfwd(residual)
@@ -166,11 +168,13 @@ def _next(model: StateSpace, state: Array, value: Array, exponents: Exponents) -
     pairs = state.reshape(-1, 2)
     (p, q), (x1, x2) = model.poles.T, pairs.T
     turned = jnp.stack([p * x1 + q * x2, p * x2 - q * x1], axis=1) + model.drive * value
-    powers = [_powers(state[k], max(one[k] for one in exponents)) for k in range(len(state))]
+    powers = [
+        _powers(state[k], max(degrees[k] for degrees in exponents)) for k in range(len(state))
+    ]
     terms = []
-    for one in exponents:
+    for degrees in exponents:
         product = jnp.ones(())
-        for k, power in enumerate(one):
+        for k, power in enumerate(degrees):
             product = product * powers[k][power] if power else product
         terms.append(product)
     return turned.ravel() + model.nonlinear @ jnp.stack(terms)

@@ -108,13 +108,13 @@ def fit_state_space(
     """
     if order not in (None, 2, 4, 6):
         raise ValueError(f"`order` must be 2, 4 or 6 (two states a mode), but is {order}.")
-    if not degrees or not all(2 <= one <= 7 for one in degrees):
+    if not degrees or not all(2 <= degree <= 7 for degree in degrees):
         raise ValueError(f"`degrees` must lie between 2 and 7, but are {degrees}.")
     records = (recordings,) if isinstance(recordings, TimeRecording) else tuple(recordings)
     channel = choose_channels(records[0], force, [motion]).responses[0]
-    for one in records:
-        if one.n_samples <= _MOST_RECORDED:
-            even_record(one.time(), one.values([motion])[0])
+    for record in records:
+        if record.n_samples <= _MOST_RECORDED:
+            even_record(record.time(), record.values([motion])[0])
     linear = _of_velocity(
         multisine_responses(records, force, [motion], period=period, skip=skip), channel
     )
@@ -132,8 +132,8 @@ def fit_state_space(
     linear_misfit = _misfit(start, fitted, exponents)
     near = regressed(fitted, natural, exponents) if order == 2 else None
     starts = [start] if near is None else [start, near]
-    shot = [_over_stretches(one, fitted, exponents, natural) for one in starts]
-    first = min([*starts, *shot], key=lambda one: _misfit(one, fitted, exponents))
+    shot = [_over_stretches(start, fitted, exponents, natural) for start in starts]
+    first = min([*starts, *shot], key=lambda start: _misfit(start, fitted, exponents))
     model, covariance, states = _fitted(first.model, first.states[:, 0], fitted, exponents, natural)
     simulated = _simulated(model, states, fitted, exponents)
     misfit = _relative(simulated, fitted.velocity)
@@ -232,7 +232,7 @@ def _mean_periods(
             once = record.values(names, start, start + samples)
             spectra.append(np.fft.rfft(once, axis=1) * 2 / samples * both)
         means.append(np.mean(spectra, axis=0))
-        scatter = np.var([one[1] for one in spectra], axis=0, ddof=1) / len(spectra)
+        scatter = np.var([spectrum[1] for spectrum in spectra], axis=0, ddof=1) / len(spectra)
         noise.append(scatter)
     lines = min(samples, wanted) // 2  # the line at half the rate is left out
     cut = np.zeros((len(means), 2, wanted // 2 + 1), dtype=complex)
@@ -309,25 +309,19 @@ def _over_stretches(start: Start, periods: Periods, exponents: Exponents, natura
     force = jnp.asarray(periods.force.reshape(-1, length))
     target = periods.velocity.reshape(-1, length)
     flat, rebuild = ravel_pytree(start.model)
-    own = start.states[:, ::length].reshape(-1, states)
+    firsts = start.states[:, ::length].reshape(-1, states)
 
     def evaluate(points: np.ndarray, unit: float) -> list[StateSpaceTrial]:
         trials = []
-        for one in points:
-            first = jnp.asarray(one[len(flat) :].reshape(-1, states))
-            model = rebuild(jnp.asarray(one[: len(flat)]))
+        for point in points:
+            first = jnp.asarray(point[len(flat) :].reshape(-1, states))
+            model = rebuild(jnp.asarray(point[: len(flat)]))
             found, slopes = _in_bounds(*_output_slopes(model, first, force, exponents))
-            steep = np.zeros((*found.shape, len(one)))
-            steep[..., : len(flat)] = slopes[..., : len(flat)]
-            for k in range(len(steep)):
-                at = len(flat) + k * states
-                steep[k, :, at : at + states] = slopes[k, :, len(flat) :]
-            trials.append(
-                StateSpaceTrial((found - target).ravel() / unit, steep.reshape(-1, len(one)) / unit)
-            )
+            steep = _with_own_states(slopes, len(flat)) / unit
+            trials.append(StateSpaceTrial((found - target).ravel() / unit, steep))
         return trials
 
-    point = np.concatenate([np.asarray(flat), own.ravel()])
+    point = np.concatenate([np.asarray(flat), firsts.ravel()])
     for _ in range(2):  # the unit is what the fit before left
         left = evaluate(point[None], 1.0)[0].residuals
         unit = float(np.sqrt(np.mean(left**2)))
@@ -357,20 +351,14 @@ def _fitted(
 
     def evaluate(points: np.ndarray, std: np.ndarray) -> list[StateSpaceTrial]:
         trials = []
-        for one in points:
-            model = rebuild(jnp.asarray(one[: len(flat)]))
-            first = jnp.asarray(one[len(flat) :].reshape(count, states))
+        for point in points:
+            model = rebuild(jnp.asarray(point[: len(flat)]))
+            first = jnp.asarray(point[len(flat) :].reshape(count, states))
             found, slopes = _in_bounds(*_output_slopes(model, first, force, exponents))
             left = (_spectrum(found, lines) - target) / std
-            steep = np.zeros((count, len(lines), len(one)), dtype=complex)
             steepness = _spectrum(np.moveaxis(slopes, 2, 1), lines) / std
-            for k, part in enumerate(np.moveaxis(steepness, 1, 2)):
-                own = len(flat) + k * states
-                steep[k, :, : len(flat)] = part[:, : len(flat)]
-                steep[k, :, own : own + states] = part[:, len(flat) :]
-            trials.append(
-                StateSpaceTrial(as_real(left.ravel()), as_real(steep.reshape(-1, len(one))))
-            )
+            steep = _with_own_states(np.moveaxis(steepness, 1, 2), len(flat))
+            trials.append(StateSpaceTrial(as_real(left.ravel()), as_real(steep)))
         return trials
 
     left = _spectrum(_simulated(start, starts, periods, exponents), lines) - target
@@ -395,6 +383,15 @@ def _fitted(
         inverse[: len(flat), : len(flat)],
         point[len(flat) :].reshape(count, states),
     )
+
+
+def _with_own_states(slopes: np.ndarray, shared: int) -> np.ndarray:
+    """Slopes of stretches (stretch, row, …) by `shared` coefficients and each by its own state."""
+    count, rows, width = slopes.shape
+    by_states = np.zeros((count, rows, count, width - shared), dtype=slopes.dtype)
+    by_states[np.arange(count), :, np.arange(count)] = slopes[..., shared:]
+    blocks = [slopes[..., :shared], by_states.reshape(count, rows, -1)]
+    return np.concatenate(blocks, axis=2).reshape(count * rows, -1)
 
 
 def _lines(periods: Periods, natural: float) -> np.ndarray:

@@ -134,12 +134,14 @@ def regressed(periods: Periods, natural: float, exponents: Exponents) -> Start |
     highest = HIGHEST * natural / (2 * np.pi * periods.rate) * count
     spectra[:, (line == 0) | (line > highest)] = 0
     turning = np.where(line == 0, 1.0, 2 * np.pi * line / count * periods.rate / natural)
-    seen = [np.fft.irfft(one, count, axis=1) for one in (spectra, spectra / (1j * turning))]
+    seen = [
+        np.fft.irfft(spectrum, count, axis=1) for spectrum in (spectra, spectra / (1j * turning))
+    ]
     states = np.stack(seen, axis=-1)
     turn = np.eye(2)
     for _ in range(2):  # in these coordinates, then in those of the model
         now = states @ turn.T
-        terms = [np.prod(now**one, axis=-1) for one in exponents]
+        terms = [np.prod(now**powers, axis=-1) for powers in exponents]
         design = np.stack([now[..., 0], now[..., 1], periods.force, *terms], axis=-1)
         later = np.roll(now, -1, axis=1)
         table = design.reshape(-1, design.shape[-1])

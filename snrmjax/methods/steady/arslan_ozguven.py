@@ -47,27 +47,27 @@ def describing_function(states: SensorStates, modes: LinearModes) -> Complex[np.
         modal @ (flexible * np.asarray(modes.participation))
         - rigid @ np.asarray(modes.rigid_body_participation) / square[:, 0]
     )
-    own = modal @ flexible**2 - rigid @ rigid / square[:, 0]
-    return (driven * states.force - states.displacement) / (own * states.displacement)
+    direct = modal @ flexible**2 - rigid @ rigid / square[:, 0]
+    return (driven * states.force - states.displacement) / (direct * states.displacement)
 
 
 def _point(states: SensorStates, k: int, modes: LinearModes) -> MethodPoint:
     """The mode that one state implies, with 1σ by differences of amplitude and phase."""
-    one = states.of(np.array([k]))
-    found = _mode_of(one, modes)
+    state = states.of(np.array([k]))
+    found = _mode_of(state, modes)
     if found is None:
-        return MethodPoint(MethodStatus.NOT_A_MODE, int(one.level[0]))
+        return MethodPoint(MethodStatus.NOT_A_MODE, int(state.level[0]))
     natural, ratio = found
     step = 1e-6
     slopes = []
     for turned in (1 + step, np.exp(1j * step)):
-        moved = _mode_of(one._replace(velocity=one.velocity * turned), modes)
+        moved = _mode_of(state._replace(velocity=state.velocity * turned), modes)
         slopes.append(np.nan * np.zeros(2) if moved is None else (np.array(moved) - found) / step)
-    std = np.hypot(slopes[0] * one.amplitude_std, slopes[1] * one.phase_std)
+    std = np.hypot(slopes[0] * state.amplitude_std, slopes[1] * state.phase_std)
     return MethodPoint(
         MethodStatus.FOUND,
-        int(one.level[0]),
-        natural * float(np.abs(one.displacement)[0]),
+        int(state.level[0]),
+        natural * float(np.abs(state.displacement)[0]),
         natural,
         float(std[0]),
         ratio,
@@ -75,18 +75,18 @@ def _point(states: SensorStates, k: int, modes: LinearModes) -> MethodPoint:
     )
 
 
-def _mode_of(one: SensorStates, modes: LinearModes) -> tuple[float, float] | None:
+def _mode_of(state: SensorStates, modes: LinearModes) -> tuple[float, float] | None:
     """ω̃ and ζ̃ of the mode of interest with the element of one state; None where it has none."""
-    v = complex(describing_function(one, modes)[0])
+    v = complex(describing_function(state, modes)[0])
     shape = np.asarray(modes.mode_shape)[reference_sensor(modes)]
     natural = np.asarray(modes.natural_frequency)
     stiffness = np.diag(natural**2) + v.real * np.outer(shape, shape)
     squares, vectors = np.linalg.eigh(stiffness)
-    own = int(np.argmax(np.abs(vectors[modes.mode_of_interest])))
-    mode = vectors[:, own]
-    added = v.imag / float(one.frequency[0]) * float(shape @ mode) ** 2
+    k = int(np.argmax(np.abs(vectors[modes.mode_of_interest])))
+    mode = vectors[:, k]
+    added = v.imag / float(state.frequency[0]) * float(shape @ mode) ** 2
     damping = float(mode**2 @ (2 * np.asarray(modes.damping_ratio) * natural)) + added
-    if not (squares[own] > 0 and damping > 0):
+    if not (squares[k] > 0 and damping > 0):
         return None
-    frequency = float(np.sqrt(squares[own]))
+    frequency = float(np.sqrt(squares[k]))
     return frequency, damping / (2 * frequency)

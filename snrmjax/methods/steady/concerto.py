@@ -39,7 +39,7 @@ def concerto(data: SteadyStates, modes: LinearModes) -> MethodResult:
     frequencies), no more than one amplitude on each side.
     """
     states = sensor_states(data, modes, any_scale=True)
-    points = [point for level, one in states.levels() for point in _pairs(level, one)]
+    points = [point for level, at_level in states.levels() for point in _pairs(level, at_level)]
     return method_result("concerto", points, len(states.level))
 
 
@@ -50,11 +50,11 @@ def _pairs(level: int, states: SensorStates) -> list[MethodPoint]:
     size = np.abs(states.displacement)
     below, above = (_rising(states, side) for side in (states.phase >= 0, states.phase < 0))
     points = []
-    for own, other in ((below, above), (above, below)):
+    for side, other in ((below, above), (above, below)):
         if len(other) < 2:
             continue
         reach = size[other]
-        for k in own:
+        for k in side:
             if not reach[0] * (1 - _ROUNDING) <= size[k] <= reach[-1] * (1 + _ROUNDING):
                 continue
             upper = int(np.clip(np.searchsorted(reach, size[k]), 1, len(other) - 1))

@@ -33,22 +33,24 @@ def sections_of(states: SensorStates) -> tuple[list[AmplitudeSection], list[int]
     is, all are cut at amplitudes that several of them reach, interpolated on each side.
     """
     levels = dict(states.levels())
-    held = [level for level, one in levels.items() if displacement_spread(one) <= CONTROLLED]
+    held = [
+        level for level, at_level in levels.items() if displacement_spread(at_level) <= CONTROLLED
+    ]
     if held:
         return [_controlled(level, levels[level]) for level in held], held
     sides = [
         side
-        for one in levels.values()
-        for rows in (one.phase >= 0, one.phase < 0)
-        if (side := _rising(one.of(rows))) is not None
+        for at_level in levels.values()
+        for rows in (at_level.phase >= 0, at_level.phase < 0)
+        if (side := _rising(at_level.of(rows))) is not None
     ]
     if not sides:
         return [], []
     # Each side reaches a range of amplitudes; a section needs enough sides that reach it.
-    low = min(float(np.abs(one.displacement)[0]) for one in sides)
-    high = max(float(np.abs(one.displacement)[-1]) for one in sides)
+    low = min(float(np.abs(side.displacement)[0]) for side in sides)
+    high = max(float(np.abs(side.displacement)[-1]) for side in sides)
     cut = [_cut(amplitude, sides) for amplitude in np.geomspace(low, high, _SECTIONS)]
-    return [one for one in cut if len(one.frequency) >= _LEAST], []
+    return [section for section in cut if len(section.frequency) >= _LEAST], []
 
 
 def displacement_spread(states: SensorStates) -> float:
@@ -78,8 +80,8 @@ def _cut(amplitude: float, sides: list[SensorStates]) -> AmplitudeSection:
             each = 1 / side.receptance
             real, imag = (np.interp(amplitude, size, part) for part in (each.real, each.imag))
             found.append((np.interp(amplitude, size, side.frequency), real + 1j * imag))
-    found.sort(key=lambda one: one[0])
-    frequency = np.array([one[0] for one in found])
+    found.sort(key=lambda row: row[0])
+    frequency = np.array([row[0] for row in found])
     return AmplitudeSection(
-        -1, amplitude, frequency, np.array([one[1] for one in found], dtype=complex)
+        -1, amplitude, frequency, np.array([row[1] for row in found], dtype=complex)
     )

@@ -61,15 +61,15 @@ def force_surface(data: SteadyStates, modes: LinearModes) -> ForceSurface:
             "two levels of held displacement or more with three states each are needed, but the "
             f"data have {len(sections)}."
         )
-    low = max(one.frequency[0] for one in sections)
-    high = min(one.frequency[-1] for one in sections)
+    low = max(section.frequency[0] for section in sections)
+    high = min(section.frequency[-1] for section in sections)
     if not low < high:
         raise ValueError("levels must share a range of frequencies.")
-    every = np.unique(np.concatenate([one.frequency for one in sections]))
-    frequency = every[(every >= low) & (every <= high)]
-    rows = sorted(sections, key=lambda one: one.amplitude)
-    forces = [one.amplitude * _interpolated(frequency, one) for one in rows]
-    return ForceSurface(np.array([one.amplitude for one in rows]), frequency, np.array(forces))
+    frequencies = np.unique(np.concatenate([section.frequency for section in sections]))
+    frequency = frequencies[(frequencies >= low) & (frequencies <= high)]
+    rows = sorted(sections, key=lambda section: section.amplitude)
+    forces = [row.amplitude * _interpolated(frequency, row) for row in rows]
+    return ForceSurface(np.array([row.amplitude for row in rows]), frequency, np.array(forces))
 
 
 def harmonic_force_surface(data: SteadyStates, modes: LinearModes) -> MethodResult:
@@ -85,16 +85,16 @@ def harmonic_force_surface(data: SteadyStates, modes: LinearModes) -> MethodResu
     Raises `ValueError` where the data have no forces or no phases.
     """
     sections = _usable(data, modes)
-    points = [_peak(one, drive_point(modes)) for one in sections]
+    points = [_peak(section, drive_point(modes)) for section in sections]
     if not points:
         points = [MethodPoint(MethodStatus.TOO_FEW_STATES, -1)]
-    count = sum(len(one.frequency) for one in sections)
+    count = sum(len(section.frequency) for section in sections)
     return method_result("harmonic_force_surface", points, count)
 
 
 def _usable(data: SteadyStates, modes: LinearModes) -> list[AmplitudeSection]:
     sections, _ = sections_of(sensor_states(data, modes))
-    return [one for one in sections if len(one.frequency) >= _FEWEST_STATES]
+    return [section for section in sections if len(section.frequency) >= _FEWEST_STATES]
 
 
 def _interpolated(

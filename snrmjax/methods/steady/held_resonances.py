@@ -119,9 +119,9 @@ def _points(
     slopes[order] = np.gradient(curves[order], at[order], axis=0)
     for k, slope in zip(held, slopes, strict=True):
         frequency, ratio = slope * motions[k].velocity_std
-        own = points[k]
-        points[k] = own._replace(
-            natural_frequency_std=float(np.hypot(own.natural_frequency_std, frequency)),
-            damping_ratio_std=float(np.hypot(own.damping_ratio_std, ratio)),
+        point_of_level = points[k]
+        points[k] = point_of_level._replace(
+            natural_frequency_std=float(np.hypot(point_of_level.natural_frequency_std, frequency)),
+            damping_ratio_std=float(np.hypot(point_of_level.damping_ratio_std, ratio)),
         )
     return points

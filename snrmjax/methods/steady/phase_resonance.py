@@ -34,7 +34,7 @@ def phase_resonance(data: SteadyStates, modes: LinearModes) -> MethodResult:
     Raises `ValueError` where the data have no forces or no phases.
     """
     states = sensor_states(data, modes)
-    points = [_resonance(level, one, modes) for level, one in states.levels()]
+    points = [_resonance(level, at_level, modes) for level, at_level in states.levels()]
     return method_result("phase_resonance", points, len(states.level))
 
 
@@ -56,14 +56,14 @@ def _resonance(level: int, states: SensorStates, modes: LinearModes) -> MethodPo
     held = displacement_spread(states) <= CONTROLLED
     velocity = float(weight @ (speed if held else speed / cosine))
     slope = (near.frequency[1] - near.frequency[0]) / (tangent[1] - tangent[0])
-    own = np.hypot(*(weight * near.phase_std / cosine**2))  # of the interpolated tan φ
+    tangent_std = np.hypot(*(weight * near.phase_std / cosine**2))  # of the interpolated tan φ
     amplitude = np.hypot(*(weight * near.amplitude_std))
     return MethodPoint(
         MethodStatus.FOUND,
         level,
         velocity,
         frequency,
-        abs(slope) * own,
+        abs(slope) * tangent_std,
         damping / (2 * frequency),
         damping / (2 * frequency) * amplitude,
     )

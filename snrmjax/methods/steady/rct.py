@@ -37,7 +37,7 @@ def rct(data: SteadyStates, modes: LinearModes) -> MethodResult:
     states = sensor_states(data, modes, any_scale=True)
     sections, held = sections_of(states)
     notes = () if held else (Fact("sections_between_levels", spread=CONTROLLED),)
-    points = [_mode_of(one) for one in sections]
+    points = [_mode_of(section) for section in sections]
     if not points:
         points = [MethodPoint(MethodStatus.ONE_SIDE, level) for level, _ in states.levels()]
     return method_result("rct", points, len(states.level), notes)

@@ -37,8 +37,8 @@ _WORDS = _Words()
 def sentence(fact: Fact) -> str:
     """The sentence that tells a fact.
 
-    >>> sentence(Fact("power_in_one_shape", share=0.987))
-    'one shape holds 98.7 % of the power'
+    >>> sentence(Fact("record_left_out", why="it is clipped"))
+    'a record was left out: it is clipped'
     """
     wording = wordings()[fact.kind]
     return wording(**fact) if callable(wording) else _WORDS.format(wording, **fact)

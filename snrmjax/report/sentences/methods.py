@@ -41,8 +41,6 @@ SENTENCES: dict[str, Wording] = {
         "bias of the filter, estimated: up to {frequency:%.2g} of the frequency and {damping:%.2g} "
         "of the damping"
     ),
-    "ring_down_read": "ring-down {number} from {start_s:.6g} s, read down to {least:.3g} {unit}",
-    "power_in_one_shape": "one shape holds {share:%.4g} of the power",
     "record_sorted": _record_sorted,
     "data_left_out": "left out: {why}",
     "steps_settled": "{n} of {n_steps} settled",

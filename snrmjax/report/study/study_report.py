@@ -36,7 +36,7 @@ _RANKS = 3  # quantities that the table of main effects has for each output
 _LONGEST = 120  # letters of a status that a table shows
 _ROWS, _COLUMNS = 4, 4  # panels of a figure of main effects
 _PANELS = 12  # of a figure of distributions
-_SPREAD = ("n_folds", "n_isolated", "n_solved")  # counts whose distribution is worth a panel
+_SPREAD = ("n_folds", "n_solved")  # counts whose distribution is worth a panel
 _ANSWERS, _MOST_ANSWERS = ("verdict", "effects"), 12
 _TELLING = 5  # quantities along which failures are drawn
 

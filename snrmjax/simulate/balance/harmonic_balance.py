@@ -266,8 +266,10 @@ def resonance_displacement(model: Structure, force: float) -> float:
     omega = np.sqrt(stiffness[j] / mass[j])
     least_damping = 1e-4 * omega
     load = abs(force * participation[j])
-    own = dict(zip(model.potential.monomials, np.asarray(model.potential.coefficient), strict=True))
-    quartic = max(3.0 * float(own.get((j,) * 4, 0.0)), 0.0)
+    values = dict(
+        zip(model.potential.monomials, np.asarray(model.potential.coefficient), strict=True)
+    )
+    quartic = max(3.0 * float(values.get((j,) * 4, 0.0)), 0.0)
     static = float(np.max(np.abs(force * participation / stiffness)))
     if load == 0:
         return static

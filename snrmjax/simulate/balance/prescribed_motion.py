@@ -46,11 +46,11 @@ class Secants(NamedTuple):
 
 def start_of(point: Float[Array, " unknown"]) -> Secants:
     """A point of whose neighbourhood nothing is known."""
-    none = nothing_of(point)
-    return Secants(point, none + jnp.zeros((_SECANTS, point.shape[0])), none.astype(int))
+    zero = batched_zero(point)
+    return Secants(point, zero + jnp.zeros((_SECANTS, point.shape[0])), zero.astype(int))
 
 
-def nothing_of(point: Float[Array, " unknown"]) -> Float[Array, ""]:
+def batched_zero(point: Float[Array, " unknown"]) -> Float[Array, ""]:
     """Zero, a number of every point.
 
     A loop of many points whose first state is theirs throughout is traced once; else again and
@@ -103,9 +103,9 @@ class PrescribedMotion(eqx.Module):
             rigid = -1j * jnp.abs(force) / self.frequency * share[:, None] * per_force
             velocity = velocity + rigid
         size, seen = jnp.abs(force)[None], velocity[None]
-        own = displacement_phasors(coefficients)[1, modes.mode_of_interest]
+        modal = displacement_phasors(coefficients)[1, modes.mode_of_interest]
         for effect in self.model.measurement_effects:
-            size, seen = effect.recorded(self.frequency[None], size, seen, jnp.abs(own)[None])
+            size, seen = effect.recorded(self.frequency[None], size, seen, jnp.abs(modal)[None])
         return size[0] * phase, seen[0] * phase**order
 
     def solved(self, start: Float[Array, " unknown"]) -> Float[Array, " unknown"]:
@@ -169,8 +169,8 @@ class PrescribedMotion(eqx.Module):
             now, far, enough = state
             return (now.taken < 1) | ((now.taken < _SECANTS) & (far > enough))  # false for NaN
 
-        none = nothing_of(near.point)
-        first = (start_of(near.point), none, none)
+        zero = batched_zero(near.point)
+        first = (start_of(near.point), zero, zero)
         found, far, _ = jax.lax.while_loop(going, step, first)
         return found._replace(point=jnp.where(far <= _CLOSE, found.point, jnp.nan))
 

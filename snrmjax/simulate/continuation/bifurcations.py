@@ -46,12 +46,12 @@ def with_bifurcations(
             crossings += [k] if outside[k] != outside[following] else []
             continue
         # At a fold one multiplier crosses +1 anyway; others may cross elsewhere beside it.
-        own = abs(int(beyond_one[following]) - int(beyond_one[k]))
-        if own == 0:
+        of_the_fold = abs(int(beyond_one[following]) - int(beyond_one[k]))
+        if of_the_fold == 0:
             quiet_folds.append(k + 1)
         beside = [m for m in range(k, following) if rest[m] != rest[m + 1]]
         beside_fold += beside
-        crossings += beside or ([following - 1] if own > 1 else [])
+        crossings += beside or ([following - 1] if of_the_fold > 1 else [])
     # Truncated harmonics turn the curve a little beside the place where the motion loses its
     # stability: a crossing of +1 next to a fold without one is the fold's own.
     for fold in quiet_folds:
@@ -96,8 +96,8 @@ def _located_bifurcations(
         radius = np.sort(np.where(free, 0.0, np.abs(rows)), axis=1)
         return radius[np.arange(len(rows)), -last[which]] - (1.0 + MARGIN)
 
-    every = np.arange(len(crossings))
-    begin, end = (heights(rows, every) for rows in ends)
+    numbers = np.arange(len(crossings))
+    begin, end = (heights(rows, numbers) for rows in ends)
 
     def motions(share: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, ...]:
         position = [crossings[e] for e in which.tolist()]
@@ -116,11 +116,11 @@ def _located_bifurcations(
         return values
 
     found = elementwise.find_root(
-        *(height, (np.zeros(len(every)), np.ones(len(every)))),
-        args=(every,),
+        *(height, (np.zeros(len(numbers)), np.ones(len(numbers)))),
+        args=(numbers,),
         tolerances={"xatol": _CROSSING, "xrtol": 0.0, "fatol": 0.0, "frtol": 0.0},
     )
-    points, tangents, rows, ok = motions(found.x, every)
+    points, tangents, rows, ok = motions(found.x, numbers)
     new = []
     for e, k in enumerate(crossings):
         if ok[e] and found.success[e]:

@@ -114,7 +114,7 @@ def _ramped(
 ) -> tuple[Float[Array, "member unknown"], Bool[Array, " member"]]:
     """Starts from the response at the lower frequency to a force that rises from zero."""
 
-    def one(balance: HarmonicBalance) -> tuple[Array, Array]:
+    def ramped(balance: HarmonicBalance) -> tuple[Array, Array]:
         load = balance.force * balance.load()
         frequency = ends[0] / balance.frequency_scale
 
@@ -130,7 +130,7 @@ def _ramped(
         last = curve.points[jnp.maximum(curve.n_points - 1, 0)]
         return last.at[-1].set(frequency), curve.status == int(CurveStatus.UPPER_END)
 
-    return mapped(one, balances)
+    return mapped(ramped, balances)
 
 
 @compiled
@@ -147,7 +147,7 @@ def _trace(
     Those not wanted do not start.
     """
 
-    def one(balance: HarmonicBalance, wanted: Array, start: Array | None = None) -> Curve:
+    def traced(balance: HarmonicBalance, wanted: Array, start: Array | None = None) -> Curve:
         if start is None:
             begin = jnp.where(downward, ends[1], ends[0])
             order = balance.harmonic_order
@@ -164,4 +164,4 @@ def _trace(
             groups=(balance.n_coefficients, balance.model.n_modes),
         )
 
-    return mapped(one, balances, wanted, *(() if starts is None else (starts,)))
+    return mapped(traced, balances, wanted, *(() if starts is None else (starts,)))

@@ -40,9 +40,9 @@ def velocities_along(
     square = xp.sum(seen**2, axis=-1)
     growth = 2 * omega * (faster * square + omega * xp.sum(seen * change, axis=-1))
     # The velocity is Ω (sine + i cosine).
-    own, rate = sign * pairs[..., j], sign * turns[..., j]
-    parts = omega[..., None] * own
-    slopes = faster[..., None] * own + omega[..., None] * rate
+    modal, rate = sign * pairs[..., j], sign * turns[..., j]
+    parts = omega[..., None] * modal
+    slopes = faster[..., None] * modal + omega[..., None] * rate
     return (
         xp.concatenate([xp.stack([omega, omega**2 * square], axis=-1), parts], axis=-1),
         xp.concatenate([xp.stack([faster, growth], axis=-1), slopes], axis=-1),
@@ -59,7 +59,7 @@ def _locate(
     wanted: Array,
     steps: StepControl,
 ) -> LocatedEvent:
-    def one(balance: HarmonicBalance, *row: Array) -> LocatedEvent:
+    def located(balance: HarmonicBalance, *row: Array) -> LocatedEvent:
         kind, here, tangent, there, wanted = row
 
         def test(point: Array, direction: Array) -> Array:
@@ -68,7 +68,7 @@ def _locate(
 
         return locate_event(balance.linearised, test, here, tangent, there, steps, wanted)
 
-    return mapped(one, balances, kind, here, tangent, there, wanted)
+    return mapped(located, balances, kind, here, tangent, there, wanted)
 
 
 @compiled
@@ -87,7 +87,7 @@ def _between(
     Guessed by the cubic through both neighbours with their tangents.
     """
 
-    def one(balance: HarmonicBalance, *row: Array) -> tuple:
+    def corrected(balance: HarmonicBalance, *row: Array) -> tuple:
         here, tangent, there, arriving, share, wanted = row
         length = tangent @ (there - here)
         chord = there - here
@@ -99,7 +99,7 @@ def _between(
         found = correct(balance.linearised, guess, tangent, steps.tolerance, patience)
         return found.point, found.tangent, found.converged
 
-    return mapped(one, balances, here, tangent, there, arriving, share, wanted)
+    return mapped(corrected, balances, here, tangent, there, arriving, share, wanted)
 
 
 def _in_blocks(

@@ -57,7 +57,7 @@ def _by_kicks(
     López-Marcos, Sanz-Serna & Skeel, SIAM J. Sci. Comput. 18 (1997) 223,
     doi:10.1137/S1064827595288085.
     """
-    n, n_points, own = model.n_modes, frequency.shape[0], np.arange(model.n_modes)
+    n, n_points, modes = model.n_modes, frequency.shape[0], np.arange(model.n_modes)
     terms = model.linear_terms()
     orders = np.arange(1, (coefficients.shape[1] - 1) // 2 + 1)
     rows = jnp.moveaxis(coefficients, 0, 2).reshape(coefficients.shape[1], n * n_points)
@@ -72,9 +72,9 @@ def _by_kicks(
         return jnp.moveaxis(tangent.reshape(n, n, len(tau), n_points), 2, 0) / per_mass
 
     varying = stiffness(2 * jnp.pi * jnp.arange(48) / 48)
-    mean = jnp.mean(varying, axis=0)[own, own]
+    mean = jnp.mean(varying, axis=0)[modes, modes]
     linear = terms.stiffness[:, None] / per_mass[:, 0]
-    rate = jnp.max(jnp.sum(jnp.abs(varying.at[:, own, own].add(linear)), axis=2))
+    rate = jnp.max(jnp.sum(jnp.abs(varying.at[:, modes, modes].add(linear)), axis=2))
     kicks = jnp.maximum(_KICKS * steps_per_cycle * jnp.nan_to_num(jnp.sqrt(rate)), _LEAST_KICKS)
     n_segments, step = _segments(kicks, _KICKS * _MOST_SEGMENTS)
     speed = jnp.max(terms.stiffness / terms.mass) ** 0.5 / frequency  # of δq̇, over Ω
@@ -90,7 +90,7 @@ def _by_kicks(
 
     def segment(number: Array, state: tuple) -> tuple:
         tau = (number * _SEGMENT + jnp.arange(_SEGMENT) + 0.5) * step
-        k = stiffness(tau).at[:, own, own].add(-mean)
+        k = stiffness(tau).at[:, modes, modes].add(-mean)
         square = sum(k[:, :, j, None] * k[:, None, j] for j in range(n))
         return jax.lax.scan(kick, state, (k - step**2 / 12 * square) * (step / speed))[0]
 
@@ -150,10 +150,10 @@ def _by_magnus(
             dragged = jnp.repeat(jnp.sum(jnp.where(held, 0.0, per_mass), axis=2), 3, axis=0)
             k = k.at[:, :, j, j].add(-dragged)
             a = a.at[:, :, n + j, 2 * n].set(1.0 / unit)
-        own = np.arange(n)
-        a = a.at[:, :, own, n + own].set(unit[:, None])
+        modes = np.arange(n)
+        a = a.at[:, :, modes, n + modes].set(unit[:, None])
         a = a.at[:, :, n : 2 * n, :n].set(-k / unit[:, None, None])
-        a = a.at[:, :, n + own, n + own].set(-c)
+        a = a.at[:, :, n + modes, n + modes].set(-c)
         return a.reshape(_SEGMENT, 3, n_points, size, size)
 
     def segment(number: Array, state: tuple) -> tuple:
@@ -228,8 +228,8 @@ def _sliders(
         return jnp.zeros_like(frequency), [], None
     j, n_samples = model.modes.mode_of_interest, 512
     tau = 2 * jnp.pi * jnp.arange(n_samples) / n_samples
-    every = jnp.broadcast_to(tau[:, None], (n_samples, len(frequency)))
-    q, v = (part[:, :, j] for part in _states_at(coefficients, frequency, every))
+    phases = jnp.broadcast_to(tau[:, None], (n_samples, len(frequency)))
+    q, v = (part[:, :, j] for part in _states_at(coefficients, frequency, phases))
     largest = jnp.argmax(q, axis=0)
     half_range = 0.5 * (jnp.max(q, axis=0) - jnp.min(q, axis=0))
     typical = jnp.sqrt(jnp.mean(v**2, axis=0))

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from enum import StrEnum
 from typing import ClassVar
 
 import equinox as eqx
@@ -20,9 +21,7 @@ from snrmjax.simulate.continuation.continuation import CurveStatus, StepControl,
 from snrmjax.simulate.continuation.events import with_events
 from snrmjax.simulate.continuation.stability import (
     Stability,
-    StabilityLoss,
     floquet_multipliers,
-    stability_loss,
     stability_of,
 )
 
@@ -57,6 +56,16 @@ def motions_of(balance: HarmonicBalance, points: Float[np.ndarray, "point unknow
     return {**named, "sensors": modes.sensors}
 
 
+class Branch(StrEnum):
+    """How a response curve was reached."""
+
+    MAIN = "main"  # from rest
+    GIVEN_START = "isolated, from a given start"
+    PHASE_RESONANCE = "isolated, from a phase resonance"
+    EQUILIBRIUM = "about another equilibrium"
+    RANDOM_START = "isolated, from a random start"
+
+
 class ResponseCurve(MotionCurve):
     """One forced response in order along the curve, unstable parts included.
 
@@ -73,7 +82,7 @@ class ResponseCurve(MotionCurve):
     truncation: Float[np.ndarray, " point"] | None = None  # estimated, like `multipliers`
     # Kinds of events that are there but were not located.
     not_located: tuple[str, ...] = setting(default=())
-    branch: str = setting(default="main")  # or how an isolated one was reached
+    branch: Branch = setting(default=Branch.MAIN)
     n_solves: int = setting(default=0)  # linear systems factorised to trace the curve
 
     @property
@@ -93,13 +102,6 @@ class ResponseCurve(MotionCurve):
         """Which points are known to be unstable."""
         return self.stability == int(Stability.UNSTABLE)
 
-    @property
-    def stability_loss(self) -> tuple[StabilityLoss, ...]:
-        """By which kind of multiplier each point is unstable."""
-        if self.multipliers is None:
-            return (StabilityLoss.NOT_COMPUTED,) * len(self.frequency)
-        return stability_loss(self.multipliers)
-
     def at_events(self, kind: str) -> np.ndarray:
         """Indices of the points at which an event of this kind was located."""
         return np.array([k for k, e in enumerate(self.event) if kind in e.split("+")], dtype=int)
@@ -107,7 +109,7 @@ class ResponseCurve(MotionCurve):
     def summary(self) -> tuple[str, ...]:
         """Force, range, largest velocity, stability, events and status."""
         n = len(self.frequency)
-        of = "" if self.branch == "main" else f" ({self.branch})"
+        of = "" if self.branch is Branch.MAIN else f" ({self.branch})"
         lines = [f"forced response at {self.force:.4g} N{of}: {n} points"]
         if n:
             height = np.abs(self.velocity[:, 1])
@@ -149,7 +151,7 @@ def assembled(
     steps: StepControl,
     *,
     stability: bool = True,
-    branch: str = "main",
+    branch: Branch = Branch.MAIN,
 ) -> list[ResponseCurve]:
     """Curves with their events and bifurcations inserted, velocities and multipliers.
 
@@ -163,8 +165,8 @@ def assembled(
         balance, curve, truncation = taken(balances, number), labelled[number], None
         if stability:
             multipliers = floquet_multipliers(balance.model, *balance.motions(curve.points))
-            one = jax.tree.map(lambda a: np.asarray(a)[None] if eqx.is_array(a) else a, balance)
-            curve = with_bifurcations(one, curve, multipliers, steps)
+            stacked = jax.tree.map(lambda a: np.asarray(a)[None] if eqx.is_array(a) else a, balance)
+            curve = with_bifurcations(stacked, curve, multipliers, steps)
         motions = motions_of(balance, curve.points)
         if stability:
             (truncation,) = by_blocks(

@@ -1,6 +1,6 @@
 """Stability of periodic motions from the monodromy matrix of the linearised equations."""
 
-from enum import Enum, IntEnum
+from enum import IntEnum
 
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
@@ -19,16 +19,6 @@ class Stability(IntEnum):
     NOT_COMPUTED = -1  # not asked for, or the multipliers could not be computed
     UNSTABLE = 0
     STABLE = 1
-
-
-class StabilityLoss(Enum):
-    """How the multiplier farthest outside the unit circle leaves it."""
-
-    NOT_COMPUTED = "not_computed"
-    STABLE = "stable"
-    REAL = "real"  # through +1: a fold or a branch point
-    PERIOD_DOUBLING = "period_doubling"  # through −1
-    NEIMARK_SACKER = "neimark_sacker"  # as a complex pair: quasi-periodic motion
 
 
 def floquet_multipliers(
@@ -79,22 +69,3 @@ def stability_of(
     largest = np.max(np.abs(multipliers), axis=-1)
     known = np.where(largest < 1.0 + MARGIN, int(Stability.STABLE), int(Stability.UNSTABLE))
     return np.where(np.isnan(largest), int(Stability.NOT_COMPUTED), known)
-
-
-def stability_loss(
-    multipliers: Complex[np.ndarray, "point multiplier"],
-) -> tuple[StabilityLoss, ...]:
-    """By which kind of multiplier each point is unstable, the largest one deciding."""
-    kinds = []
-    for row, stability in zip(multipliers, stability_of(multipliers).tolist(), strict=True):
-        largest = row[np.argmax(np.abs(row))]
-        if stability == Stability.NOT_COMPUTED:
-            kinds.append(StabilityLoss.NOT_COMPUTED)
-        elif stability == Stability.STABLE:
-            kinds.append(StabilityLoss.STABLE)
-        elif abs(largest.imag) > 1e-9 * abs(largest):
-            kinds.append(StabilityLoss.NEIMARK_SACKER)
-        else:
-            real = StabilityLoss.REAL if largest.real > 0 else StabilityLoss.PERIOD_DOUBLING
-            kinds.append(real)
-    return tuple(kinds)

@@ -184,9 +184,9 @@ def _trace_phase(
 
     share = 0.01
     terms = model.linear_terms()
-    own = jnp.sqrt(terms.stiffness[j] / terms.mass[j])
+    natural = jnp.sqrt(terms.stiffness[j] / terms.mass[j])
     # Off resonance by the phase: tan φ = (ω² − Ω²)/(2ζωΩ), to first order in the damping.
-    begin = own - 0.5 * terms.damping[j] / terms.mass[j] * jnp.tan(phase)
+    begin = natural - 0.5 * terms.damping[j] / terms.mass[j] * jnp.tan(phase)
     x = linear_coefficients(model, share * balance.force, begin, balance.harmonic_order)
     start = jnp.append(balance.point(x, begin), share)
     rising = jnp.zeros_like(start).at[-1].set(1.0)
@@ -266,10 +266,10 @@ def _trace_response(
         return jnp.append(residual, value), jnp.concatenate([jacobian, slope[None]])
 
     begin = jnp.where(downward, ends[1], ends[0])
-    one = linear_coefficients(model, balance.force, begin, balance.harmonic_order)
-    linear = jnp.abs(velocity_phasors(one, begin, model.modes.mode_shape)[1, 0])
+    per_unit = linear_coefficients(model, balance.force, begin, balance.harmonic_order)
+    linear = jnp.abs(velocity_phasors(per_unit, begin, model.modes.mode_shape)[1, 0])
     share = velocity / linear
-    start = balance.point(share * one, begin)
+    start = balance.point(share * per_unit, begin)
     start = jnp.concatenate([start[:-1], jnp.stack([share, start[-1]])])
     onward = jnp.zeros_like(start).at[-1].set(jnp.where(downward, -1.0, 1.0))
     lower, upper = ends / balance.frequency_scale

@@ -145,8 +145,8 @@ def forced_response_batch(
         rows += found if keep_curves else []
         if progress is not None:
             progress(min(begin + chunk, len(members)), len(members))
-    names = [one.name for one in dataclasses.fields(ResponseBatch)][1:]
-    columns = {name: np.array([one[name] for one in summaries]) for name in names}
+    names = [field.name for field in dataclasses.fields(ResponseBatch)][1:]
+    columns = {name: np.array([summary[name] for summary in summaries]) for name in names}
     return ResponseBatch(**columns, curves=tuple(rows))
 
 
@@ -239,9 +239,9 @@ def _chunk_of_curves(
     jobs = [np.arange(b, min(b + _BLOCK, len(parts))) for b in range(0, len(parts), _BLOCK)]
 
     def finished(job: np.ndarray) -> list[ResponseCurve]:
-        own = taken(balances, np.array([owner[e] for e in job]))
+        mine = taken(balances, np.array([owner[e] for e in job]))
         some = [parts[e] for e in job]
-        return assembled(own, some, settings.steps, stability=settings.stability)
+        return assembled(mine, some, settings.steps, stability=settings.stability)
 
     for job, responses in zip(jobs, over_cores(finished, jobs), strict=True):
         for e, response in zip(job, responses, strict=True):
@@ -258,9 +258,9 @@ def _ends_near_rest(balances: HarmonicBalance, member: int, curve: TracedCurve) 
     model, j = balances.model, balances.model.modes.mode_of_interest
     omega = float(curve.points[-1, -1])  # over the natural frequency
     damping = float(np.asarray(model.modes.damping_ratio)[member, j])
-    own = float(np.asarray(model.modes.natural_frequency)[member, j])
+    natural = float(np.asarray(model.modes.natural_frequency)[member, j])
     load = float(balances.force[member]) * float(np.asarray(model.modes.participation)[member, j])
-    linear = load / (own**2 * (1 - omega**2 + 2j * damping * omega))
+    linear = load / (natural**2 * (1 - omega**2 + 2j * damping * omega))
     x = curve.points[-1, :-1].reshape(balances.n_coefficients, -1)[1:3, j]
     last = complex(x[0], -x[1]) * float(balances.displacement_scale[member])
     return abs(last - linear) < 0.5 * abs(linear)
@@ -315,7 +315,7 @@ def _solve_batch(
 ) -> tuple:
     harmonic_order = (start.shape[1] - 1) // 2
 
-    def one(force: Array, frequency: Array, start: Array) -> tuple[Array, Array]:
+    def solved(force: Array, frequency: Array, start: Array) -> tuple[Array, Array]:
         # A guess of zero is allowed: the static displacement keeps the unknowns of order one.
         static = force * model.modes.participation / model.modes.natural_frequency**2
         scale = jnp.maximum(jnp.max(jnp.abs(start)), jnp.max(jnp.abs(static)))
@@ -327,4 +327,4 @@ def _solve_batch(
         found = correct(balance.linearised, guess, fixed, 1e-10, 30)
         return balance.coefficients(found.point), found.converged
 
-    return mapped(one, force, frequency, start)
+    return mapped(solved, force, frequency, start)

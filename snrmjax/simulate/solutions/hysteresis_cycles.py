@@ -67,9 +67,9 @@ def integrated_cycle(
         drive = load * (orders @ jnp.cos(jnp.arange(len(orders)) * phase))
         inner = terms.stiffness * q + terms.damping * v
         inner = inner + model.memoryless_force(q[None], v[None])[0]
-        for effect, own in zip(effects, memory, strict=True):
-            inner = inner.at[j].add(effect.state_force(q[j], v[j], own))
-        rates = tuple(map(lambda e, own: memory_rate(e, q[j], v[j], own), effects, memory))
+        for effect, states in zip(effects, memory, strict=True):
+            inner = inner.at[j].add(effect.state_force(q[j], v[j], states))
+        rates = tuple(map(lambda e, states: memory_rate(e, q[j], v[j], states), effects, memory))
         return ravel_pytree((v, (drive - inner) / terms.mass, rates))[0] / frequency
 
     term, width = diffrax.ODETerm(slope), 2 * jnp.pi / n_samples
@@ -159,7 +159,9 @@ def _with_memory(
 ) -> Float[Array, " unknown"]:
     """The new state with the sliders moved along the way of q, its turning point included."""
     ends = (old[0][j], old[1][j]), (new[0][j], new[1][j])
-    moved = (memory_after_step(e, own, *ends, time) for e, own in zip(effects, new[2], strict=True))
+    moved = (
+        memory_after_step(e, states, *ends, time) for e, states in zip(effects, new[2], strict=True)
+    )
     return ravel_pytree((*new[:2], tuple(moved)))[0]
 
 

@@ -79,13 +79,13 @@ def _at_velocities(
     order = jnp.argsort(velocities)
     guesses, found = _followed(*jax.lax.stop_gradient((balance, velocities[order])), steps)
 
-    def one(guess: Array, known: Array, velocity: Array, size: Array) -> PeriodicMotion:
+    def motion_at(guess: Array, known: Array, velocity: Array, size: Array) -> PeriodicMotion:
         # With a scale of its own a small motion has all its digits beside a large one.
-        own = dataclasses.replace(balance, displacement_scale=size)
+        scaled = dataclasses.replace(balance, displacement_scale=size)
         guess = guess.at[:-1].multiply(balance.displacement_scale / size)
         start = jnp.where(known, guess, jnp.nan)
-        point, converged = root_of(own, _velocity_test, velocity, start, _ITERATIONS)
-        cosines, omega = own.coefficients(point), point[-1] * balance.frequency_scale
+        point, converged = root_of(scaled, _velocity_test, velocity, start, _ITERATIONS)
+        cosines, omega = scaled.coefficients(point), point[-1] * balance.frequency_scale
         whole = with_sines(cosines[None])[0]
         phasors = velocity_phasors(whole, omega, modes.mode_shape)
         return PeriodicMotion(
@@ -95,7 +95,7 @@ def _at_velocities(
             converged=converged,
         )
 
-    motions = mapped(one, guesses, found, velocities[order], sizes[order])
+    motions = mapped(motion_at, guesses, found, velocities[order], sizes[order])
     back = jnp.argsort(order)
     return jax.tree.map(lambda part: part[back], motions)
 
@@ -103,12 +103,10 @@ def _at_velocities(
 def _velocity_test(balance: HarmonicBalance, velocity: Array, point: Array) -> Array:
     """What vanishes at the wanted velocity: of the first sensor, towards the linear mode's side."""
     model = balance.model
-    shape, own = model.modes.mode_shape[0], model.modes.mode_of_interest
+    shape, j = model.modes.mode_shape[0], model.modes.mode_of_interest
     cosine = point[:-1].reshape(balance.n_coefficients, -1)[1]
-    unit = balance.displacement_scale * balance.frequency_scale * jnp.abs(shape[own])
-    return point[-1] * (cosine @ shape) * jnp.sign(shape[own]) / jnp.abs(shape[own]) - (
-        velocity / unit
-    )
+    unit = balance.displacement_scale * balance.frequency_scale * jnp.abs(shape[j])
+    return point[-1] * (cosine @ shape) * jnp.sign(shape[j]) / jnp.abs(shape[j]) - (velocity / unit)
 
 
 def _followed(
@@ -116,14 +114,14 @@ def _followed(
 ) -> tuple[Float[Array, "velocity unknown"], Array]:
     """Points of the mode at rising velocities, and which of them were found."""
     model = balance.model
-    n, own = model.n_modes, model.modes.mode_of_interest
-    shape = jnp.abs(model.modes.mode_shape[0, own])
+    n, j = model.n_modes, model.modes.mode_of_interest
+    shape = jnp.abs(model.modes.mode_shape[0, j])
     before = jnp.concatenate([jnp.zeros(1), velocities[:-1]])
     share = jnp.arange(1, steps + 1) / steps
     levels = (before[:, None] + (velocities - before)[:, None] * share).reshape(-1)
     rest = jnp.zeros(balance.size + 1).at[-1].set(1.0)
     unit = balance.displacement_scale * balance.frequency_scale * shape
-    slope = jnp.zeros(balance.size + 1).at[n + own].set(1 / unit)
+    slope = jnp.zeros(balance.size + 1).at[n + j].set(1 / unit)
 
     def step(carry: tuple, level: Array) -> tuple[tuple, tuple]:
         point, slope, last, good = carry

@@ -128,27 +128,6 @@ def _periodic_motion(
     )
 
 
-def turning(
-    model: Structure, force: Float[Array, ""], motion: PeriodicMotion, condition: Condition
-) -> Float[Array, ""]:
-    """Which way the response curve turns at a fold or a peak; 1 for the other conditions.
-
-    The second derivative along the curve, scaled: of Ω at a fold (negative where the curve turns
-    back from higher frequencies), of |V₁|² at a peak (negative at a maximum).
-    """
-    if condition not in ("fold", "peak"):
-        return jnp.ones(())
-    model = simulated_structure(model)
-    scale = jnp.max(jnp.abs(motion.coefficients))
-    order = (motion.coefficients.shape[0] - 1) // 2
-    balance = harmonic_balance(model, force, scale, harmonic_order=order)
-    point = balance.point(motion.coefficients, motion.frequency)
-    border = _generic(point.shape[0])
-    tangent = _tangent_near(balance.linearised, point, border)
-    zero = jnp.zeros(())
-    return jax.jvp(lambda p: _test(balance, condition, zero, border, p), (point,), (tangent,))[1]
-
-
 def response_at_velocities(
     model: Structure,
     curve: ResponseCurve,
@@ -181,13 +160,13 @@ def motions_at_velocities(
     differentiable as `periodic_motion` is.
     """
 
-    def one(coefficients: Array, frequency: Array, value: Array) -> PeriodicMotion:
+    def motion_near(coefficients: Array, frequency: Array, value: Array) -> PeriodicMotion:
         start = (coefficients, frequency)
         return periodic_motion(model, force, start, condition="velocity", value=value)
 
     coefficients, frequency = (jnp.asarray(part, dtype=jnp.float64) for part in starts)
     values = jnp.broadcast_to(jnp.asarray(velocities, dtype=jnp.float64), frequency.shape)
-    return mapped(one, coefficients, frequency, values)
+    return mapped(motion_near, coefficients, frequency, values)
 
 
 def _crossings(

@@ -125,17 +125,13 @@ def settled_motion(
     >>> bool(motion.converged), bool(abs(motion.velocity[1] / exact - 1).max() < 1e-4)
     (True, True)
     """
-    positive("force", force)
     positive("frequency", frequency)
-    frequency = jnp.asarray(frequency, dtype=jnp.float64)
-    motions = _stepped(
-        simulated_structure(model),
-        jnp.asarray(force, dtype=jnp.float64),
-        frequency[None],
-        jnp.asarray(model.test_order)[None],
-        _start_state(model, start),
-        harmonic_order,
-        _settings(max_cycles, accuracy),
+    motions = stepped_sine(
+        *(model, force, jnp.asarray(frequency, dtype=jnp.float64)[None]),
+        cycles_per_step=max_cycles,
+        start=start,
+        harmonic_order=harmonic_order,
+        accuracy=accuracy,
     )
     return jax.tree.map(lambda part: part[0], motions)
 
@@ -165,8 +161,12 @@ def stepped_sine(
     """
     positive("force", force)
     positive("frequencies", frequencies)
+    if cycles_per_step < LEAST_CYCLES:
+        raise ValueError(
+            f"a motion needs {LEAST_CYCLES} cycles or more to settle, but gets {cycles_per_step}."
+        )
     frequencies = jnp.asarray(frequencies, dtype=jnp.float64)
-    if frequencies.ndim != 1 or not frequencies.size:
+    if frequencies.ndim != 1:
         raise ValueError(
             f"`frequencies` must be a vector of steps, but has shape {frequencies.shape}."
         )
@@ -184,7 +184,7 @@ def stepped_sine(
         test_orders,
         _start_state(model, start),
         harmonic_order,
-        _settings(cycles_per_step, accuracy),
+        _Settings(jnp.asarray(cycles_per_step), *(jnp.asarray(part) for part in accuracy)),
     )
 
 
@@ -192,14 +192,6 @@ class _Settings(NamedTuple):
     max_cycles: Int[Array, ""]
     tolerance: Float[Array, ""]
     rtol: Float[Array, ""]
-
-
-def _settings(max_cycles: int, accuracy: IntegrationAccuracy) -> _Settings:
-    if max_cycles < LEAST_CYCLES:
-        raise ValueError(
-            f"a motion needs {LEAST_CYCLES} cycles or more to settle, but gets {max_cycles}."
-        )
-    return _Settings(jnp.asarray(max_cycles), *(jnp.asarray(part) for part in accuracy))
 
 
 def _start_state(model: Structure, start: Any) -> Float[Array, "2 mode"]:

@@ -1,5 +1,7 @@
 """States at given phases of the mode of interest: where a test records, and what is there."""
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -84,74 +86,47 @@ def between(values: np.ndarray, point: int, share: float) -> np.ndarray:
     return values[point] + share * (values[point + 1] - values[point])
 
 
-def states_at_phases(
-    model: Structure,
-    near: VisitedStates,
-    phase: Float[np.ndarray, " state"],
-    velocity: Float[np.ndarray, " state"] | None = None,
+def states_near(
+    model: Structure, rows: Sequence[tuple[int, float, float, np.ndarray, float]]
 ) -> VisitedStates:
-    """The motions near given ones that have exactly these phases of the mode of interest.
+    """The motions near given ones that have exactly their phases of the mode of interest.
 
-    Solves the harmonic balance for the motion and its frequency, at the force of `near`, or with
-    `velocity` (m/s, fundamental at the first sensor) for the force too. A structure that drifts
-    is looked at in each state's own `order`. States that are not found are left out.
+    Arguments: `rows` in the order of the test, which takes the time from 0 to 1: level, force (N),
+    frequency (rad/s), coefficients (kg^1/2 m) and the phase (rad) asked for.
+    Solves the harmonic balance for the motion and its frequency. A structure that drifts is looked
+    at in each state's own time. States that are not found are left out.
     """
-    asked = (near.order, near.force, phase, near.frequency, near.coefficients)
-    given = np.full(len(phase), np.nan) if velocity is None else velocity
-    rows = (jnp.asarray(padded(part, 64)) for part in (*asked, given))
-    solved = _at_phases(simulated_structure(model), *rows)
-    force, frequency, coefficients, converged = (np.asarray(a)[: len(phase)] for a in solved)
-    found = near._replace(force=force, frequency=frequency, coefficients=coefficients)
+    level, force, frequency, start, phase = (np.array(c) for c in zip(*rows, strict=True))
+    order = np.linspace(0.0, 1.0, len(rows))
+    columns = (jnp.asarray(padded(part, 64)) for part in (order, force, phase, frequency, start))
+    solved = _at_phases(simulated_structure(model), *columns)
+    frequency, coefficients, converged = (np.asarray(a)[: len(rows)] for a in solved)
+    found = VisitedStates(level, order, force, frequency, coefficients)
     # Newton's method may leave for another branch.
-    size, was = (np.linalg.norm(x[:, 1:3], axis=(1, 2)) for x in (coefficients, near.coefficients))
+    size, was = (np.linalg.norm(x[:, 1:3], axis=(1, 2)) for x in (coefficients, start))
     off = np.exp(1j * (mode_phase(model, coefficients) - phase))
     return found.only(converged & (np.abs(size / was - 1) < 0.2) & (off.real > 0))
 
 
 @compiled
 def _at_phases(
-    model: Structure,
-    order: Array,
-    force: Array,
-    phase: Array,
-    frequency: Array,
-    start: Array,
-    velocity: Array,
-) -> tuple[Array, Array, Array, Bool[Array, " state"]]:
+    model: Structure, order: Array, force: Array, phase: Array, frequency: Array, start: Array
+) -> tuple[Array, Array, Bool[Array, " state"]]:
     n, j = model.n_modes, model.modes.mode_of_interest
     harmonic_order = (start.shape[1] - 1) // 2
 
-    def one(row: tuple) -> tuple[Array, Array, Array, Array]:
-        order, force, phase, frequency, start, velocity = row
+    def at_phase(row: tuple) -> tuple[Array, Array, Array]:
+        order, force, phase, frequency, start = row
         now = eqx.tree_at(lambda m: m.test_order, model, order)
         scale = jnp.max(jnp.abs(start))
         balance = harmonic_balance(now, force, scale, harmonic_order=harmonic_order)
-        prescribed = jnp.isfinite(velocity)
-        unit = jnp.where(prescribed, velocity, 1.0) / (balance.frequency_scale * scale)
-
-        def condition(point: Array) -> Array:
-            seen = point[n : 3 * n].reshape(2, n) @ model.modes.mode_shape[0]
-            miss = point[-2] ** 2 * (seen @ seen) / unit**2 - 1.0
-            return jnp.where(prescribed, miss, point[-1] - 1.0)
-
-        def linearised(point: Array) -> tuple[Array, Array]:
-            """Unknowns x, Ω/ω₀ and the force over the one given."""
-            loaded = eqx.tree_at(lambda b: b.force, balance, force * point[-1])
-            residual, jacobian = loaded.linearised(point[:-1])
-            column = -force * balance.load()
-            value, slope = jax.value_and_grad(condition)(point)
-            wide = jnp.concatenate([jacobian, column[:, None]], axis=1)
-            return jnp.append(residual, value), jnp.concatenate([wide, slope[None]])
-
-        guess = jnp.append(balance.point(start, frequency), 1.0)
+        guess = balance.point(start, frequency)
         # Velocity phasor ∝ i(a − ib) = b + ia: on the line at the phase φ.
         line = (
             jnp.zeros_like(guess).at[n + j].set(jnp.cos(phase)).at[2 * n + j].set(-jnp.sin(phase))
         )
-        found = correct(linearised, guess - (line @ guess) * line, line, 1e-10, 30)
-        point = found.point
-        motion = balance.coefficients(point)
-        omega = point[-2] * balance.frequency_scale
-        return force * point[-1], omega, motion, found.converged
+        found = correct(balance.linearised, guess - (line @ guess) * line, line, 1e-10, 30)
+        omega = found.point[-1] * balance.frequency_scale
+        return omega, balance.coefficients(found.point), found.converged
 
-    return jax.lax.map(one, (order, force, phase, frequency, start, velocity))
+    return jax.lax.map(at_phase, (order, force, phase, frequency, start))

@@ -37,32 +37,27 @@ class Instruments(NamedTuple):
 
 def check_shaker(shaker: Shaker) -> None:
     """Raise `ValueError` where a shaker's numbers cannot be."""
-    numbers = np.asarray(shaker, dtype=float)
-    if not shaker.resistance > 0 or not numbers.min() >= 0:
-        raise ValueError(f"a shaker's numbers must not be negative, but are {shaker}.")
-    if not np.isfinite(numbers[:5]).all():
-        raise ValueError(f"only the amplifier's limits may be infinite, but {shaker} has others.")
-    if min(shaker.largest_voltage, shaker.largest_current) == 0:
+    limits = min(shaker.largest_voltage, shaker.largest_current)
+    if not (shaker.resistance > 0 and limits > 0 and np.min(shaker) >= 0):
         raise ValueError(
-            f"`largest_voltage` and `largest_current` must be positive, but one is zero: {shaker}."
+            "a shaker's numbers must not be negative, and its resistance, `largest_voltage` and "
+            f"`largest_current` must be positive, but are {shaker}."
         )
+    if not np.isfinite(shaker[:5]).all():
+        raise ValueError(f"only the amplifier's limits may be infinite, but {shaker} has others.")
 
 
 def check_instruments(instruments: Instruments, sampling_rate: float) -> None:
     """Raise `ValueError` where the instruments' numbers cannot be at this rate (Hz)."""
-    one = instruments
-    if min(one.force_noise, one.velocity_noise) < 0:
-        raise ValueError(f"the instruments' noise must not be negative, but is {one}.")
-    if not one.filter_corner_hz > 0 or int(one.filter_order) != one.filter_order:
+    force, velocity, corner, order = instruments
+    if min(force, velocity) < 0:
+        raise ValueError(f"the instruments' noise must not be negative, but is {instruments}.")
+    good = int(order) == order and order >= 1
+    if not (good and (0 < corner <= sampling_rate / 2 or corner == np.inf)):
         raise ValueError(
-            f"`filter_corner_hz` must be positive and `filter_order` a whole number, but are {one}."
-        )
-    filtered = np.isfinite(one.filter_corner_hz)
-    if filtered and not (one.filter_corner_hz <= sampling_rate / 2 and one.filter_order >= 1):
-        raise ValueError(
-            f"`filter_corner_hz` must be at most half the sampling rate, {sampling_rate / 2:g} Hz, "
-            f"and `filter_order` at least 1, but are {one.filter_corner_hz:g} Hz and "
-            f"{one.filter_order}."
+            f"`filter_corner_hz` must be positive and at most half the sampling rate, "
+            f"{sampling_rate / 2:g} Hz, or infinite, and `filter_order` a whole number of at least "
+            f"1, but are {corner:g} Hz and {order}."
         )
 
 

@@ -304,8 +304,8 @@ def _equations(
             + terms.stiffness * q
             + structure.memoryless_force(q[None], v[None])[0]
         )
-        for effect, own in zip(friction, motion.memory, strict=True):
-            inner = inner.at[j].add(effect.state_force(q[j], v[j], own))
+        for effect, states in zip(friction, motion.memory, strict=True):
+            inner = inner.at[j].add(effect.state_force(q[j], v[j], states))
         free = -inner / terms.mass
         force = jnp.zeros(())
         if attached:
@@ -313,8 +313,8 @@ def _equations(
             push = pushed(drive @ q, drive @ v, voltage)
             force = (push - shaker.mass * (drive @ free)) / inertia
         memory = tuple(
-            memory_rate(effect, q[j], v[j], own)
-            for effect, own in zip(friction, motion.memory, strict=True)
+            memory_rate(effect, q[j], v[j], states)
+            for effect, states in zip(friction, motion.memory, strict=True)
         )
         return LabMotion(v, free + per_force * force, memory), force
 
@@ -341,10 +341,10 @@ def _integrator(
         four = slope(after(h, three), last)[0]
         mean = jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, one, two, three, four)
         moved = after(h, mean)
-        way = [(one.displacement[j], one.velocity[j]) for one in (motion, moved)]
+        way = [(at.displacement[j], at.velocity[j]) for at in (motion, moved)]
         memory = (
-            memory_after_step(effect, own, way[0], way[1], h)
-            for effect, own in zip(friction, moved.memory, strict=True)
+            memory_after_step(effect, states, way[0], way[1], h)
+            for effect, states in zip(friction, moved.memory, strict=True)
         )
         return moved._replace(memory=tuple(memory))
 
@@ -357,8 +357,8 @@ def _between_samples(share: Float[np.ndarray, " time"]) -> Float[np.ndarray, "ti
     others = [np.delete(at, k) for k in range(4)]
     return np.stack(
         [
-            np.prod((share[:, None] - other) / (own - other), axis=1)
-            for own, other in zip(at, others, strict=True)
+            np.prod((share[:, None] - other) / (node - other), axis=1)
+            for node, other in zip(at, others, strict=True)
         ],
         axis=1,
     )
@@ -391,9 +391,9 @@ def _fastest(structure: Structure, shaker: Shaker) -> float:
             stiffness[j, j] += float(jnp.max(slope))
     drive = np.asarray(model.modes.participation)
     coil = shaker.damping + shaker.motor_constant**2 / shaker.resistance
-    own = np.outer(drive, drive)
-    mass, damping = mass + shaker.mass * own, damping + coil * own
-    stiffness = stiffness + shaker.stiffness * own
+    coupling = np.outer(drive, drive)
+    mass, damping = mass + shaker.mass * coupling, damping + coil * coupling
+    stiffness = stiffness + shaker.stiffness * coupling
     state = np.block(
         [
             [np.zeros((n, n)), np.eye(n)],

@@ -149,10 +149,10 @@ def phase_sweep(
         record_cycles=record_cycles,
         seed=seed,
     )
-    held = np.array([one.held for one in motions])
-    force = np.where(held, [one.force for one in motions], np.nan)
-    velocity = np.where(held, [one.velocity for one in motions], np.nan)
-    frequency = np.where(held, [one.frequency for one in motions], np.nan)
+    held = np.array([motion.held for motion in motions])
+    force = np.where(held, [motion.force for motion in motions], np.nan)
+    velocity = np.where(held, [motion.velocity for motion in motions], np.nan)
+    frequency = np.where(held, [motion.frequency for motion in motions], np.nan)
     relative = velocity * np.conj(force) / np.abs(force)
     return PhaseSweep(wanted, frequency, np.abs(force), relative, held, seconds)
 

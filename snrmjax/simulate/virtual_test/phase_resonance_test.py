@@ -21,7 +21,7 @@ from snrmjax.simulate.virtual_test.appropriation import (
     mode_phase,
     phase_limits,
     spread_in_phase,
-    states_at_phases,
+    states_near,
 )
 from snrmjax.simulate.virtual_test.integrated_test import stepped_states
 from snrmjax.simulate.virtual_test.recording import (
@@ -36,18 +36,12 @@ Means = Literal["harmonic_balance", "time_integration"]
 
 
 class SweepSimulation(NamedTuple):
-    """How the motions of a phase-resonance test are computed.
+    """How the motions of a phase-resonance test are computed."""
 
-    `by` is "harmonic_balance", where the frequency is stepped infinitely slowly, or
-    "time_integration", where each sweep has `steps_per_sweep` equal steps of frequency, each held
-    for at most `cycles_per_step` cycles of the force. `harmonic_order` is the highest harmonic of
-    the motion, a multiple of the frequency of the force.
-    """
-
-    by: Means = "harmonic_balance"
-    harmonic_order: int = 9
-    steps_per_sweep: int = 100  # of a time integration
-    cycles_per_step: int = 200  # of a time integration
+    by: Means = "harmonic_balance"  # as if the frequency were stepped infinitely slowly
+    harmonic_order: int = 9  # highest of the motion
+    steps_per_sweep: int = 100  # of a time integration: equal steps of frequency
+    cycles_per_step: int = 200  # of a time integration, at most
 
 
 BY_HARMONIC_BALANCE = SweepSimulation()
@@ -179,10 +173,7 @@ def _along_curves(
     if not rows:
         nothing = VisitedStates(*(np.zeros(0),) * 4, np.zeros((0, 2 * harmonic_order + 1, 1)))
         return _Visited(nothing, jumps, curves, 0)
-    number, load, frequency, motion, wanted = (np.array(c) for c in zip(*rows, strict=True))
-    order = np.linspace(0.0, 1.0, len(rows))
-    states = VisitedStates(number, order, load, frequency, motion)
-    exact = states_at_phases(model, states, wanted)
+    exact = states_near(model, rows)
     return _Visited(exact, jumps, curves, len(rows) - len(exact.level))
 
 

@@ -217,26 +217,26 @@ def multisine_test(
     Raises `ValueError` for lines outside 1 to half of `period_samples`, and for numbers that are
     not positive.
     """
-    every = np.unique(np.asarray(lines, dtype=int))
+    distinct = np.unique(np.asarray(lines, dtype=int))
     for name, value in (
         *(("rms_voltage", rms_voltage), ("periods", periods)),
         ("period_samples", period_samples),
     ):
         positive(name, value)
-    if not every.size or every[0] < 1 or every[-1] >= period_samples / 2:
+    if not distinct.size or distinct[0] < 1 or distinct[-1] >= period_samples / 2:
         raise ValueError(
             f"`lines` must lie between 1 and half of `period_samples`, {period_samples / 2:g}, but "
             f"are {lines}."
         )
-    order = np.arange(len(every))
+    order = np.arange(len(distinct))
     turned = {
-        "random": np.random.default_rng(seed).uniform(0, 2 * np.pi, len(every)),
-        "schroeder": -np.pi * order * (order + 1) / len(every),
+        "random": np.random.default_rng(seed).uniform(0, 2 * np.pi, len(distinct)),
+        "schroeder": -np.pi * order * (order + 1) / len(distinct),
     }
     if phases not in turned:
         raise ValueError(f"`phases` must be random or schroeder, but is {phases!r}.")
     spectrum = np.zeros(period_samples // 2 + 1, dtype=complex)
-    spectrum[every] = np.exp(1j * turned[phases])
+    spectrum[distinct] = np.exp(1j * turned[phases])
     once = np.fft.irfft(spectrum, period_samples)
     voltages = np.tile(once * rms_voltage / np.sqrt(np.mean(once**2)), periods)
     record, _ = run_test(laboratory, Playback(jnp.asarray(voltages)), len(voltages), seed=seed)

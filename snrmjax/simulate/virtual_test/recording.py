@@ -19,14 +19,9 @@ _POINTS = 256  # of a curve, that instruments record at a time
 
 
 class MeasurementErrors(NamedTuple):
-    """Random errors of a test, 1σ; what a level shares is drawn once for each level.
+    """Random errors of a test, 1σ; what a level shares is drawn once for each level."""
 
-    `amplitude` of the velocity, relative (0.01 is 1 %); `phase` of the velocity, rad; `force`,
-    relative; `level_gain`, relative, and `level_phase`, rad, shared by a level; `harmonic`, m/s,
-    the rms of the complex error of every higher harmonic of the velocity.
-    """
-
-    amplitude: float = 0.0  # relative, of the velocity
+    amplitude: float = 0.0  # relative (0.01 is 1 %), of the velocity
     phase: float = 0.0  # rad
     force: float = 0.0  # relative
     level_gain: float = 0.0  # relative, shared by a level
@@ -38,16 +33,11 @@ NO_ERRORS = MeasurementErrors()
 
 
 class Recording(NamedTuple):
-    """What a test writes down of the states it visits: random errors, and further harmonics.
-
-    `errors` of the instruments, none by default; `seed` of the random numbers behind them, a
-    whole number; `keep_harmonics` the orders (2, 3, … up to the test's `harmonic_order`) whose
-    velocity, m/s, is recorded beside the fundamental.
-    """
+    """What a test writes down of the states it visits: random errors, and further harmonics."""
 
     errors: MeasurementErrors = NO_ERRORS
     seed: int = 0  # of the random errors
-    keep_harmonics: tuple[int, ...] = ()  # recorded beside the fundamental
+    keep_harmonics: tuple[int, ...] = ()  # orders recorded beside the fundamental
 
 
 EXACT = Recording()
@@ -90,8 +80,17 @@ def recorded_states(
     What the sensors see (the flexible modes and the rigid-body ones) goes through the model's
     measurement effects in their order; random errors come last.
     """
-    force, velocity = _through_the_chain(model, states)
-    return _with_errors(states, force, velocity, model.modes.sensors, recording)
+    modes = simulated_structure(model).modes
+    frequency, force = jnp.asarray(states.frequency), jnp.asarray(states.force)
+    coefficients = jnp.asarray(states.coefficients)
+    velocity = velocity_phasors(coefficients, frequency, modes.mode_shape)
+    velocity = velocity + _rigid_body_velocity(model, frequency, force, velocity.shape[1])
+    seen = _behind_instruments(
+        *(model, frequency, force, velocity),
+        jnp.abs(displacement_phasors(coefficients)[:, 1, modes.mode_of_interest]),
+    )
+    written = np.asarray(seen[0]), np.asarray(seen[1])
+    return _with_errors(states, *written, model.modes.sensors, recording)
 
 
 def recorded_curves(model: Structure, curves: Sequence[ResponseCurve]) -> list[ResponseCurve]:
@@ -129,21 +128,6 @@ def acting_force(model: Structure, recorded: float) -> float:
     force, _ = _behind_instruments(model, jnp.ones(2), acting, still, jnp.zeros(2))
     at_one, at_two = (float(value) for value in force)
     return recorded * (1 + (recorded - at_one) / (at_two - at_one))
-
-
-def _through_the_chain(
-    model: Structure, states: VisitedStates
-) -> tuple[np.ndarray, Complex[np.ndarray, "state harmonic sensor"]]:
-    """Force (N) and velocity (m/s) behind the instruments, without random errors."""
-    modes = simulated_structure(model).modes
-    frequency, force = jnp.asarray(states.frequency), jnp.asarray(states.force)
-    coefficients = jnp.asarray(states.coefficients)
-    velocity = velocity_phasors(coefficients, frequency, modes.mode_shape)
-    velocity = velocity + _rigid_body_velocity(model, frequency, force, velocity.shape[1])
-    j = modes.mode_of_interest
-    displacement = jnp.abs(displacement_phasors(coefficients)[:, 1, j])
-    force, velocity = _behind_instruments(model, frequency, force, velocity, displacement)
-    return np.asarray(force), np.asarray(velocity)
 
 
 def _behind_instruments(
@@ -190,10 +174,10 @@ def _with_errors(
     gain = errors.level_gain * normal(keys[3], len(groups))[group]
     turn = errors.level_phase * normal(keys[4], len(groups))[group]
     shared = (1 + gain) * np.exp(1j * turn)
-    own = (1 + errors.amplitude * normal(keys[0], n, n_sensors)) * np.exp(
+    alone = (1 + errors.amplitude * normal(keys[0], n, n_sensors)) * np.exp(
         1j * errors.phase * normal(keys[1], n, n_sensors)
     )
-    factor = shared[:, None] * own
+    factor = shared[:, None] * alone
     size = np.abs(factor)  # a phase is an error of time: h times as large of harmonic h
     harmonics = (
         np.stack([velocity[:, h] * size * (factor / size) ** h for h in keep_harmonics], axis=2)

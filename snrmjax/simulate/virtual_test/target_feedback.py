@@ -240,10 +240,10 @@ def s_curve(
     (omega,) = positive("frequency", frequency)
     bench = FeedbackBench(laboratory, settings, seed)
     found = [bench.motion(float(omega), float(size)) for size in positive("amplitudes", amplitudes)]
-    held = np.array([one.held for one in found])
+    held = np.array([motion.held for motion in found])
     return SCurve(
-        np.where(held, np.abs([one.velocity for one in found]), np.nan),
-        np.where(held, np.abs([one.force for one in found]), np.nan),
-        np.array([one.invasive for one in found]),
+        np.where(held, np.abs([motion.velocity for motion in found]), np.nan),
+        np.where(held, np.abs([motion.force for motion in found]), np.nan),
+        np.array([motion.invasive for motion in found]),
         bench.seconds,
     )

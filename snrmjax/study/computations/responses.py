@@ -7,12 +7,10 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from snrmjax.model.structures import Structure
 from snrmjax.simulate.balance.labelled import HERTZ
 from snrmjax.simulate.continuation.continuation import CurveStatus
 from snrmjax.simulate.continuation.response_curve import ResponseCurve
 from snrmjax.simulate.solutions.forced_response import ResponseSettings, forced_response_batch
-from snrmjax.simulate.solutions.isolated_responses import isolated_responses
 from snrmjax.study.computations.base import (
     COMPLETE,
     HIGHEST_AT_END,
@@ -27,11 +25,6 @@ from snrmjax.study.computations.base import (
 )
 
 GRID = "frequency_hz"
-_ISOLATED = {
-    "n_isolated": ("i4", "1", "isolated responses that were found"),
-    "isolated_peak_velocity_m_s": ("f8", "m/s", "highest velocity of an isolated response"),
-}
-_FOLD = ("fold_frequency_hz", "fold_velocity_m_s")
 
 
 class ResponseRange(eqx.Module):
@@ -53,31 +46,16 @@ class ResponseRange(eqx.Module):
         return ResponseSettings(harmonic_order=self.harmonic_order, stability=self.stability)
 
 
-class Peaks(AbstractComputation):
-    """Highest peak, strongest phase resonance and all folds of every forced response.
+class AbstractResponses(AbstractComputation):
+    """Forced responses of every member under every force."""
 
-    A member whose response has no peak between the ends of the range has the status
-    `no_peak_in_range`; one whose response is higher at an end than at its highest peak has
-    `highest_at_range_end`: the resonance lies outside, and a wider range would have it.
-
-    `forces` in N; None: `force_n` varies. With `grid_points` also the highest and the lowest
-    velocity of the response at that many frequencies: what the response bands of a report are made
-    of. With `isolated` also the responses that are not connected to those of small motion (takes
-    several times as long).
-    """
-
-    kind: ClassVar[str] = "peaks"
-    members_a_chunk: ClassVar[int] = 128
-
-    within: ResponseRange
-    forces: OfForces = eqx.field(default=None, converter=of_forces)
-    grid_points: int = eqx.field(static=True, default=0)
-    isolated: bool = eqx.field(static=True, default=False)
+    within: eqx.AbstractVar[ResponseRange]
+    forces: eqx.AbstractVar[OfForces]
 
     def outputs(self) -> dict[str, Output]:
-        """See `AbstractComputation.outputs`."""
+        """Peak, resonance and folds of every response."""
         at = self.forces.dimensions
-        named = {
+        return {
             "status": Output(at, TEXT, "", "how the curve ended"),
             "n_points": Output(at, "i4", "1", "points of the curve"),
             "peak_frequency_hz": Output(at, "f8", "Hz", "frequency of the highest peak"),
@@ -89,61 +67,79 @@ class Peaks(AbstractComputation):
             "fold_frequency_hz": Output(("fold",), "f8", "Hz", "frequency of a fold"),
             "fold_velocity_m_s": Output(("fold",), "f8", "m/s", "velocity at a fold"),
         }
+
+    def axes(self) -> dict[str, Axis]:
+        """The forces, where there are several."""
+        return self.forces.axes()
+
+    def traced(
+        self, members: Members
+    ) -> tuple[Sequence[tuple[ResponseCurve, ...]], dict[str, np.ndarray]]:
+        """The curves of every member and force, and what `outputs` has of them."""
+        loads, within = self.forces.of(members), self.within
+        models = [m for m in members.models for _ in range(loads.shape[1])]
+        batch = forced_response_batch(models, loads.ravel(), *within.ends, settings=within.settings)
+        rows = {
+            name: self.forces.shaped(np.asarray(one.values))
+            for name, one in batch.variables().items()
+        }
+        folds = np.concatenate([_at_folds(parts) for parts in batch.curves], axis=1)
+        return batch.curves, {**rows, "fold_frequency_hz": folds[0], "fold_velocity_m_s": folds[1]}
+
+
+class Peaks(AbstractResponses):
+    """Highest peak, strongest phase resonance and all folds of every forced response.
+
+    A member whose response has no peak between the ends of the range has the status
+    `no_peak_in_range`; one whose response is higher at an end than at its highest peak has
+    `highest_at_range_end`: the resonance lies outside, and a wider range would have it.
+
+    `forces` in N; None: `force_n` varies. With `grid_points` also the highest and the lowest
+    velocity of the response at that many frequencies: what the response bands of a report are made
+    of.
+    """
+
+    kind: ClassVar[str] = "peaks"
+    members_a_chunk: ClassVar[int] = 128
+
+    within: ResponseRange
+    forces: OfForces = eqx.field(default=None, converter=of_forces)
+    grid_points: int = eqx.field(static=True, default=0)
+
+    def outputs(self) -> dict[str, Output]:
+        """Those of responses, and bounds on the grid."""
+        named = super().outputs()
         if self.grid_points:
             for name, which in (("upper", "highest"), ("lower", "lowest")):
                 text = f"{which} velocity of the response at this frequency"
-                named[f"{name}_velocity_m_s"] = Output((*at, GRID), "f8", "m/s", text)
-        if self.isolated:
-            named |= {name: Output(at, *rest) for name, rest in _ISOLATED.items()}
+                dimensions = *self.forces.dimensions, GRID
+                named[f"{name}_velocity_m_s"] = Output(dimensions, "f8", "m/s", text)
         return named
 
     def axes(self) -> dict[str, Axis]:
-        """See `AbstractComputation.axes`."""
-        axes = self.forces.axes()
+        """The forces and the grid."""
+        axes = super().axes()
         if self.grid_points:
             axes[GRID] = Axis(self._grid / HERTZ, "Hz", "frequency of the force")
         return axes
 
     def rows(self, members: Members) -> dict[str, np.ndarray]:
         """See `AbstractComputation.rows`."""
-        curves, summary = traced_members(self.within, self.forces, members)
-        folds = [_at_folds(parts) for parts in curves]
-        summary["status"] = np.array(
-            [peak_status(*one) for one in zip(curves, summary["status"].tolist(), strict=True)]
-        )
-        rows = {name: self.forces.shaped(values) for name, values in summary.items()}
-        rows |= dict(zip(_FOLD, np.concatenate(folds, axis=1), strict=True))
+        curves, rows = self.traced(members)
+        ends = zip(curves, rows["status"].ravel().tolist(), strict=True)
+        rows["status"] = self.forces.shaped(np.array([peak_status(*one) for one in ends]))
         if self.grid_points:
             bounds = np.array([velocity_bounds(parts, self._grid) for parts in curves])
             rows["upper_velocity_m_s"] = self.forces.shaped(bounds[:, 1])
             rows["lower_velocity_m_s"] = self.forces.shaped(bounds[:, 0])
-        if self.isolated:
-            found = [self._isolated(*one) for one in self._each(members, curves)]
-            for name, column in zip(_ISOLATED, zip(*found, strict=True), strict=True):
-                rows[name] = self.forces.shaped(np.array(column))
         return rows
 
     @property
     def _grid(self) -> Float[np.ndarray, " frequency"]:
         return np.linspace(*self.within.ends, self.grid_points)
 
-    def _each(self, members: Members, curves: Sequence[tuple[ResponseCurve, ...]]) -> list[tuple]:
-        loads = self.forces.of(members)
-        models = [m for m in members.models for _ in range(loads.shape[1])]
-        return list(zip(models, loads.ravel().tolist(), curves, strict=True))
 
-    def _isolated(self, model: Structure, force: float, known: Sequence[ResponseCurve]) -> tuple:
-        """How many isolated responses there are, and their highest velocity in m/s."""
-        if known[0].status == CurveStatus.INVALID:
-            return 0, np.nan
-        further = isolated_responses(
-            model, force, *self.within.ends, known=known, settings=self.within.settings
-        )
-        heights = [np.max(np.abs(c.velocity[:, 1, 0])) for c in further if len(c.frequency)]
-        return len(heights), max(heights, default=np.nan)
-
-
-class Curves(AbstractComputation):
+class Curves(AbstractResponses):
     """Whole forced responses, unstable parts included, point by point.
 
     `forces` in N; None: `force_n` varies.
@@ -156,10 +152,10 @@ class Curves(AbstractComputation):
     forces: OfForces = eqx.field(default=None, converter=of_forces)
 
     def outputs(self) -> dict[str, Output]:
-        """See `AbstractComputation.outputs`."""
+        """Those of responses, and their points."""
         at = ("point",)
         return {
-            **Peaks(self.within, self.forces).outputs(),
+            **super().outputs(),
             "point_frequency_hz": Output(at, "f8", "Hz", "frequency of the force"),
             "point_velocity_re_m_s": Output(at, "f8", "m/s", "velocity in phase with the force"),
             "point_velocity_im_m_s": Output(at, "f8", "m/s", "velocity a quarter period ahead"),
@@ -167,39 +163,21 @@ class Curves(AbstractComputation):
             "point_branch": Output(at, "i1", "1", "number of the branch: a response may have two"),
         }
 
-    def axes(self) -> dict[str, Axis]:
-        """See `AbstractComputation.axes`."""
-        return self.forces.axes()
-
     def rows(self, members: Members) -> dict[str, np.ndarray]:
         """See `AbstractComputation.rows`."""
-        curves, summary = traced_members(self.within, self.forces, members)
-        folds = np.concatenate([_at_folds(parts) for parts in curves], axis=1)
-        every = [(branch, one) for parts in curves for branch, one in enumerate(parts)]
-        velocity = np.concatenate([one.velocity[:, 1, 0] for _, one in every])
+        curves, rows = self.traced(members)
+        branches = [part for parts in curves for part in parts]
+        number = [branch for parts in curves for branch in range(len(parts))]
+        sizes = [len(part.frequency) for part in branches]
+        velocity = np.concatenate([part.velocity[:, 1, 0] for part in branches])
         return {
-            **{name: self.forces.shaped(values) for name, values in summary.items()},
-            "fold_frequency_hz": folds[0],
-            "fold_velocity_m_s": folds[1],
-            "point_frequency_hz": np.concatenate([one.frequency for _, one in every]) / HERTZ,
+            **rows,
+            "point_frequency_hz": np.concatenate([part.frequency for part in branches]) / HERTZ,
             "point_velocity_re_m_s": velocity.real,
             "point_velocity_im_m_s": velocity.imag,
-            "point_stability": np.concatenate([one.stability for _, one in every]).astype("i1"),
-            "point_branch": np.concatenate([np.full(len(o.frequency), b) for b, o in every]).astype(
-                "i1"
-            ),
+            "point_stability": np.concatenate([part.stability for part in branches]).astype("i1"),
+            "point_branch": np.repeat(number, sizes).astype("i1"),
         }
-
-
-def traced_members(
-    within: ResponseRange, forces: OfForces, members: Members
-) -> tuple[Sequence[tuple[ResponseCurve, ...]], dict[str, np.ndarray]]:
-    """The curves of every member and force, and their summary by the names of the store."""
-    loads = forces.of(members)
-    models = [m for m in members.models for _ in range(loads.shape[1])]
-    batch = forced_response_batch(models, loads.ravel(), *within.ends, settings=within.settings)
-    columns = {name: np.asarray(one.values) for name, one in batch.variables().items()}
-    return batch.curves, columns
 
 
 def peak_status(curves: Sequence[ResponseCurve], status: str) -> str:

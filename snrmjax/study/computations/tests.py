@@ -17,11 +17,9 @@ from snrmjax.simulate.virtual_test.recording import NO_ERRORS, MeasurementErrors
 from snrmjax.study.computations.base import (
     MEMBER,
     TEXT,
-    AbstractComputation,
+    AbstractSingly,
     Axis,
-    Members,
     Output,
-    one_by_one,
 )
 from snrmjax.study.computations.responses import ResponseRange
 
@@ -40,7 +38,7 @@ _FOUND = {
 }
 
 
-class AbstractIdentified(AbstractComputation):
+class AbstractIdentified(AbstractSingly):
     """Backbone and damping by the pointwise inverse method, at shares of the amplitude range."""
 
     def outputs(self) -> dict[str, Output]:
@@ -71,12 +69,6 @@ class AbstractIdentified(AbstractComputation):
             **{name: np.asarray(one)[None] for name, one in row.items()},
         }
 
-    def failed(self) -> dict[str, np.ndarray]:
-        """The row of a member for which nothing is found."""
-        counts = {name: np.zeros(1, dtype="i4") for name in ("n_states", "n_solved")}
-        curves = {k: np.full((1, _POINTS), np.nan) for k in _FOUND if SHARE in _FOUND[k][0]}
-        return {**counts, **curves}
-
 
 class VirtualTests(AbstractIdentified):
     """A virtual near-resonance test of every member with its own noise, then its identification.
@@ -92,11 +84,8 @@ class VirtualTests(AbstractIdentified):
     errors: MeasurementErrors = NO_ERRORS
     points_per_level: int = eqx.field(static=True, default=5)
 
-    def rows(self, members: Members) -> dict[str, np.ndarray]:
-        """See `AbstractComputation.rows`."""
-        return one_by_one(members, self._one, **self.failed())
-
-    def _one(self, model: Structure, force: np.ndarray | None, seed: int) -> dict:
+    def member(self, model: Structure, force: np.ndarray | None, seed: int) -> dict:
+        """See `AbstractSingly.member`."""
         test = phase_resonance_test(
             *(model, self.levels, *self.within.ends),
             points_per_level=self.points_per_level,
@@ -113,15 +102,12 @@ class Identifications(AbstractIdentified):
 
     data: SteadyStates
 
-    def rows(self, members: Members) -> dict[str, np.ndarray]:
-        """See `AbstractComputation.rows`."""
-        return one_by_one(members, self._one, **self.failed())
-
-    def _one(self, model: Structure, force: np.ndarray | None, seed: int) -> dict:
+    def member(self, model: Structure, force: np.ndarray | None, seed: int) -> dict:
+        """See `AbstractSingly.member`."""
         return self.identified(self.data, model)
 
 
-class Diagnoses(AbstractComputation):
+class Diagnoses(AbstractSingly):
     """The same measured steady states diagnosed against the model of every member."""
 
     kind: ClassVar[str] = "diagnose"
@@ -141,13 +127,8 @@ class Diagnoses(AbstractComputation):
             "gap_after": Output(at, "f8", "1", "the same with the effects"),
         }
 
-    def rows(self, members: Members) -> dict[str, np.ndarray]:
-        """See `AbstractComputation.rows`."""
-        numbers = {name: np.full(1, np.nan) for name, o in self.outputs().items() if o.kind == "f8"}
-        texts = {name: np.array([""]) for name in ("verdict", "effects")}
-        return one_by_one(members, self._one, **numbers, **texts)
-
-    def _one(self, model: Structure, force: np.ndarray | None, seed: int) -> dict:
+    def member(self, model: Structure, force: np.ndarray | None, seed: int) -> dict:
+        """See `AbstractSingly.member`."""
         found = diagnose_model(model, self.data)
         name = "+".join(found.effects)
         return {

@@ -14,9 +14,7 @@ from snrmjax.model.potential import polynomial_potential
 from snrmjax.model.structures import structure
 from snrmjax.simulate.continuation.stability import (
     Stability,
-    StabilityLoss,
     floquet_multipliers,
-    stability_loss,
     stability_of,
 )
 from snrmjax.simulate.solutions.forced_response import forced_response, solve_at_frequency
@@ -46,7 +44,6 @@ def test_linear_modes_have_their_decay_as_multipliers(distance_between):
         # left.
         assert distance_between(one, other) < 1e-12
     assert np.all(stability_of(found) == Stability.STABLE)
-    assert stability_loss(found) == (StabilityLoss.STABLE,) * 4
 
 
 def test_undamped_growth_and_decay_are_told_apart():
@@ -61,7 +58,6 @@ def test_undamped_growth_and_decay_are_told_apart():
     # q̈ = q: multipliers e^{±T}, T = π.
     np.testing.assert_allclose(sorted(np.abs(saddle[0])), np.exp([-np.pi, np.pi]), rtol=1e-12)
     assert stability_of(saddle)[0] == Stability.UNSTABLE
-    assert stability_loss(saddle) == (StabilityLoss.REAL,)
 
 
 def test_points_that_are_not_finite_have_no_multipliers():
@@ -72,7 +68,6 @@ def test_points_that_are_not_finite_have_no_multipliers():
     assert stability_of(found).tolist() == [
         *(Stability.STABLE, Stability.NOT_COMPUTED, Stability.NOT_COMPUTED)
     ]
-    assert stability_loss(found)[1:] == (StabilityLoss.NOT_COMPUTED,) * 2
     assert floquet_multipliers(one_mode(2.0), cosine([]), np.zeros(0)).shape == (0, 2)
 
 

@@ -144,7 +144,7 @@ def test_what_cannot_stand_in_the_laboratory_is_refused():
         ((slider,), Shaker(), "jenkins_slider needs `largest_displacement`"),
         ((stop,), Shaker(), "402.* Hz, or more, .* 3 substeps would do"),
         ((effect("sensor_gain_error", gain=0.1),), Shaker(), "has sensor_gain_error"),
-        ((), Shaker(largest_current=0.0), "must be positive, but one is zero"),
+        ((), Shaker(largest_current=0.0), "`largest_current` must be positive"),
     ):
         with pytest.raises(ValueError, match=words):
             Laboratory(structure(*acting), shaker, Instruments(), RATE)

@@ -11,10 +11,7 @@ from snrmjax.model.beams import CURVED_BEAM_FORCES, curved_beam
 from snrmjax.model.effects import make_effect
 from snrmjax.model.modes import RigidBodyModes, linear_modes, linear_response
 from snrmjax.model.structures import structure
-from snrmjax.simulate.virtual_test.controlled_test import (
-    phase_controlled_test,
-    response_controlled_test,
-)
+from snrmjax.simulate.virtual_test.controlled_test import phase_controlled_test
 from snrmjax.simulate.virtual_test.phase_resonance_test import (
     SweepSimulation,
     _swept,
@@ -411,31 +408,6 @@ def test_a_phase_locked_loop_records_what_jumps_leave_out(exact):
     assert len(test.curves) == 3
 
 
-NARROW = (55 * HZ, 80 * HZ)
-
-
-def test_response_control_holds_the_velocity():
-    test = response_controlled_test(
-        curved_beam(), [1e-3, 0.1], *NARROW, recording=Recording(keep_harmonics=(2,))
-    )
-    states, modes = test.steady_states, curved_beam().modes
-    assert states.level.tolist() == [1] * 5 + [2] * 5
-    np.testing.assert_allclose(
-        np.abs(states.velocity[:, 0]), np.repeat([1e-3, 0.1], 5), rtol=1e-8
-    )  # Newton's method ends at an estimated 1e-10
-    assert np.all(np.cos(phases(states)) ** 2 >= 0.5)
-    assert np.any(phases(states) > 0)
-    assert np.any(phases(states) < 0)
-    # A small motion needs the linear structure's force.
-    small = np.asarray(states.level) == 1
-    per_newton = linear_response(modes, states.frequency[small], np.ones(5))[:, 0]
-    np.testing.assert_allclose(1e-3 / np.abs(per_newton), states.force[small], rtol=1e-3)
-    # At the other one the forced response to each state's force passes through it.
-    own, strong = float(modes.natural_frequency[0]), ~small
-    assert np.all(np.asarray(states.frequency)[strong] < 1.01 * own)
-    assert np.all(np.abs(states.harmonics[strong, 0, 0]) > 1e-4)
-
-
 def test_errors_and_chain_are_the_same_for_every_test():
     errors = MeasurementErrors(amplitude=0.01, phase=0.02, force=0.03)
     noisy, plain = Recording(errors, seed=3), Recording(seed=3)
@@ -504,22 +476,6 @@ def test_wrong_settings_are_named(options, message):
 def test_wrong_settings_of_a_phase_locked_loop_are_named(forces, phases, message):
     with pytest.raises(ValueError, match=message):
         phase_controlled_test(curved_beam(), forces, phases)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"velocities": [-1.0]}, "`velocities` must be positive and finite, but is -1"),
-        ({"appropriation": (1.0, 1.0)}, "`appropriation`"),
-        ({"points_per_level": 0}, "`points_per_level`"),
-        ({"recording": Recording(keep_harmonics=(1,))}, "`keep_harmonics`"),
-        ({"from_frequency": 1e4}, "`from_frequency` must be positive and below"),
-    ],
-)
-def test_wrong_settings_of_response_control_are_named(options, message):
-    given = {"velocities": [1e-3], "from_frequency": RANGE[0], "to_frequency": RANGE[1]}
-    with pytest.raises(ValueError, match=message):
-        response_controlled_test(curved_beam(), **(given | options))
 
 
 def test_a_range_without_resonance_has_no_states():

@@ -102,14 +102,18 @@ class PlacedSamples(AbstractSamples):
         for k, place in enumerate(chosen):
             if k in rows:
                 continue
-            alike = {m: one.other for m, one in enumerate(chosen) if one.numbers is place.numbers}
+            alike = {
+                m: sibling.other
+                for m, sibling in enumerate(chosen)
+                if sibling.numbers is place.numbers
+            }
             at = [slice(0, n) for n in place.numbers.shape]
             at[place.axis] = slice(start, stop)
             first = min(alike.values())
             if len(at) > 1:
                 at[1 - place.axis] = slice(first, max(alike.values()) + 1)
-            found = place.numbers.read(tuple(at))
+            block = place.numbers.read(tuple(at))
             for m, other in alike.items():
                 is_matrix = len(at) > 1
-                rows[m] = np.take(found, other - first, 1 - place.axis) if is_matrix else found
+                rows[m] = np.take(block, other - first, 1 - place.axis) if is_matrix else block
         return np.stack([rows[k] for k in range(len(chosen))])

@@ -1,26 +1,11 @@
-"""One nonlinear structure excited in four ways, by time integration: is the backbone the same?
+"""A Duffing oscillator excited in four ways, integrated in time by SciPy's DOP853.
 
-Run: python benchmarks/kinds_of_excitation.py [--states 6] [--figure FILE.png]
-
-A mass of 0.4 kg on a spring with a cubic part and a dashpot (50 Hz, 2 %), integrated by SciPy's
-DOP853, which knows nothing of this package, until it is periodic; then the fundamental of what
-sensors see. Four ways:
-
-- point: a force on the mass, both measured;
-- base: the foot moves sinusoidally (shaker table); its acceleration and the mass's absolute
-  velocity are measured;
-- fixture: the foot is a free rigid fixture of 1.5 kg that a stinger forces (the paper's section
-  4): force on the fixture, absolute velocity of the mass; the model has a rigid-body mode;
-- drive: the force on the mass is known as a voltage only; low levels and the linear model
-  calibrate it (newtons per volt), then high levels are identified.
-
-One JSON line each: largest relative errors of natural frequency and modal damping against the
-closed form of the relative motion, ω̃² = ω²(1 + ¾e + 3e²/128), e = γa²/k (Duffing's equation to
-second order in e, which reaches 0.2), at states within 55° of resonance.
+A mass of 0.4 kg on a spring with a cubic part and a dashpot (50 Hz, 2 %), until it is periodic;
+then the fundamental of what sensors see: a `point` force; a shaker table (`base`); a free rigid
+`fixture` of 1.5 kg that a stinger forces (the paper's section 4); a `drive` voltage that low levels
+calibrate. The truth is the closed form of the relative motion, ω̃² = ω²(1 + ¾e + 3e²/128),
+e = γa²/k.
 """
-
-import argparse
-import json
 
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -185,26 +170,3 @@ def errors_of(way, n_states):
         (damping * reduced / DAMPING - 1)[usable],
         int((~usable).sum()),
     )
-
-
-def main() -> None:
-    """Print a line for every way."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--states", type=int, default=6)
-    given = parser.parse_args()
-    for way in ways():
-        speed, off, off_damping, failed = errors_of(way, given.states)
-        line = {
-            "benchmark": "kinds_of_excitation",
-            "way": way,
-            "states": len(speed),
-            "failed": failed,
-            "velocity_m_s": [float(speed.min()), float(speed.max())],
-            "frequency_error_max": float(np.abs(off).max()),
-            "damping_error_max": float(np.abs(off_damping).max()),
-        }
-        print(json.dumps(line), flush=True)
-
-
-if __name__ == "__main__":
-    main()

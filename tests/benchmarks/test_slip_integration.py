@@ -14,7 +14,7 @@ OWN = 2 * np.pi * np.array([1.0, 4.0, 9.0])
 @pytest.fixture(scope="module")
 def integration():
     """The benchmark's module, which is in no package."""
-    folder = str(Path(__file__).resolve().parents[1] / "benchmarks")
+    folder = str(Path(__file__).resolve().parents[2] / "benchmarks")
     sys.path.insert(0, folder)
     yield importlib.import_module("slip_integration")
     sys.path.remove(folder)
