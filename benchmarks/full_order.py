@@ -15,8 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import snrmjax as sj
-from snrmjax.condense.elements.statics import free_force, free_tangent
-from snrmjax.condense.elements.strain_energy import mass_matrix
+from snrmjax.condense.elements.strain_energy import internal_force, mass_matrix, tangent_stiffness
 
 ORDER, SAMPLES = 9, 40  # exact for a cubic force
 FLAT = sj.condense.Beam(0.2286, 0.0127, 0.787e-3, young=204.8e9, density=7870.0, elements=20)
@@ -109,6 +108,21 @@ def balanced(
 
     begin = (*start, jnp.array(jnp.inf), jnp.array(0))
     return Motion(*jax.lax.while_loop(goes_on, step, begin)[:3])
+
+
+def _all(beam: sj.condense.Beam, u: jax.Array) -> jax.Array:
+    """All degrees of freedom from those that are not held."""
+    return jnp.zeros(beam.n_dof).at[beam.free].set(u)
+
+
+def free_force(beam: sj.condense.Beam, u: jax.Array) -> jax.Array:
+    """Internal force on the degrees of freedom that are not held."""
+    return internal_force(beam, _all(beam, u))[beam.free]
+
+
+def free_tangent(beam: sj.condense.Beam, u: jax.Array) -> jax.Array:
+    """Tangent stiffness of the degrees of freedom that are not held."""
+    return tangent_stiffness(beam, _all(beam, u))[beam.free[:, None], beam.free]
 
 
 def free_mass(beam: sj.condense.Beam) -> jax.Array:

@@ -32,13 +32,13 @@ from full_order import (
     condensed,
     cosines_and_sines,
     free_mass,
+    free_tangent,
 )
 from harness import options, teller
 from scipy.interpolate import CubicSpline
 from scipy.linalg import eigh
 
 import snrmjax as sj
-from snrmjax.condense.elements.statics import free_tangent
 from snrmjax.condense.elements.strain_energy import shape_rows, uniform_load
 
 tell = teller(__file__)

@@ -22,8 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 from drawn import RIGHT
-from harness import options
-from score import Result, tell
+from score import Result, options, tell
 
 EDGES = (0.0, 0.4, 0.6, 0.8, 0.95, 1.0)
 CHANCE = 0.95

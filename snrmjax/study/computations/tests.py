@@ -17,11 +17,9 @@ from snrmjax.simulate.virtual_test.recording import NO_ERRORS, MeasurementErrors
 from snrmjax.study.computations.base import (
     MEMBER,
     TEXT,
-    AbstractComputation,
+    AbstractSingly,
     Axis,
-    Members,
     Output,
-    one_by_one,
 )
 from snrmjax.study.computations.responses import ResponseRange
 
@@ -40,7 +38,7 @@ _FOUND = {
 }
 
 
-class AbstractIdentified(AbstractComputation):
+class AbstractIdentified(AbstractSingly):
     """Backbone and damping by the pointwise inverse method, at shares of the amplitude range."""
 
     def outputs(self) -> dict[str, Output]:
@@ -86,11 +84,8 @@ class VirtualTests(AbstractIdentified):
     errors: MeasurementErrors = NO_ERRORS
     points_per_level: int = eqx.field(static=True, default=5)
 
-    def rows(self, members: Members) -> dict[str, np.ndarray]:
-        """See `AbstractComputation.rows`."""
-        return one_by_one(self, members, self._one)
-
-    def _one(self, model: Structure, force: np.ndarray | None, seed: int) -> dict:
+    def member(self, model: Structure, force: np.ndarray | None, seed: int) -> dict:
+        """See `AbstractSingly.member`."""
         test = phase_resonance_test(
             *(model, self.levels, *self.within.ends),
             points_per_level=self.points_per_level,
@@ -107,15 +102,12 @@ class Identifications(AbstractIdentified):
 
     data: SteadyStates
 
-    def rows(self, members: Members) -> dict[str, np.ndarray]:
-        """See `AbstractComputation.rows`."""
-        return one_by_one(self, members, self._one)
-
-    def _one(self, model: Structure, force: np.ndarray | None, seed: int) -> dict:
+    def member(self, model: Structure, force: np.ndarray | None, seed: int) -> dict:
+        """See `AbstractSingly.member`."""
         return self.identified(self.data, model)
 
 
-class Diagnoses(AbstractComputation):
+class Diagnoses(AbstractSingly):
     """The same measured steady states diagnosed against the model of every member."""
 
     kind: ClassVar[str] = "diagnose"
@@ -135,11 +127,8 @@ class Diagnoses(AbstractComputation):
             "gap_after": Output(at, "f8", "1", "the same with the effects"),
         }
 
-    def rows(self, members: Members) -> dict[str, np.ndarray]:
-        """See `AbstractComputation.rows`."""
-        return one_by_one(self, members, self._one)
-
-    def _one(self, model: Structure, force: np.ndarray | None, seed: int) -> dict:
+    def member(self, model: Structure, force: np.ndarray | None, seed: int) -> dict:
+        """See `AbstractSingly.member`."""
         found = diagnose_model(model, self.data)
         name = "+".join(found.effects)
         return {
