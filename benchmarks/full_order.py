@@ -5,7 +5,6 @@ force at samples of the period (alternating frequency-time). It shares the eleme
 condensation, but neither modes, potential nor solver. Used by `rom_forced_response.py`.
 """
 
-import time
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -130,28 +129,19 @@ def free_mass(beam: sj.condense.Beam) -> jax.Array:
     return mass_matrix(beam)[beam.free[:, None], beam.free]
 
 
-class Reduced(NamedTuple):
-    """A condensed model with a sensor at midspan under a uniform force, and what it took."""
-
-    model: sj.model.Structure
-    seconds: float
-    largest: float  # thicknesses that single modes move linearly in the load cases
-
-
-def condensed(beam: sj.condense.Beam, modes: Sequence[int], damping_ratio: np.ndarray) -> Reduced:
-    """Condense a beam, with load cases as large as the package's own rule has them."""
-    begin = time.perf_counter()
+def condensed(
+    beam: sj.condense.Beam, modes: Sequence[int], damping_ratio: np.ndarray
+) -> sj.model.Structure:
+    """A beam condensed by the package's own rule, with a sensor at midspan and a uniform force."""
     basis = sj.condense.beam_modes(beam, modes)
 
     def solve(force):
         return sj.condense.static_cases(beam, basis, force)
 
     wanted = sj.condense.displacement_for_ratio(basis, solve, start=float(beam.thickness) / 4)
-    found = sj.condense.reduced_model(basis, solve(sj.condense.modal_loads(basis, wanted).force))
-    seconds = time.perf_counter() - begin
-    model = found.structure(
+    found = sj.condense.condense(basis, solve(sj.condense.modal_loads(basis, wanted).force))
+    return found.structure(
         damping_ratio,
         sensors={"midspan": sj.condense.shape_at(beam, basis, 0.5)},
         participation=np.asarray(sj.condense.participation(beam, basis)),
     )
-    return Reduced(model, seconds, float(wanted[0]) / float(beam.thickness))

@@ -93,10 +93,9 @@ def limits(probabilities: Sequence[float]) -> tuple[int, int]:
     distribution = np.ones(1)
     for p in probabilities:
         distribution = np.convolve(distribution, [1 - p, p])
-    below = np.cumsum(distribution)
-    tail = 0.5 * (1 - CHANCE)
-    most = min(int(np.searchsorted(below, 1 - tail)), len(probabilities))
-    return int(np.searchsorted(below, tail)), most
+    below, tail = np.cumsum(distribution), 0.5 * (1 - CHANCE)
+    fewest, most = np.searchsorted(below, [tail, 1 - tail]).tolist()
+    return fewest, min(most, len(probabilities))
 
 
 def binned(stated: Sequence[Stated]) -> list[Bin]:

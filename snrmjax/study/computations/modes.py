@@ -51,9 +51,9 @@ class NormalModes(AbstractModes):
 
     def member(self, model: Structure, force: np.ndarray | None, seed: int) -> dict:
         """See `AbstractSingly.member`."""
-        found = nonlinear_normal_mode(model, self.to_frequency, harmonic_order=self.harmonic_order)
-        speed = np.abs(found.velocity[:, 1, 0])
-        return {**_rows(found.status, found.frequency, speed), "point_energy_j": found.energy}
+        mode = nonlinear_normal_mode(model, self.to_frequency, harmonic_order=self.harmonic_order)
+        speed = np.abs(mode.velocity[:, 1, 0])
+        return {**_rows(mode.status, mode.frequency, speed), "point_energy_j": mode.energy}
 
 
 class DampedModes(AbstractModes):
@@ -67,11 +67,11 @@ class DampedModes(AbstractModes):
 
     def member(self, model: Structure, force: np.ndarray | None, seed: int) -> dict:
         """See `AbstractSingly.member`."""
-        found = damped_normal_mode(model, self.largest_velocity, harmonic_order=self.harmonic_order)
-        rows = _rows(found.status, found.frequency, np.abs(found.velocity[:, 1, 0]))
-        if found.status == CurveStatus.AMPLITUDE_LIMIT:  # which was asked for: a whole mode
+        mode = damped_normal_mode(model, self.largest_velocity, harmonic_order=self.harmonic_order)
+        rows = _rows(mode.status, mode.frequency, np.abs(mode.velocity[:, 1, 0]))
+        if mode.status == CurveStatus.AMPLITUDE_LIMIT:  # which was asked for: a whole mode
             rows["status"] = np.array(["largest_velocity"])
-        return {**rows, "point_damping_ratio": found.damping_ratio}
+        return {**rows, "point_damping_ratio": mode.damping_ratio}
 
 
 def _rows(status: CurveStatus, frequency: np.ndarray, speed: np.ndarray) -> dict:

@@ -240,6 +240,6 @@ def bounds_over(
 
 def _at_folds(curves: Sequence[ResponseCurve]) -> Float[np.ndarray, "quantity fold"]:
     """Frequency in Hz and velocity in m/s of all folds of a response."""
-    found = [(one, one.at_events("fold")) for one in curves]
-    frequency = np.concatenate([one.frequency[at] for one, at in found]) / HERTZ
-    return np.array([frequency, np.concatenate([np.abs(c.velocity[at, 1, 0]) for c, at in found])])
+    folds = [(curve, curve.at_events("fold")) for curve in curves]
+    frequency = np.concatenate([curve.frequency[at] for curve, at in folds]) / HERTZ
+    return np.array([frequency, np.concatenate([np.abs(c.velocity[at, 1, 0]) for c, at in folds])])

@@ -52,8 +52,8 @@ class AbstractIdentified(AbstractSingly):
 
     def identified(self, data: SteadyStates, model: Structure) -> dict[str, np.ndarray]:
         """One member's row."""
-        found: Identification = identify_backbone(data, model)
-        backbone, status = found.backbone, np.asarray(found.points.status)
+        identification: Identification = identify_backbone(data, model)
+        backbone, status = identification.backbone, np.asarray(identification.points.status)
         values = backbone.sampled(_POINTS)
         row = {
             "velocity_m_s": values.velocity,
@@ -129,13 +129,13 @@ class Diagnoses(AbstractSingly):
 
     def member(self, model: Structure, force: np.ndarray | None, seed: int) -> dict:
         """See `AbstractSingly.member`."""
-        found = diagnose_model(model, self.data)
-        name = "+".join(found.effects)
+        diagnosis = diagnose_model(model, self.data)
+        name = "+".join(diagnosis.effects)
         return {
             "status": np.array(["answered"]),
-            "verdict": np.array([str(found.verdict.value)]),
+            "verdict": np.array([str(diagnosis.verdict.value)]),
             "effects": np.array([name]),
-            "probability": np.array([found.probabilities.get(name or "none", np.nan)]),
-            "gap_before": np.array([found.gap.before]),
-            "gap_after": np.array([found.gap.after]),
+            "probability": np.array([diagnosis.probabilities.get(name or "none", np.nan)]),
+            "gap_before": np.array([diagnosis.gap.before]),
+            "gap_after": np.array([diagnosis.gap.after]),
         }
