@@ -74,7 +74,7 @@ SUB_ROOMS = {
     "methods.steady": {"methods.result", "methods.one_sensor"},
     "methods.records": {"methods.result", "methods.one_sensor"},
     "identify.test_model": {"identify.checks", "identify.curves"},
-    "diagnose.misfit": set(),
+    "diagnose.misfit": {"diagnose.priors"},
     "diagnose.search": {"diagnose.misfit", "diagnose.priors"},
     "diagnose.checks": {
         *("diagnose.misfit", "diagnose.search", "diagnose.priors", "diagnose.evidence"),

@@ -15,7 +15,6 @@ from snrmjax.diagnose.misfit.effect_fit import (
     likely_errors,
     without_errors,
 )
-from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
 from snrmjax.diagnose.misfit.predictions import Predictions
 from snrmjax.diagnose.misfit.programs import MANY_HARMONICS
 from snrmjax.diagnose.misfit.reference import with_unstated_level_errors
@@ -27,9 +26,7 @@ from snrmjax.model.effect_base import AbstractHysteresis, AbstractKinked
 from snrmjax.model.effect_metadata import MotionScales
 from snrmjax.model.effects import EFFECTS
 
-_NEAR_ANSWERS, _NEAREST_ANSWERS = 12, 4  # whose effects are looked for again
 _WITHOUT_LAST_HARMONIC = (AbstractKinked, AbstractHysteresis)
-_NEAR = 0.8  # share of noise that is as much
 
 
 class Answered(NamedTuple):
@@ -59,9 +56,8 @@ class Search(NamedTuple):
 
     def near(self, found: FoundEffects) -> "Search":
         """A search among the effects of the answers that fit best so far."""
-        n = found.misfit.n_rows
-        ranked = sorted(found.considered, key=lambda fit: fit.criterion(n))
-        return self._among(fit.kinds for fit in ranked[:_NEAR_ANSWERS])
+        ranked = sorted(found.considered, key=lambda fit: fit.criterion)
+        return self._among(fit.kinds for fit in ranked[: priors.NEAR_ANSWERS])
 
     def _among(self, answers: Iterable[Iterable[str]]) -> "Search":
         near = {kind for kinds in answers for kind in kinds}
@@ -87,7 +83,7 @@ class Search(NamedTuple):
         for _ in range(0 if stated else 3):
             winner = self.refined(found.misfit, found.fit)
             factor = max(rms_misfit(*winner), least / misfit.predictions.error_scale)
-            if _NEAR < factor < 1 / _NEAR:
+            if priors.SAME_NOISE < factor < 1 / priors.SAME_NOISE:
                 break
             misfit = weighted_misfit(misfit.predictions.with_errors_scaled(factor))
             # Smaller noise may need effects that larger noise hid; larger noise needs no others.
@@ -108,10 +104,8 @@ class Search(NamedTuple):
         curves may miss a kink.
         """
         found = self._corrected(misfit, fit)
-        if found is not None:
-            freedom = found[0].n_rows - len(found[1].values)
-            if chi_square_p_value(found[1].chi_square, freedom) > priors.REJECTED:
-                return found
+        if found is not None and found[1].p_value > priors.REJECTED:
+            return found
         none = np.zeros_like(misfit.predictions.added)
         plain = without_errors(misfit, fit, self.data, none)
         other = self._corrected(plain, refitted(plain, self.scales, fit))
@@ -143,15 +137,15 @@ def best_answer(search: Search, predictions: Predictions) -> Answered:
     That is asked where an answer leaves more than noise, or does what such levels would do.
     """
     answered = search.answered(predictions)
-    answered = with_more_harmonics(answered, search.among(answered, _NEAREST_ANSWERS))
+    answered = with_more_harmonics(answered, search.among(answered, priors.NEAREST_ANSWERS))
     alike = any(EFFECTS[kind].is_linear for kind in answered.found.fit.kinds)
     stated = all(std > 0 for std in predictions.given.level_stds)
     if stated or predictions.reference is None or not (alike or leaves_more_than_noise(answered)):
         return answered
     now = (answered.coarse or answered.found).misfit.predictions
-    near = search.among(answered, _NEAR_ANSWERS)
+    near = search.among(answered, priors.NEAR_ANSWERS)
     apart = near.answered(with_unstated_level_errors(now))
-    apart = with_more_harmonics(apart, search.among(apart, _NEAREST_ANSWERS))
+    apart = with_more_harmonics(apart, search.among(apart, priors.NEAREST_ANSWERS))
     odds = float(np.log(priors.LEVELS_APART))
     weights = evidence.either(answered.weights, apart.weights, odds)
     likelier = apart if apart.log_weight + odds > answered.log_weight else answered
@@ -182,4 +176,4 @@ def leaves_more_than_noise(answered: Answered) -> bool:
     if predictions.chosen.noise_stated or predictions.reference is None:
         return answered.found.p_value < priors.REJECTED
     size = ASSUMED_ERROR * predictions.error_scale
-    return bool(_NEAR * size > predictions.reference.posterior.hyper.noise)
+    return bool(priors.SAME_NOISE * size > predictions.reference.posterior.hyper.noise)

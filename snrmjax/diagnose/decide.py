@@ -31,8 +31,6 @@ from snrmjax.diagnose.search.locating import Located, power_of_answer
 from snrmjax.diagnose.search.model_search import FoundEffects
 from snrmjax.numerics.facts import Fact
 
-_FEW = 2  # effects of an answer beside which no law is drawn
-
 
 class Verdict(StrEnum):
     """What a diagnosis says as a whole."""
@@ -148,7 +146,7 @@ def decide(
 
 def law_is_asked_for(judgement: Judgement, n_effects: int) -> bool:
     """Whether a drawn law may do better: nothing is named, or by so many effects that fit most."""
-    return judgement.verdict is Verdict.UNKNOWN or n_effects > _FEW
+    return judgement.verdict is Verdict.UNKNOWN or n_effects > priors.FEW_EFFECTS
 
 
 def with_law(judgement: Judgement, law: LawAnswer) -> Judgement:
@@ -159,7 +157,7 @@ def with_law(judgement: Judgement, law: LawAnswer) -> Judgement:
     apart = {
         name: p
         for name, p in judgement.probabilities.items()
-        if name != UNKNOWN and len(name.split("+")) <= _FEW
+        if name != UNKNOWN and len(name.split("+")) <= priors.FEW_EFFECTS
     }
     outside = 1 - sum(apart.values())
     apart["+".join(law.kinds)] = law.share * outside

@@ -53,7 +53,6 @@ from snrmjax.diagnose.misfit.effect_fit import EffectFit, at_phases_of, at_refer
 from snrmjax.diagnose.misfit.noise_model import notes_without_phases
 from snrmjax.diagnose.misfit.predictions import Predictions, predictions_of, scales_of
 from snrmjax.diagnose.misfit.reference import (
-    FREE_GAIN_STD,
     driven_by_voltage,
     with_first_gain,
     with_reference,
@@ -108,7 +107,7 @@ def diagnose_model(
     gain, notes = None, list[Fact | str]()
     if driven_by_voltage(data):
         data, gain, of_gain = with_first_gain(model, data)
-        force_gain_std = force_gain_std or FREE_GAIN_STD
+        force_gain_std = force_gain_std or priors.FREE_GAIN_STD
         notes += of_gain
     predictions = _corrected_predictions(model, data, force_gain_std)
     unknown, noise_stated = predictions.chosen.phase_unknown, predictions.chosen.noise_stated

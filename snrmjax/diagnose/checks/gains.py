@@ -13,7 +13,7 @@ from snrmjax.diagnose.checks.alternative_laws import Doubt
 from snrmjax.diagnose.misfit.candidates import parameter_labels
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
 from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
-from snrmjax.diagnose.misfit.weighted_misfit import FREE_LEVEL_FORCE_STD, WeightedMisfit
+from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
 from snrmjax.diagnose.search.model_search import FoundEffects
 from snrmjax.identify.checks.instruments import (
     Determination,
@@ -71,7 +71,7 @@ def suspected_level_forces(found: FoundEffects, noise: float) -> LevelForces | N
     member = np.asarray(chosen.states.level) == np.arange(chosen.n_levels)[:, None]
     of_forces = member[:, :, None] * misfit.passed_on.by_error[None, :, :, 0]
     arms = misfit.noise.decorrelated(misfit.noise.noise_units(of_forces)).T
-    as_recorded, cost = found.fit.criterion(misfit.n_rows), float(np.log(misfit.n_rows))
+    as_recorded, cost = found.fit.criterion, float(np.log(misfit.n_rows))
     fits: dict[frozenset[str], EffectFit] = {}
     for fit in (found.baseline, found.fit, *found.considered):
         known = fits.get(frozenset(fit.kinds))
@@ -121,8 +121,8 @@ def level_gains(misfit: WeightedMisfit, fit: EffectFit) -> dict[int, LevelGain]:
     first = predictions.n_baseline_errors
     moved = misfit.noise.shared_errors(fit.rows)
     for k, place in enumerate(predictions.free_level_forces, first):
-        value = 1 + FREE_LEVEL_FORCE_STD * float(moved[k])
-        std = FREE_LEVEL_FORCE_STD * misfit.noise.shared_std(fit.slopes, k)
+        value = 1 + priors.FREE_LEVEL_FORCE_STD * float(moved[k])
+        std = priors.FREE_LEVEL_FORCE_STD * misfit.noise.shared_std(fit.slopes, k)
         gains[int(misfit.level_numbers[place])] = LevelGain(value, std)
     return gains
 

@@ -9,10 +9,10 @@ from scipy.special import fdtrc, ndtr
 
 from snrmjax.diagnose import priors
 from snrmjax.diagnose.checks.alternative_laws import Doubt
-from snrmjax.diagnose.evidence import hat_functions
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
 from snrmjax.diagnose.misfit.noise_model import chi_square_p_value, shared_covariance
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
+from snrmjax.diagnose.search.locating import hat_functions
 from snrmjax.diagnose.search.model_search import FoundEffects
 from snrmjax.numerics.facts import Fact
 

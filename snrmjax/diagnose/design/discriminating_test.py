@@ -248,9 +248,8 @@ class _Hypothesis:
                 continue
             rival = ModelRows(*before, in_noise_units(test.misfit, its))
             gain = separation(self.misfit, test.misfit, own, rival, kept)
-            n = self.misfit.n_rows
             # A gain G of χ² scatters by 2√G.
-            ahead = fit.criterion(n) - self.truth.criterion(n)
+            ahead = fit.criterion - self.truth.criterion
             least = max(priors.AS_GOOD_BY_CRITERION - ahead, 0.0)
             needed = float((priors.ONE_SIDED + np.sqrt(priors.ONE_SIDED**2 + least)) ** 2)
             found.append(

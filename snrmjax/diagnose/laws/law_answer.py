@@ -33,10 +33,6 @@ from snrmjax.diagnose.misfit.effect_fit import EffectFit, baseline_fit
 from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
 from snrmjax.diagnose.search.model_search import FoundEffects
-from snrmjax.model.effect_base import AbstractMemoryless
-from snrmjax.model.effect_metadata import Argument
-from snrmjax.model.effect_shape import shape_of
-from snrmjax.model.effects import EFFECTS
 from snrmjax.model.parameters import with_parameters
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.facts import Fact
@@ -76,7 +72,7 @@ def law_answer(found: FoundEffects, model: Structure) -> LawAnswer | None:
     misfit, numbers = fit.misfit, fit.misfit.level_numbers
     # Each with errors passed on as it passes them. Effects that fit were refuted otherwise.
     rejected = found.p_value < priors.REJECTED
-    if rejected and fit.criterion > found.fit.criterion(misfit.n_rows) - priors.DETECTED:
+    if rejected and fit.criterion > found.fit.criterion - priors.DETECTED:
         return None
     as_effect = _as_effect_fit(fit)
     neighbours = neighbour_noise(misfit, as_effect)
@@ -123,7 +119,7 @@ def law_answer(found: FoundEffects, model: Structure) -> LawAnswer | None:
         levels=levels,
         completed=completed,
         completed_without=completed_without,
-        notes=tuple(_notes(fit, laws, levels, found)),
+        notes=tuple(_notes(fit, laws, levels)),
         decide_by=_decide_by(fit),
     )
 
@@ -152,7 +148,6 @@ def _notes(
     fit: LawFit,
     laws: tuple[DrawnLaw, ...],
     levels: HeldOutLevels | None,
-    found: FoundEffects,
 ) -> Iterator[Fact]:
     first = laws[0]
     yield Fact(
@@ -168,7 +163,6 @@ def _notes(
         yield Fact("odd_part_alone")
     if fit.rivals:
         yield Fact("laws_as_good", effects=tuple(LAW_KINDS[part] for part in fit.rivals))
-    yield from _closest(fit, first, found)
 
 
 def _odd_alone(fit: LawFit) -> bool:
@@ -181,27 +175,3 @@ def _decide_by(fit: LawFit) -> Fact | None:
     if not (fit.rivals or _odd_alone(fit)):
         return None
     return Fact("record_harmonics_of_law", kind_is_open=bool(fit.rivals))
-
-
-def _closest(fit: LawFit, law: DrawnLaw, found: FoundEffects) -> Iterator[Fact]:
-    """Where the two laws of the library that fit best alone leave the band."""
-    modes = fit.misfit.model.modes
-    j = modes.mode_of_interest
-    size = abs(float(modes.mode_shape[fit.misfit.predictions.chosen.sensors[0], j]))
-    alike = []
-    for row in found.table[0] if found.table else ():
-        effect = EFFECTS[row.kind]
-        shape = shape_of(effect)
-        if not issubclass(effect, AbstractMemoryless) or shape is None:
-            continue
-        if shape.argument is law.argument and np.isfinite(row.gain):
-            alike.append((effect, row.parameters.values()))
-    for effect, parameters in alike[:2]:
-        at = jnp.asarray(law.at / size)
-        zero = jnp.zeros_like(at)
-        pair = (zero, at) if law.argument is Argument.VELOCITY else (at, zero)
-        force = effect(*map(jnp.asarray, parameters)).cycle_force(*pair)
-        off = np.abs(np.asarray(force) / size - law.force)
-        beyond = law.at[off > priors.BAND * law.force_std + 1e-12 * np.abs(law.force).max()]
-        ends = (float(beyond.min()), float(beyond.max())) if beyond.size else None
-        yield Fact("law_of_library", effect=effect.kind, beyond=ends, argument=law.argument.value)

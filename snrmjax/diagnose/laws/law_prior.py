@@ -19,11 +19,7 @@ from scipy.linalg import block_diag, cho_solve, solve_triangular
 from scipy.optimize import nnls
 from scipy.special import logsumexp
 
-REACHES = (0.35, 0.7, 1.4, 2.8)
-"""Of a process, in logarithms of displacement or velocity, from which the likeliest is taken."""
-
-SIZES = 2.0 ** np.arange(-7.0, 9.0)
-"""Of a process, in units of a change that is plainly seen."""
+from snrmjax.diagnose import priors
 
 
 class LawPart(NamedTuple):
@@ -129,7 +125,7 @@ def posterior(problem: LawProblem, parts: Sequence[str]) -> LawPosterior:
         several = []
         for reach, size in zip(*np.nonzero(weights > 1e-2), strict=True):
             others = list(found)
-            others[k] = Process(float(SIZES[size]), REACHES[reach])
+            others[k] = Process(float(priors.LAW_SIZES[size]), priors.LAW_REACHES[reach])
             several.append((weights[reach, size], _gaussian(problem, parts, others)))
         total = sum(weight for weight, _ in several)
         centre = sum(weight * one.mean for weight, one in several) / total
@@ -199,13 +195,13 @@ def _table(
 ) -> Float[np.ndarray, "reach size"]:
     """Cost for every reach and size of one part, the others as they are."""
     gram, pulled, fixed = _beside(problem, parts, processes, k)
-    table = np.zeros((len(REACHES), len(SIZES)))
-    for number, reach in enumerate(REACHES):
+    table = np.zeros((len(priors.LAW_REACHES), len(priors.LAW_SIZES)))
+    for number, reach in enumerate(priors.LAW_REACHES):
         root = _root(problem, parts[k], Process(1.0, reach))
         values, vectors = np.linalg.eigh(root.T @ gram @ root)
         values = np.maximum(values, 0.0)
         pull = vectors.T @ (root.T @ pulled)
-        scaled = SIZES[:, None] ** 2
+        scaled = priors.LAW_SIZES[:, None] ** 2
         table[number] = np.sum(np.log1p(scaled * values), axis=1)
         table[number] -= np.sum(scaled * pull**2 / (1 + scaled * values), axis=1)
     return table + fixed
@@ -224,7 +220,7 @@ def _cost_of_bounds(
 
 def _least(table: np.ndarray) -> Process:
     reach, size = np.unravel_index(np.argmin(table), table.shape)
-    return Process(float(SIZES[size]), REACHES[reach])
+    return Process(float(priors.LAW_SIZES[size]), priors.LAW_REACHES[reach])
 
 
 def _mean(table: np.ndarray) -> float:

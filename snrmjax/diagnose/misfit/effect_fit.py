@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from snrmjax.diagnose.misfit.candidates import EffectCandidate, coordinates, parameter_labels
+from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
 from snrmjax.diagnose.misfit.predictions import Predictions, scales_of
 from snrmjax.diagnose.misfit.weighted_misfit import ErrorPropagation, WeightedMisfit, by_baseline
 from snrmjax.measure.states import SteadyStates
@@ -52,9 +53,15 @@ class EffectFit(NamedTuple):
         pairs = zip(self.labels, self.values.tolist(), strict=True)
         return tuple(value for label, value in pairs if label.startswith(f"{kind}."))
 
-    def criterion(self, n_rows: int) -> float:
+    @property
+    def criterion(self) -> float:
         """Schwarz's Bayesian information criterion, χ² + p ln n."""
-        return self.chi_square + len(self.values) * float(np.log(n_rows))
+        return self.chi_square + len(self.values) * float(np.log(max(len(self.rows), 1)))
+
+    @property
+    def p_value(self) -> float:
+        """Probability by chance of at least the misfit that is left."""
+        return chi_square_p_value(self.chi_square, len(self.rows) - len(self.values))
 
 
 class _Evaluated(NamedTuple):

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex
 
+from snrmjax.diagnose import priors
 from snrmjax.diagnose.misfit.predictions import Predictions, predictions_of
 from snrmjax.diagnose.misfit.weighted_misfit import weighted_misfit
 from snrmjax.identify.checks.instruments import force_gain_undetermined
@@ -153,10 +154,6 @@ def _with_levels(predictions: Predictions, sizes: Sequence[float]) -> Prediction
     )
 
 
-FREE_GAIN_STD = 1.0
-"""Relative 1σ of a force gain that is unknown."""
-
-
 def driven_by_voltage(data: SteadyStates) -> bool:
     """Whether the force is known as a drive voltage only."""
     force, drive = np.asarray(data.force), np.asarray(data.drive)
@@ -179,7 +176,7 @@ def with_first_gain(
     def driven(gain: float) -> SteadyStates:
         return eqx.tree_at(lambda d: d.force, data, gain * data.drive)
 
-    predictions = predictions_of(model, driven(1.0), FREE_GAIN_STD)
+    predictions = predictions_of(model, driven(1.0), priors.FREE_GAIN_STD)
     needed, unknown = weighted_misfit(predictions).baseline.force, predictions.chosen.phase_unknown
     phase = np.angle(np.asarray(predictions.chosen.states.velocity)[:, 0])
     # With known phases the part against damping, which no error of the stiffness changes.
@@ -190,7 +187,7 @@ def with_first_gain(
     gain, doubt, from_curves = float(np.median(gains[np.isfinite(gains)])), None, False
     # Twice: the first curves' prior lies about what the model as given needs.
     for _ in range(0 if unknown.any() else 2):
-        reference = reference_of(predictions_of(model, driven(gain), FREE_GAIN_STD))
+        reference = reference_of(predictions_of(model, driven(gain), priors.FREE_GAIN_STD))
         if reference is None:
             break
         mass, std = reference.posterior.modal_mass

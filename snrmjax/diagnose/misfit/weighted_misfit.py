@@ -7,14 +7,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
+from snrmjax.diagnose import priors
 from snrmjax.diagnose.misfit.candidates import EffectCandidate, parameter_labels
 from snrmjax.diagnose.misfit.noise_model import NoiseModel, shared_covariance
 from snrmjax.diagnose.misfit.predictions import Predicted, Predictions
 from snrmjax.identify.calibrate.calibration_states import ComparedColumns, whitened_columns
 from snrmjax.model.structures import Structure
-
-FREE_LEVEL_FORCE_STD = 0.3
-"""Relative 1σ of the force of a level that is left free: far more than a calibration is off."""
 
 
 class BaselinePrediction(NamedTuple):
@@ -252,7 +250,7 @@ def _noise(predictions: Predictions, passed_on: ErrorPropagation) -> NoiseModel:
     by_error, force = passed_on.by_error, passed_on.by_error[:, :, :1]
     gain = predictions.force_gain_std * force
     free = level[:, None, None] == np.array(predictions.free_level_forces, dtype=int)
-    shared = [own, *([gain] if np.any(gain) else []), FREE_LEVEL_FORCE_STD * force * free]
+    shared = [own, *([gain] if np.any(gain) else []), priors.FREE_LEVEL_FORCE_STD * force * free]
     of_no_level = sum(part.shape[2] for part in shared)
     member = (level[:, None] == np.arange(n_levels)).astype(float)
     inputs = (by_error[:, :, 1 : n + 1].sum(axis=2), by_error[:, :, n + 1 :].sum(axis=2))

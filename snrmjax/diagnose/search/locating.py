@@ -1,18 +1,16 @@
 """Which part of the force balance disagrees: stiffness, damping, harmonics, or none of them."""
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Complex, Float
-from scipy.optimize import least_squares
+from jaxtyping import Float
 
 from snrmjax.diagnose import priors
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
 from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
 
-_FREE = 6  # of a free curve of amplitude
+_FREE = priors.FREE_CURVE
 
 
 class Located(NamedTuple):
@@ -29,61 +27,81 @@ def locate_misfit(misfit: WeightedMisfit, base: EffectFit) -> tuple[Located, ...
     """Fit free curves of stiffness and damping to the force, and test every part by itself.
 
     Where sizes alone are compared, states off resonance determine the stiffness and those near it
-    the damping: a part that the other one can explain as well is not reported.
+    the damping, to first order: a part that the other one can explain as well is not reported.
     """
     noise, states = misfit.noise, misfit.predictions.states
     speed = np.abs(states.velocity[:, 0])
-    of_force = noise.column < 2
     amplitude = np.log(speed / speed.max())
-    knots = np.quantile(amplitude, np.linspace(0, 1, _FREE))
-    knots = knots + 1e-9 * np.arange(_FREE)
+    knots = np.quantile(amplitude, np.linspace(0, 1, _FREE)) + 1e-9 * np.arange(_FREE)
     hats = np.stack([np.interp(amplitude, knots, row) for row in np.eye(_FREE)], axis=1)
-    rows = np.where(of_force, base.rows, 0.0)
-    force = _Rows(misfit, of_force)
-    nothing = float(np.sum(force.decorrelated(rows) ** 2))
-    both = [_curves(misfit, rows, hats, [k]) for k in range(2)]
-    alone = [force.fitted(curves, np.zeros(_FREE)) for curves in both]
-    starts = (np.append(alone[0][1], np.zeros(_FREE)), np.append(np.zeros(_FREE), alone[1][1]))
-    together = _curves(misfit, rows, hats, [0, 1])
-    fits = [force.fitted(together, start) for start in starts]
-    free, values, covariance = min(fits, key=lambda fit: fit[0])
-    # Sizes are not linear: what curves of few knots leave adds uncertainty.
-    if np.any(together.weight > 0):
-        covariance = covariance * max(free / max(int(of_force.sum()) - 2 * _FREE, 1), 1.0)
+    of_force = noise.column < 2
+    covariance = noise.covariance.of_rows(of_force)
+    left = covariance.decorrelated(base.rows[of_force])
+    curves = [
+        covariance.decorrelated((misfit.by_linear[:, [k]] * hats[noise.state])[of_force].T).T
+        for k in range(2)
+    ]
+    alone = [_fitted(left, arms)[0] for arms in curves]
+    free, values, spread = _fitted(left, np.concatenate(curves, axis=1))
+    n_force = int(of_force.sum())
+    if misfit.predictions.sizes.alone.any():  # they are not linear in a curve
+        spread = spread * max(free / max(n_force - 2 * _FREE, 1), 1.0)
     parts = []
     for k, name in enumerate(("stiffness", "damping")):
-        p_value = chi_square_p_value(alone[1 - k][0] - free, _FREE)
+        p_value = chi_square_p_value(alone[1 - k] - free, _FREE)
         if p_value < priors.REJECTED:
             some = slice(k * _FREE, (k + 1) * _FREE)
-            own, spread = values[some], covariance[some, some]
-            std = np.sqrt(np.maximum(np.einsum("sk,kl,sl->s", hats, spread, hats), 0.0))
-            seen = np.abs(hats @ own) > 2 * std
-            where = speed[seen] if seen.any() else speed
-            ends = float(where.min()), float(where.max())
-            parts.append(Located(name, ends, p_value, *power_of_amplitude(knots, own, spread)))
-    n_force = int(of_force.sum())
-    left = chi_square_p_value(free, n_force - 2 * _FREE)
-    everywhere = (float(speed.min()), float(speed.max()))
-    if left < priors.REJECTED and nothing > n_force:
-        parts.append(Located("not_a_function_of_amplitude", everywhere, left))
-    n_sensors = states.velocity.shape[1]
-    orders = misfit.predictions.chosen.orders
-    for place, order in enumerate(orders):
-        if order not in (2, 3):
+            curve, its = values[some], spread[some, some]
+            std = np.sqrt(np.maximum(np.einsum("sk,kl,sl->s", hats, its, hats), 0.0))
+            ends = _range(speed, np.abs(hats @ curve) > 2 * std)
+            parts.append(Located(name, ends, p_value, *power_of_amplitude(knots, curve, its)))
+    chance = chi_square_p_value(free, n_force - 2 * _FREE)
+    if chance < priors.REJECTED and float(left @ left) > n_force:
+        parts.append(Located("not_a_function_of_amplitude", _range(speed), chance))
+    for place, order in enumerate(misfit.predictions.chosen.orders):
+        first = 2 * (states.velocity.shape[1] + place)
+        rows = (noise.column == first) | (noise.column == first + 1)
+        if order not in (2, 3) or not rows.any():
             continue
-        first = 2 * (n_sensors + place)
-        mine = (noise.column >= first) & (noise.column < first + 2)
-        if not mine.any():
-            continue
-        left_of = _Rows(misfit, mine).decorrelated(np.where(mine, base.rows, 0.0))
-        p_value = chi_square_p_value(float(left_of @ left_of), int(mine.sum()))
+        own = noise.covariance.of_rows(rows).decorrelated(base.rows[rows])
+        p_value = chi_square_p_value(float(own @ own), int(rows.sum()))
         if p_value < priors.REJECTED:
-            large = np.abs(base.rows[mine]) > 2.5
-            where = speed[noise.state[mine][large]] if large.any() else speed
-            parts.append(
-                Located(f"harmonic_{order}", (float(where.min()), float(where.max())), p_value)
-            )
+            large = noise.state[rows][np.abs(base.rows[rows]) > 2.5]
+            ends = _range(speed, np.isin(np.arange(len(speed)), large))
+            parts.append(Located(f"harmonic_{order}", ends, p_value))
     return tuple(parts)
+
+
+def curve_knots(where: Float[np.ndarray, " state"], knots: int) -> Float[np.ndarray, " knot"]:
+    """Knots with equally many states between any two."""
+    return np.asarray(np.quantile(where, np.linspace(0, 1, knots)) + 1e-9 * np.arange(knots))
+
+
+def hat_functions(
+    where: Float[np.ndarray, " state"], knots: int
+) -> Float[np.ndarray, "state knot"]:
+    """Piecewise linear curves of unit height at each of these knots."""
+    at = curve_knots(where, knots)
+    return np.stack([np.interp(where, at, row) for row in np.eye(knots)], axis=1)
+
+
+def _range(speed: np.ndarray, seen: np.ndarray | None = None) -> tuple[float, float]:
+    """The range of velocities where something is seen; of all where it is seen nowhere."""
+    where = speed if seen is None or not seen.any() else speed[seen]
+    return float(where.min()), float(where.max())
+
+
+def _fitted(
+    left: Float[np.ndarray, " row"], arms: Float[np.ndarray, "row column"]
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """χ², the most likely values of some columns, and their covariance."""
+    size = np.linalg.norm(arms, axis=0)
+    size = np.where(size > 0, size, 1.0)
+    scaled = arms / size
+    inverse = np.linalg.pinv(scaled.T @ scaled, rcond=1e-10, hermitian=True)
+    values = -inverse @ (scaled.T @ left)
+    left = left + scaled @ values
+    return float(left @ left), values / size, inverse / np.outer(size, size)
 
 
 def power_of_answer(
@@ -99,80 +117,6 @@ def power_of_answer(
     alone = baseline._replace(rows=baseline.rows - fit.rows)
     powers = [one.exponent for one in locate_misfit(misfit, alone) if one.part == part]
     return powers[0] if powers else None
-
-
-class _Curves(NamedTuple):
-    """Rows with free curves added to the baseline: linear in them, except for sizes."""
-
-    rows: Float[np.ndarray, " row"]
-    arms: Float[np.ndarray, "row value"]
-    force: Complex[np.ndarray, " row"]  # the model's, over the measured one
-    by_value: Complex[np.ndarray, "row value"]
-    weight: Float[np.ndarray, " row"]  # of the force's size where that alone is compared; else 0
-
-    def at(self, values: Float[np.ndarray, " value"]) -> tuple[np.ndarray, np.ndarray]:
-        """Rows and slopes."""
-        rows, force = self.rows + self.arms @ values, self.force + self.by_value @ values
-        size, alone = np.abs(force), self.weight > 0
-        unit = force.conj() / np.where(size > 0, size, 1.0)
-        arms = self.weight[:, None] * np.real(unit[:, None] * self.by_value)
-        of_size = self.weight * (size - 1)
-        return np.where(alone, of_size, rows), np.where(alone[:, None], arms, self.arms)
-
-
-def _curves(
-    misfit: WeightedMisfit, rows: np.ndarray, hats: np.ndarray, parts: list[int]
-) -> _Curves:
-    """Curves of stiffness (0) or damping (1), or of both."""
-    noise = misfit.noise
-    state, hats = noise.state, hats[noise.state]
-    alone = misfit.predictions.sizes.alone[state, 0] & (noise.column == 0)
-    return _Curves(
-        rows,
-        np.concatenate([misfit.by_linear[:, [k]] * hats for k in parts], axis=1),
-        misfit.baseline.force[state],
-        np.concatenate(
-            [misfit.baseline.force_by_linear[state][:, [k]] * hats for k in parts], axis=1
-        ),
-        np.where(alone, noise.whiten[state, 0, 0], 0.0),
-    )
-
-
-class _Rows:
-    """Least squares on some of the rows."""
-
-    def __init__(self, misfit: WeightedMisfit, keep: np.ndarray):
-        self.keep = keep
-        self.covariance = misfit.noise.covariance.of_rows(keep)
-
-    def decorrelated(self, rows: np.ndarray) -> np.ndarray:
-        """The kept ones of rows, or of columns of them, made independent and of unit variance."""
-        return self.covariance.decorrelated(rows[self.keep].T).T
-
-    def chi_square(
-        self, rows: np.ndarray, columns: Float[np.ndarray, "row column"]
-    ) -> tuple[float, np.ndarray, np.ndarray]:
-        """χ², the most likely values of some columns, and their covariance."""
-        left, arms = self.decorrelated(rows), self.decorrelated(columns)
-        size = np.linalg.norm(arms, axis=0)
-        size = np.where(size > 0, size, 1.0)
-        inverse = np.linalg.pinv((arms / size).T @ (arms / size), rcond=1e-10, hermitian=True)
-        values = -inverse @ ((arms / size).T @ left)
-        left = left + (arms / size) @ values
-        return float(left @ left), values / size, inverse / np.outer(size, size)
-
-    def fitted(
-        self, curves: _Curves, start: Float[np.ndarray, " value"]
-    ) -> tuple[float, np.ndarray, np.ndarray]:
-        """χ², values and their covariance; by Levenberg–Marquardt where sizes are compared."""
-        if not np.any(curves.weight > 0):
-            return self.chi_square(curves.rows, curves.arms)
-
-        def part(k: int) -> Callable[[np.ndarray], np.ndarray]:
-            return lambda values: self.decorrelated(curves.at(values)[k])
-
-        found = least_squares(part(0), start, part(1), method="lm")
-        return 2 * float(found.cost), found.x, self.chi_square(*curves.at(found.x))[2]
 
 
 def power_of_amplitude(

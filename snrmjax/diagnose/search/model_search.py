@@ -19,7 +19,6 @@ from snrmjax.diagnose.misfit.effect_fit import (
     unfitted,
     with_errors_passed_on,
 )
-from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
 from snrmjax.model.effect_base import AbstractEffect
 from snrmjax.model.effect_metadata import VISIBLE_CHANGE, MotionScales
@@ -27,11 +26,6 @@ from snrmjax.model.effect_shape import shape_of, starts_of
 from snrmjax.model.effects import EFFECTS, effect_parameters
 from snrmjax.numerics.blocks import over_cores
 from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
-
-_HOPELESS = 5.0  # times χ² of the best fit so far, or of noise: others are given up on the way
-_PAIRS = 8  # that are fitted from their own starts
-_ONE = 2  # parameters of one effect; one with more is compared with two simple effects
-_MOST = 3  # effects of an answer
 
 
 class TriedEffect(NamedTuple):
@@ -57,8 +51,7 @@ class FoundEffects(NamedTuple):
     @property
     def p_value(self) -> float:
         """Probability by chance of at least the misfit that is left."""
-        freedom = self.misfit.n_rows - len(self.fit.values)
-        return chi_square_p_value(self.fit.chi_square, freedom)
+        return self.fit.p_value
 
 
 def find_effects(
@@ -87,19 +80,19 @@ def find_effects(
 def _searched(misfit: WeightedMisfit, every: dict[str, EffectCandidate]) -> FoundEffects:
     misfit, singles, rows = _tried(misfit, every)
     nothing, table = baseline_fit(misfit), [rows]
-    best = _best(misfit, [nothing, *singles])
+    best = _best([nothing, *singles])
     considered = [nothing, *singles]
-    if _gain(misfit, nothing, best) <= priors.DETECTED:
+    if not _gains(nothing, best):
         return FoundEffects(misfit, nothing, nothing, tuple(table), tuple(considered))
     jobs = [(c, best) for c in _promising(misfit, every, best)]
-    unexplained = _is_below(misfit, best, 0.05)
+    unexplained = best.p_value < 0.05
     # Two simple effects may do what one with many parameters does.
-    if unexplained or len(best.values) > _ONE:
+    if unexplained or len(best.values) > priors.SIMPLE:
         jobs += _pairs(misfit, every, best, unexplained=unexplained)
     pairs = fit_effects(misfit, jobs, _hopeless(best))
-    pair = _best(misfit, [best, *pairs])
+    pair = _best([best, *pairs])
     considered += pairs
-    if pair is best or _gain(misfit, best, pair) <= priors.DETECTED:
+    if not _gains(best, pair):
         return FoundEffects(misfit, best, nothing, tuple(table), tuple(considered))
     # Errors are passed on as by both. Each is chosen again beside the other one.
     misfit = with_errors_passed_on(misfit, pair)
@@ -109,23 +102,23 @@ def _searched(misfit: WeightedMisfit, every: dict[str, EffectCandidate]) -> Foun
         starts = (*every[kind].starts, pair.of_kind(kind))
         alone.append(fit_effect(misfit, every[kind]._replace(starts=starts)))
     others = [fit for fit in singles if fit.kinds[0] not in pair.kinds]
-    one, two = pair.kinds
-    together = fit_effect(misfit, _where(every, pair, two), started(_where(every, pair, one)))
+    one, two = (_where(every, pair, kind) for kind in pair.kinds)
+    together = fit_effect(misfit, two, started(one))
     considered = [nothing, *alone, together]
     again = [(_where(every, fit, fit.kinds[0]), nothing) for fit in others]
     considered += fit_effects(misfit, again, _hopeless(together))
     for kind, other in zip(pair.kinds, reversed(alone), strict=True):
         rivals = [c for c in _promising(misfit, every, other) if c.kind != kind]
         fits = fit_effects(misfit, [(c, other) for c in rivals], _hopeless(together))
-        table.append(_table(misfit, other, [*fits, together]))
+        table.append(_table(other, [*fits, together]))
         considered += fits
-    best = _best(misfit, considered)
-    if _is_below(misfit, best, priors.REJECTED) and len(best.kinds) < _MOST:
+    best = _best(considered)
+    if best.p_value < priors.REJECTED and len(best.kinds) < priors.MOST_EFFECTS:
         thirds = fit_effects(misfit, [(c, best) for c in _promising(misfit, every, best)])
-        table.append(_table(misfit, best, thirds))
+        table.append(_table(best, thirds))
         considered += thirds
-        third = _best(misfit, [best, *thirds])
-        best = third if _gain(misfit, best, third) > priors.DETECTED else best
+        third = _best([best, *thirds])
+        best = third if _gains(best, third) else best
     return FoundEffects(misfit, best, nothing, tuple(table), tuple(considered))
 
 
@@ -158,32 +151,25 @@ def _compared_with(
     misfit, fit = found.misfit, found.fit
     alike = [kind for kind in fit.kinds if EFFECTS[kind].is_linear]
     others = [kind for kind in fit.kinds if not EFFECTS[kind].is_linear]
-    refuted = _is_below(misfit, fit, priors.REJECTED)
+    refuted = fit.p_value < priors.REJECTED
     fits_by_itself = len(others) == len(fit.kinds) == 1 and not refuted
     if not fit.kinds or fits_by_itself or misfit.predictions.sizes.alone.any():
         return found
     jobs = [(close, found.baseline)]
     if alike and others:
-        jobs.append((close, _only(misfit, every, fit, others)))
-    if refuted and len(fit.kinds) < _MOST:
+        only = found.baseline
+        for kind in others:
+            only = fit_effect(misfit, _where(every, fit, kind), only)
+        jobs.append((close, only))
+    if refuted and len(fit.kinds) < priors.MOST_EFFECTS:
         jobs.append((close, fit))
     fits = fit_effects(misfit, jobs, _hopeless(fit))
     fits = [one for one in fits if np.isfinite(one.chi_square)]
     if not fits:
         return found
-    best = _best(misfit, [fit, *fits])
-    table = (*found.table, _table(misfit, found.baseline, fits))
+    best = _best([fit, *fits])
+    table = (*found.table, _table(found.baseline, fits))
     return found._replace(fit=best, table=table, considered=(*found.considered, *fits))
-
-
-def _only(
-    misfit: WeightedMisfit, every: dict[str, EffectCandidate], fit: EffectFit, kinds: Sequence[str]
-) -> EffectFit:
-    """A fit with some of the effects of another one only."""
-    found = baseline_fit(misfit)
-    for kind in kinds:
-        found = fit_effect(misfit, _where(every, fit, kind), found)
-    return found
 
 
 def _pairs(
@@ -197,18 +183,14 @@ def _pairs(
     pairs = [(one, two) for _, one, two in screened_pairs(misfit, list(every.values()))]
     most = len(best.values)
     simple = [(one, two) for one, two in pairs if len(one.unit) + len(two.unit) <= most]
-    chosen = simple[:_PAIRS] if most > _ONE else []
-    chosen += [pair for pair in pairs[:_PAIRS] if pair not in chosen] if unexplained else []
+    chosen = simple[: priors.PAIRS] if most > priors.SIMPLE else []
+    chosen += [pair for pair in pairs[: priors.PAIRS] if pair not in chosen] if unexplained else []
     return [(two, started(one)) for one, two in chosen]
 
 
 def _hopeless(best: EffectFit) -> float:
     """χ² that a fit must fall below, or promise to, to be continued beside the best one so far."""
-    return _HOPELESS * max(best.chi_square, float(len(best.rows)))
-
-
-def _is_below(misfit: WeightedMisfit, fit: EffectFit, probability: float) -> bool:
-    return chi_square_p_value(fit.chi_square, misfit.n_rows - len(fit.values)) < probability
+    return priors.HOPELESS * max(best.chi_square, float(len(best.rows)))
 
 
 def _promising(
@@ -239,14 +221,14 @@ def _tried(
     """
     nothing = baseline_fit(misfit)
     fits = fit_effects(misfit, [(c, nothing) for c in _promising(misfit, every, nothing)])
-    rows = _table(misfit, nothing, fits)
+    rows = _table(nothing, fits)
     fits = [fit for fit in fits if np.isfinite(fit.chi_square)]
-    best = min(fits, key=lambda fit: fit.criterion(misfit.n_rows), default=nothing)
-    if _gain(misfit, nothing, best) <= priors.DETECTED:
+    best = min(fits, key=lambda fit: fit.criterion, default=nothing)
+    if not _gains(nothing, best):
         return misfit, fits, rows
     again = with_errors_passed_on(misfit, best)
-    reach = best.criterion(misfit.n_rows) + max(40.0, 0.5 * best.chi_square)
-    near = [fit for fit in fits if fit.criterion(misfit.n_rows) < reach]
+    reach = best.criterion + max(40.0, 0.5 * best.chi_square)
+    near = [fit for fit in fits if fit.criterion < reach]
     jobs = [(_where(every, fit, fit.kinds[0]), baseline_fit(again)) for fit in near]
     return again, fit_effects(again, jobs), rows
 
@@ -256,28 +238,27 @@ def _where(every: dict[str, EffectCandidate], fit: EffectFit, kind: str) -> Effe
     return every[kind]._replace(starts=(fit.of_kind(kind),))
 
 
-def _gain(misfit: WeightedMisfit, before: EffectFit, after: EffectFit) -> float:
-    return before.criterion(misfit.n_rows) - after.criterion(misfit.n_rows)
+def _gains(before: EffectFit, after: EffectFit) -> bool:
+    """Whether an effect counts as detected."""
+    return before.criterion - after.criterion > priors.DETECTED
 
 
-def _best(misfit: WeightedMisfit, fits: Sequence[EffectFit]) -> EffectFit:
+def _best(fits: Sequence[EffectFit]) -> EffectFit:
     """The fit with the smallest criterion."""
-    finite = [fit for fit in fits if np.isfinite(fit.criterion(misfit.n_rows))]
+    finite = [fit for fit in fits if np.isfinite(fit.criterion)]
     if not finite:
         raise ValueError(
             "no trial fit of an effect has a finite misfit: the model is too far from the data to "
             "be compared."
         )
-    return min(finite, key=lambda fit: fit.criterion(misfit.n_rows))
+    return min(finite, key=lambda fit: fit.criterion)
 
 
-def _table(
-    misfit: WeightedMisfit, before: EffectFit, fits: list[EffectFit]
-) -> tuple[TriedEffect, ...]:
+def _table(before: EffectFit, fits: list[EffectFit]) -> tuple[TriedEffect, ...]:
     rows = [
         TriedEffect(
             next(kind for kind in fit.kinds if kind not in before.kinds),
-            _gain(misfit, before, fit),
+            before.criterion - fit.criterion,
             fit.chi_square,
             dict(zip(fit.labels, fit.values.tolist(), strict=True)),
             fit.status,

@@ -368,13 +368,4 @@ SENTENCES: dict[str, Wording] = {
     ),
     "odd_part_alone": "without harmonics the odd part of the force alone is seen.",
     "laws_as_good": lambda *, effects: f"{effect_names(effects, 'or')} would do about as well.",
-    "law_of_library": lambda *, effect, beyond, argument: (
-        f"{effect_name(effect)}, fitted alone, "
-        + (
-            "stays within the 95 % band of the law."
-            if beyond is None
-            else f"leaves the 95 % band of the law between {beyond[0]:.3g} and {beyond[1]:.3g} "
-            f"{_UNITS[argument]}."
-        )
-    ),
 }

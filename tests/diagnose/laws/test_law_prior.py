@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal, truncnorm
 
+from snrmjax.diagnose import priors
 from snrmjax.diagnose.laws.law_prior import (
     PARTS,
-    REACHES,
-    SIZES,
     LawProblem,
     Process,
     _gaussian,
@@ -46,7 +45,10 @@ def test_the_cost_is_that_of_the_full_gaussian(parts, processes):
     assert found.cost == pytest.approx(2 * (alone - with_law), abs=1e-8)
     # The same number stands in the table of sizes and reaches, others beside it or not.
     for k, process in enumerate(processes):
-        place = REACHES.index(process.reach), SIZES.tolist().index(process.size)
+        place = (
+            priors.LAW_REACHES.index(process.reach),
+            priors.LAW_SIZES.tolist().index(process.size),
+        )
         assert _table(problem(), parts, processes, k)[place] == pytest.approx(found.cost, abs=1e-8)
 
 
