@@ -283,7 +283,8 @@ def main() -> None:
         rows = list(pool.map(judged, [(folder, f"{kind}_{seed}") for kind, seed in named]))
     for kind in (*kinds, "every kind"):
         mine = [r for (own, _), r in zip(named, rows, strict=True) if kind in (own, "every kind")]
-        tell(kind=kind, **summary(mine))
+        if mine:
+            tell(kind=kind, **summary(mine))
 
 
 if __name__ == "__main__":

@@ -5,7 +5,6 @@ force at samples of the period (alternating frequency-time). It shares the eleme
 condensation, but neither modes, potential nor solver. Used by `rom_forced_response.py`.
 """
 
-import time
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -15,8 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import snrmjax as sj
-from snrmjax.condense.elements.statics import free_force, free_tangent
-from snrmjax.condense.elements.strain_energy import mass_matrix
+from snrmjax.condense.elements.strain_energy import internal_force, mass_matrix, tangent_stiffness
 
 ORDER, SAMPLES = 9, 40  # exact for a cubic force
 FLAT = sj.condense.Beam(0.2286, 0.0127, 0.787e-3, young=204.8e9, density=7870.0, elements=20)
@@ -111,33 +109,39 @@ def balanced(
     return Motion(*jax.lax.while_loop(goes_on, step, begin)[:3])
 
 
+def _all(beam: sj.condense.Beam, u: jax.Array) -> jax.Array:
+    """All degrees of freedom from those that are not held."""
+    return jnp.zeros(beam.n_dof).at[beam.free].set(u)
+
+
+def free_force(beam: sj.condense.Beam, u: jax.Array) -> jax.Array:
+    """Internal force on the degrees of freedom that are not held."""
+    return internal_force(beam, _all(beam, u))[beam.free]
+
+
+def free_tangent(beam: sj.condense.Beam, u: jax.Array) -> jax.Array:
+    """Tangent stiffness of the degrees of freedom that are not held."""
+    return tangent_stiffness(beam, _all(beam, u))[beam.free[:, None], beam.free]
+
+
 def free_mass(beam: sj.condense.Beam) -> jax.Array:
     """Mass matrix of the degrees of freedom that are not held."""
     return mass_matrix(beam)[beam.free[:, None], beam.free]
 
 
-class Reduced(NamedTuple):
-    """A condensed model with a sensor at midspan under a uniform force, and what it took."""
-
-    model: sj.model.Structure
-    seconds: float
-    largest: float  # thicknesses that single modes move linearly in the load cases
-
-
-def condensed(beam: sj.condense.Beam, modes: Sequence[int], damping_ratio: np.ndarray) -> Reduced:
-    """Condense a beam, with load cases as large as the package's own rule has them."""
-    begin = time.perf_counter()
+def condensed(
+    beam: sj.condense.Beam, modes: Sequence[int], damping_ratio: np.ndarray
+) -> sj.model.Structure:
+    """A beam condensed by the package's own rule, with a sensor at midspan and a uniform force."""
     basis = sj.condense.beam_modes(beam, modes)
 
     def solve(force):
         return sj.condense.static_cases(beam, basis, force)
 
     wanted = sj.condense.displacement_for_ratio(basis, solve, start=float(beam.thickness) / 4)
-    found = sj.condense.reduced_model(basis, solve(sj.condense.modal_loads(basis, wanted).force))
-    seconds = time.perf_counter() - begin
-    model = found.structure(
+    found = sj.condense.condense(basis, solve(sj.condense.modal_loads(basis, wanted).force))
+    return found.structure(
         damping_ratio,
         sensors={"midspan": sj.condense.shape_at(beam, basis, 0.5)},
         participation=np.asarray(sj.condense.participation(beam, basis)),
     )
-    return Reduced(model, seconds, float(wanted[0]) / float(beam.thickness))

@@ -56,13 +56,13 @@ def short(value: Any) -> Any:
     """A value as JSON has it: numbers with four digits, null for what is none."""
     if isinstance(value, dict):
         return {str(key): short(one) for key, one in value.items()}
-    if isinstance(value, np.ndarray):
+    if hasattr(value, "tolist"):  # arrays and their numbers
         value = value.tolist()
     if isinstance(value, list | tuple):
         return [short(one) for one in value]
-    if isinstance(value, float | np.floating):
+    if isinstance(value, float):
         return float(f"{value:.4g}") if np.isfinite(value) else None
-    return value.item() if isinstance(value, np.generic) else value
+    return value
 
 
 def seconds_of(function: Callable[[], Any]) -> tuple[float, Any]:

@@ -1,11 +1,11 @@
 """Each method against its own source: data, claims or formulas that its authors published.
 
-Run: python benchmarks/methods_sources.py [--pff FOLDER] [--nltest FOLDER]
+Run: python benchmarks/methods_sources.py [--pff FOLDER]
          [--only METHOD ...]
 
-The folders are copies of github.com/JustinPorter88/pff-analysis and github.com/maltekrack/NLtest,
-whose programs and data are used where they lie (they are not part of this project); NLtest needs
-Octave. One JSON line a method, `kind` says what it was held against:
+The folder is a copy of github.com/JustinPorter88/pff-analysis, whose program and data are used
+where they lie (they are not part of this project). One JSON line a method, `kind` says what it was
+held against:
 
 - own_result: the authors' own numbers for the authors' own record (their Python program, run
   beside, and the stored result of their MATLAB program, which are also held against each other);
@@ -16,18 +16,11 @@ Octave. One JSON line a method, `kind` says what it was held against:
 - physics_only: no numbers of the source could be had; the method's central claim against harmonic
   balance, which it does not use.
 
-What could not be had: the worked examples of Arslan, Aykan & Özgüven (2011) and of Özer, Özgüven &
-Royston (2009), the structures of Karaağaçlı & Özgüven (2020, 2021), and the example of Carrella &
-Ewins (2011) — abstracts alone, without coefficients or tables; the record of the Silverbox, for
-which Paduart et al. (2010) state 0.26 mV (rms) of a polynomial state-space model: no package has it
-in itself; the response-controlled tests of the Tribomechadynamics challenge that NLtest works on
-(40 GB, not in its repository).
+What could not be had: the worked examples of Arslan, Aykan & Özgüven (2011), of Özer, Özgüven &
+Royston (2009), of Karaağaçlı & Özgüven (2020, 2021) and of Carrella & Ewins (2011).
 """
 
 import importlib.util
-import shutil
-import subprocess
-import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -200,7 +193,7 @@ def held_displacements(model, sizes, frequencies=None):
     return sj.measure.join_steady_states(tables)
 
 
-def response_controlled(nltest: Path | None) -> None:
+def response_controlled() -> None:
     """Modal analysis of held levels: the line of inverse receptance beside a circle fit."""
     model, sizes = duffing(), np.array([4e-4, 8e-4, 1.2e-3, 1.6e-3])
     data = held_displacements(model, sizes)
@@ -222,62 +215,6 @@ def response_controlled(nltest: Path | None) -> None:
         circle_damping_error_max=float(np.abs(ratios * true / (RATIO * REST) - 1).max()),
         damping_difference_max=float(np.abs(ours / ratios - 1).max()),
     )
-    source = "NLtest (github.com/maltekrack/NLtest), circleFit.m, run under Octave"
-    octave = shutil.which("octave-cli") or shutil.which("octave")
-    if nltest is None or octave is None:
-        why = "--nltest FOLDER is missing" if nltest is None else "Octave is not installed"
-        said("rct", "independent_program", source, not_run=why)
-        return
-    theirs = np.array(
-        [_their_circle(octave, nltest, data, level) for level in np.asarray(found.level)[good]]
-    )
-    # Theirs answers with the frequency of the state next to resonance: to the test's step at best.
-    middle = theirs[:, 0] * HERTZ
-    said(
-        *("rct", "independent_program", source),
-        levels=len(theirs),
-        step_of_frequency=float(np.ptp(np.asarray(data.frequency)[:13]) / 12 / REST),
-        frequency_difference_max=float(
-            np.abs(np.asarray(found.natural_frequency)[good] / middle - 1).max()
-        ),
-        damping_difference_by_level=np.abs(ours / theirs[:, 1] - 1).tolist(),
-        their_damping_error_max=float(np.abs(theirs[:, 1] * true / (RATIO * REST) - 1).max()),
-        their_damping_std_by_level=(theirs[:, 2] / theirs[:, 1]).tolist(),
-    )
-
-
-def _their_circle(octave: str, folder: Path, data, level: int) -> tuple[float, float, float]:
-    """Frequency (Hz), damping ratio and its scatter by NLtest's `circleFit`.
-
-    It takes states from high to low frequency, a positive damping ratio coming out that way, and
-    phases within 90° of resonance as seen from the middle of the circle; as in its own scripts
-    states are left out whose displacement is 2 % off. `combvec` is of a toolbox that Octave does
-    not have.
-    """
-    rows = np.flatnonzero(np.asarray(data.level) == level)
-    omega = np.asarray(data.frequency)[rows]
-    velocity = np.asarray(data.velocity)[rows, 0]
-    receptance = velocity / (1j * omega) / np.asarray(data.force)[rows]
-    size = np.abs(velocity) / omega
-    kept = np.abs(np.angle(velocity)) < np.pi / 4
-    kept &= np.abs(size / np.median(size) - 1) < 0.02
-    order = np.flatnonzero(kept)[np.argsort(-omega[kept])]
-    table = np.stack([omega / HERTZ, receptance.real, receptance.imag], axis=1)[order]
-    with tempfile.TemporaryDirectory() as place:
-        np.savetxt(Path(place) / "states.txt", table, fmt="%.17g")
-        Path(place, "combvec.m").write_text(
-            "function c = combvec(a, b)\n[x, y] = meshgrid(a, b);\nc = [x(:)'; y(:)'];\nend\n"
-        )
-        script = (
-            f"addpath('{folder / 'SRC'}'); t = load('states.txt');"
-            "[f, d, s] = circleFit(t(:, 1), t(:, 2) + 1i * t(:, 3)); printf('%.17g\\n', f, d, s);"
-        )
-        answer = subprocess.run(
-            *([octave, "--no-gui", "--quiet", "--eval", script],),
-            **{"cwd": place, "capture_output": True, "text": True, "check": True},
-        )
-    frequency, ratio, scatter = (float(one) for one in answer.stdout.split())
-    return frequency, ratio, scatter
 
 
 def harmonic_force_surface() -> None:
@@ -483,13 +420,12 @@ def _steady_motion(stiffness, damping, mass, cubic, force, omega) -> np.ndarray:
 
 def main() -> None:
     """All methods in turn."""
-    folders = dict.fromkeys(("pff", "nltest"), Path)
-    given = options(__doc__, only=METHODS, **folders)
+    given = options(__doc__, only=METHODS, pff=Path)
     runs = {
         "resonant_decay": lambda: resonant_decay(given.pff),
         "pll": phase_locked_loop,
         "cbc": continuation,
-        "rct": lambda: response_controlled(given.nltest),
+        "rct": response_controlled,
         "harmonic_force_surface": harmonic_force_surface,
         "concerto": concerto,
         "arslan_ozguven": spring_in_a_chain,

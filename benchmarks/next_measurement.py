@@ -12,17 +12,55 @@ compared. One JSON line.
 """
 
 import numpy as np
-from closed_form import OMEGA, at_frequency, at_phase
 from harness import options, teller
 
 import snrmjax as sj
 
 tell = teller(__file__)
 
+OMEGA, CONSTANT = 500.0, 6.0  # rad/s at rest; of force over displacement, 1/kg
 NOISE = {"velocity": 0.01, "phase": 0.012, "force": 0.003, "gain": 0.01}
 FAMILIES = {"backbone": "polynomial:2@displacement", "damping": "viscous_quadratic@velocity"}
 FORCES = (0.3, 0.8, 1.6, 2.6)
 MODES = sj.model.linear_modes([OMEGA], [0.012], [[2.0]], [3.0])
+
+
+def squared(x: np.ndarray) -> np.ndarray:
+    """ω̃² against displacement (m)."""
+    return OMEGA**2 * (1 + 0.3 * (x / 2e-3) ** 2)
+
+
+def damping(v: np.ndarray) -> np.ndarray:
+    """2ζ̃ω̃ against velocity (m/s)."""
+    return 12.0 + 6.0 * v
+
+
+def needed(x: np.ndarray, omega: np.ndarray) -> np.ndarray:
+    """Complex force over displacement times A."""
+    return squared(x) - omega**2 + 1j * omega * damping(x * omega)
+
+
+def at_phase(force: float, phase: float) -> tuple[float, complex]:
+    """Frequency and velocity under a force where the velocity has a phase, by bisection."""
+    low, high, omega = 1e-6, 1e-2, OMEGA
+    for _ in range(200):
+        x = 0.5 * (low + high)
+        omega = np.sqrt(squared(x))
+        for _ in range(60):
+            omega = np.sqrt(squared(x) - omega * damping(x * omega) * np.tan(phase))
+        below = abs(needed(x, omega)) * x < CONSTANT * force
+        low, high = (x, high) if below else (low, x)
+    return float(omega), 1j * omega * CONSTANT * force / needed(x, omega)
+
+
+def at_frequency(force: float, omega: float, expected: float) -> complex:
+    """The motion under a force at a frequency whose velocity is nearest to the expected one."""
+    x = np.linspace(1e-6, 4e-3, 40001)
+    excess = np.abs(needed(x, omega)) * x - CONSTANT * force
+    at = np.flatnonzero(np.signbit(excess[:-1]) != np.signbit(excess[1:]))
+    roots = x[at] - excess[at] * (x[1] - x[0]) / (excess[at + 1] - excess[at])
+    best = roots[np.argmin(np.abs(roots * omega - expected))]
+    return 1j * omega * CONSTANT * force / needed(best, omega)
 
 
 Row = tuple[int, float, float, complex]  # level, force, frequency, velocity

@@ -32,13 +32,13 @@ from full_order import (
     condensed,
     cosines_and_sines,
     free_mass,
+    free_tangent,
 )
 from harness import options, teller
 from scipy.interpolate import CubicSpline
 from scipy.linalg import eigh
 
 import snrmjax as sj
-from snrmjax.condense.elements.statics import free_tangent
 from snrmjax.condense.elements.strain_energy import shape_rows, uniform_load
 
 tell = teller(__file__)
@@ -228,7 +228,7 @@ def compared(name: str, kind: str, beam, forces, sets) -> None:
         ratio = full.ratio[np.array(modes) - 1]
         reduced = condensed(beam, modes, ratio)
         begin = time.perf_counter()
-        parts = [reduced_response(reduced.model, f, w) for f, w in zip(forces, whole, strict=True)]
+        parts = [reduced_response(reduced, f, w) for f, w in zip(forces, whole, strict=True)]
         seconds = (time.perf_counter() - begin) / len(forces)
         rows = [errors_of(a, b) for a, b in zip(whole, parts, strict=True)]
         good = [abs(row["peak_frequency"]) <= _BAR for row in rows]

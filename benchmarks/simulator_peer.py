@@ -60,8 +60,7 @@ class Curve(NamedTuple):
 
     coefficients: np.ndarray  # (point, coefficient, mode) over the displacement scale
     frequency: np.ndarray  # (point,) over the frequency scale
-    status: str  # "ok" or what went wrong
-    n_solves: int | None = None  # factorisations, where the peer counts them
+    n_solves: int  # factorisations
 
 
 class Polynomial:
@@ -147,14 +146,6 @@ def midspan(problem: Problem, curve: Curve) -> tuple[np.ndarray, np.ndarray]:
     omega = curve.frequency * problem.frequency_scale
     x = curve.coefficients[:, 1:3] @ problem.mode_shape * problem.displacement_scale
     return omega / (2 * np.pi), omega * np.hypot(x[:, 0], x[:, 1])
-
-
-def end_status(problem: Problem, frequency: np.ndarray) -> str:
-    """The text "ok" when the curve went through the whole range."""
-    begin, end = problem.ends
-    if (frequency[-1] - end) * np.sign(end - begin) >= -1e-9:
-        return "ok"
-    return f"stopped at {frequency[-1] * problem.frequency_scale / (2 * np.pi):.2f} Hz"
 
 
 class Balance:
@@ -248,6 +239,6 @@ def solver(problem: Problem) -> Callable[[], Curve]:
             step = min(step * grow, problem.largest_step)
         rows = np.array(points)
         coefficients = rows[:, :-1].reshape(len(rows), balance.size, balance.n)
-        return Curve(coefficients, rows[:, -1], end_status(problem, rows[:, -1]), n_solves)
+        return Curve(coefficients, rows[:, -1], n_solves)
 
     return run

@@ -22,8 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 from drawn import RIGHT
-from harness import options
-from score import Result, tell
+from score import Result, options, tell
 
 EDGES = (0.0, 0.4, 0.6, 0.8, 0.95, 1.0)
 CHANCE = 0.95
@@ -94,10 +93,9 @@ def limits(probabilities: Sequence[float]) -> tuple[int, int]:
     distribution = np.ones(1)
     for p in probabilities:
         distribution = np.convolve(distribution, [1 - p, p])
-    below = np.cumsum(distribution)
-    tail = 0.5 * (1 - CHANCE)
-    most = min(int(np.searchsorted(below, 1 - tail)), len(probabilities))
-    return int(np.searchsorted(below, tail)), most
+    below, tail = np.cumsum(distribution), 0.5 * (1 - CHANCE)
+    fewest, most = np.searchsorted(below, [tail, 1 - tail]).tolist()
+    return fewest, min(most, len(probabilities))
 
 
 def binned(stated: Sequence[Stated]) -> list[Bin]:

@@ -15,7 +15,7 @@ from snrmjax.identify.pointwise.missing_resonance import jump_at_resonance
 from snrmjax.measure.states import SteadyStates, steady_states
 from snrmjax.model.structures import Structure
 from snrmjax.simulate.continuation.continuation import CurveStatus
-from snrmjax.simulate.continuation.response_curve import ResponseCurve
+from snrmjax.simulate.continuation.response_curve import Branch, ResponseCurve
 from snrmjax.simulate.solutions.forced_response import ResponseSettings, forced_response_batch
 from snrmjax.simulate.virtual_test.recording import acting_force, recorded_curves
 
@@ -205,7 +205,7 @@ def _in_phase(curve: ResponseCurve, sensor: int) -> list[tuple[float, float]]:
 
 def _complete(curves: Sequence[ResponseCurve]) -> bool:
     """Whether a response was traced to the upper end of the range of frequencies."""
-    main = [curve for curve in curves if curve.branch == "main"]
+    main = [curve for curve in curves if curve.branch == Branch.MAIN]
     return bool(main) and all(curve.status == CurveStatus.UPPER_END for curve in main)
 
 

@@ -14,10 +14,9 @@ from .inference.optimal_design import (
 )
 from .inference.refits import bootstrap
 from .joint.joint_fit import JointFit, corrected_states, fit_jointly
-from .modal.base_motion import relative_to_base
 from .modal.free_decay import fit_free_decay
 from .modal.linear_fit import fit_linear_modes
-from .modal.modes_of_tests import find_modes
+from .modal.modes_of_tests import find_modes, relative_to_base
 from .modal.response_data import joined_responses
 from .pointwise.backbone import Backbone
 from .pointwise.backbone_points import identify_points

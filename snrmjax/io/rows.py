@@ -74,24 +74,42 @@ class Cells(NamedTuple):
         self, column: str, rules: Sequence[Rule] = (), *, empty_allowed: bool = False
     ) -> Float[np.ndarray, " row"]:
         """One column as numbers that keep its rules; NaN where a field is empty."""
-        values = np.full(len(self.rows), np.nan)
-        for k, text in enumerate(self.texts(column)):
-            if text == "" and empty_allowed:
-                continue
-            if not _NUMBER.fullmatch(text):
-                raise self.refusal(column, _expected_number(text), k)
-            value = float(text)
-            if not np.isfinite(value):
-                raise self.refusal(column, "a finite number", k)
+        texts = self.texts(column)
+        empty = ("",) if empty_allowed else ()
+        values = _plain_numbers([text for text in texts if text not in empty])
+        if values is None:
+            k = next(k for k, text in enumerate(texts) if not (text in empty or _is_number(text)))
+            raise self.refusal(column, _expected_number(texts[k]), k)
+        at = np.array([k for k, text in enumerate(texts) if text not in empty], dtype=int)
+        for k, value in zip(at.tolist(), values.tolist(), strict=True) if rules else ():
             for rule in rules:
                 if not rule.good(value):
                     raise self.refusal(column, rule.expected, k)
-            values[k] = value
-        return values
+        column_values = np.full(len(texts), np.nan)
+        column_values[at] = values
+        return column_values
+
+
+def _plain_numbers(texts: list[str]) -> Float[np.ndarray, " text"] | None:
+    """All texts as finite numbers, or None where one is none.
+
+    Of these letters Python makes a number of what is one, and of nothing else.
+    """
+    if not set("".join(texts)) <= set("0123456789+-.eE"):
+        return None
+    try:
+        values = np.array(list(map(float, texts)))
+    except ValueError:
+        return None
+    return values if np.isfinite(values).all() else None
+
+
+def _is_number(text: str) -> bool:
+    return _NUMBER.fullmatch(text) is not None and bool(np.isfinite(float(text)))
 
 
 def _expected_number(text: str) -> str:
-    if text.lstrip("+-").lower() in ("nan", "inf", "infinity"):
+    if _NUMBER.fullmatch(text) or text.lstrip("+-").lower() in ("nan", "inf", "infinity"):
         return "a finite number"
     if _LIKE_GROUPED_NUMBER.fullmatch(text):
         return "a number with a point as decimal sign and no thousands separators"

@@ -10,7 +10,7 @@ from snrmjax.io.units import HERTZ
 from snrmjax.model.structures import Structure, equilibria
 from snrmjax.numerics.facts import Fact
 from snrmjax.simulate.continuation.continuation import CurveStatus
-from snrmjax.simulate.continuation.response_curve import ResponseCurve
+from snrmjax.simulate.continuation.response_curve import Branch, ResponseCurve
 from snrmjax.simulate.continuation.stability import Stability
 from snrmjax.simulate.solutions.forced_response import ResponseSettings, forced_response
 from snrmjax.simulate.solutions.isolated_responses import isolated_responses
@@ -119,7 +119,7 @@ def _sensor(model: Structure) -> str:
 
 
 def _notes_on_curve(curve: ResponseCurve) -> Iterator[Fact]:
-    if curve.branch == "main" and curve.status != CurveStatus.UPPER_END:
+    if curve.branch == Branch.MAIN and curve.status != CurveStatus.UPPER_END:
         yield Fact("curve_ended", force=curve.force, status=curve.status)
     if curve.not_located:
         yield Fact("curve_events_not_located", force=curve.force, kinds=curve.not_located)

@@ -114,8 +114,8 @@ def stored_description(folder: StudyFolder) -> dict[str, Any] | None:
     if not folder.out.exists():
         return None
     try:
-        found = json.loads((folder.out / ".zattrs").read_text(encoding="utf-8"))
-        return dict(json.loads(found["study"]))
+        attributes = json.loads((folder.out / ".zattrs").read_text(encoding="utf-8"))
+        return dict(json.loads(attributes["study"]))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ValueError(
             f"{folder.out} is no data set of a study: choose another --out."

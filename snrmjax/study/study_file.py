@@ -111,10 +111,10 @@ def _single(table: TomlTable) -> AbstractVariation:
     name = (table.text("parameter"),)
     ways = [key for key in ("values", "range", "distribution") if key in table.entries]
     if len(ways) != 1:
-        found = " and ".join(f"`{key}`" for key in ways) or "none of them"
+        given = " and ".join(f"`{key}`" for key in ways) or "none of them"
         raise ValueError(
             f"{table.place} ({name[0]}) needs one of `values`, `range`, `distribution`, but has "
-            f"{found}."
+            f"{given}."
         )
     if ways == ["values"]:
         table.check_keys(("parameter", "values"))

@@ -53,7 +53,6 @@ def test_gains_do_not_move_the_answer_and_bad_ones_say_so(beam):
     wild = sj.simulate.LoopGains(2 * np.pi * 0.2, 2 * np.pi * 40.0)
     lost = sj.methods.phase_locked_loop(lab, VOLTAGES[1:3], gains=wild)
     assert list(lost.status) == 2 * [int(MethodStatus.NOT_LOCKED)]
-    assert "did not hold its target" in repr(lost)
 
 
 def test_noise_stays_within_its_error(beam):

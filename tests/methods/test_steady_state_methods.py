@@ -198,7 +198,6 @@ def test_a_level_that_jumps_before_resonance_has_no_answer():
     data = constant_force(forces=(0.1,), sides=(-1,))
     result = sj.methods.phase_resonance(data, modes_of())
     assert list(result.status) == [int(MethodStatus.NO_RESONANCE)]
-    assert "jumped before it" in repr(result)
     result = sj.methods.concerto(data, modes_of())
     assert list(result.status) == [int(MethodStatus.ONE_SIDE)]
     assert np.isnan(result.natural_frequency).all()

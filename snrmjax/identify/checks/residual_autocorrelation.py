@@ -7,8 +7,10 @@ curve that the data do not follow, or by a motion that was not steady.
 import numpy as np
 from jaxtyping import Float, Int
 
-_CERTAIN = 4.0  # standard deviations of white noise's correlation, beyond which one is real
-_NOTHING = 0.1  # of the noise: the correlation of smaller residuals does not count
+_CORRELATION_STDS = (
+    4.0  # standard deviations of white noise's correlation, beyond which one is real
+)
+_FAR_BELOW_NOISE = 0.1  # of the noise: the correlation of smaller residuals does not count
 _LARGEST = 0.98  # correlation: an estimate may exceed what a band can be widened by
 
 
@@ -35,7 +37,10 @@ def residual_autocorrelation(
     correlations = []
     for part in residuals.T:
         neighbours, pairs = _correlation(part, levels, 1)
-        if neighbours * np.sqrt(pairs) <= _CERTAIN or np.mean(part**2) < _NOTHING**2:
+        if (
+            neighbours * np.sqrt(pairs) <= _CORRELATION_STDS
+            or np.mean(part**2) < _FAR_BELOW_NOISE**2
+        ):
             correlations.append(0.0)
             continue
         total, lag, correlation = 1.0, 1, neighbours

@@ -6,11 +6,10 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from snrmjax.identify.curves.family_base import AbstractFamily
+from snrmjax.identify.curves.family_base import AbstractFamily, Argument
 from snrmjax.identify.curves.splines import SmoothingSpline, Spline
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.pointwise.backbone import Backbone, BackboneValues, banded_values
-from snrmjax.identify.pointwise.points_result import AmplitudeArgument
 
 _SCAN = 256  # displacements of the backbone, on which a velocity is looked for
 _ITERATIONS = 12
@@ -60,7 +59,7 @@ def values_to_the_largest(fit: JointFit, n_points: int) -> BackboneValues:
 
 
 def as_backbone(
-    fit: JointFit, *, argument: AmplitudeArgument = "displacement", reach: float = 1.0
+    fit: JointFit, *, argument: Argument = "displacement", reach: float = 1.0
 ) -> Backbone:
     """The fitted curves as what responses are predicted from.
 
@@ -100,7 +99,7 @@ def _own_curves(fit: JointFit) -> tuple[AbstractFamily, AbstractFamily, np.ndarr
 
 
 def _redrawn(
-    fit: JointFit, argument: AmplitudeArgument, reach: float
+    fit: JointFit, argument: Argument, reach: float
 ) -> tuple[AbstractFamily, AbstractFamily, np.ndarray]:
     """Splines through values of both curves, and the covariance of these values."""
     squared = fit.unknowns.squared_frequency

@@ -80,7 +80,6 @@ def fitted_response(
     *,
     from_frequency: float = 0.0,
     to_frequency: float = np.inf,
-    points_per_side: int = 200,
     largest_amplitude_ratio: float = LARGEST_AMPLITUDE_RATIO,
     of: NewLevel | None = None,
 ) -> list[FittedResponse]:
@@ -101,8 +100,12 @@ def fitted_response(
     ratio = {"largest_amplitude_ratio": largest_amplitude_ratio}
     rough = as_backbone(fit, reach=largest_amplitude_ratio)
     level = new_level(fit, force) if of is None else of
-    settings = {"from_frequency": from_frequency, "to_frequency": to_frequency, **ratio}
-    curves = predict_response(rough, fit.modes, force, points_per_side=points_per_side, **settings)
+    curves = predict_response(
+        *(rough, fit.modes, force),
+        from_frequency=from_frequency,
+        to_frequency=to_frequency,
+        largest_amplitude_ratio=largest_amplitude_ratio,
+    )
     tips = [
         Place("resonance", r.amplitude, r.frequency)
         for r in resonances(rough, fit.modes, force, **ratio)

@@ -8,11 +8,11 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
+from snrmjax.identify.curves.family_base import Argument
 from snrmjax.identify.inference.fitted_curves import as_backbone
 from snrmjax.identify.joint.joint_fit import JointFit, fit_jointly
 from snrmjax.identify.pointwise.backbone import Backbone
 from snrmjax.identify.pointwise.backbone_points import (
-    AmplitudeArgument,
     AmplitudeMeasure,
     BackbonePoints,
     identify_points,
@@ -114,7 +114,7 @@ def identify_backbone(
     data: SteadyStates,
     modes: LinearModes | Structure,
     *,
-    amplitude: AmplitudeArgument = "displacement",
+    amplitude: Argument = "displacement",
     measure: AmplitudeMeasure = "fundamental",
     n_knots: int | None = None,
 ) -> Identification:
@@ -157,7 +157,7 @@ def identification_of_fit(
     data: SteadyStates,
     fit: JointFit,
     *,
-    amplitude: AmplitudeArgument = "displacement",
+    amplitude: Argument = "displacement",
     measure: AmplitudeMeasure = "fundamental",
 ) -> Identification:
     """Each steady state's own point beside the curves of a joint fit.
@@ -177,13 +177,13 @@ def identification_of_fit(
         gain, phase = map(float, fit.noise.level_std[:2])
         j = fit.modes.mode_of_interest
         natural = float(fit.modes.natural_frequency[j])
-        wandering = 0.5 * natural * float(np.max(np.asarray(fit.data.std)[:, 3]))
+        frequency_jitter_std = 0.5 * natural * float(np.max(np.asarray(fit.data.std)[:, 3]))
         points = errors_from_scatter(
             points,
             fit.noise.scale,
             level_gain=gain,
             level_phase=phase,
-            frequency_std=float(np.hypot(identified.level_frequency_std, wandering)),
+            frequency_std=float(np.hypot(identified.level_frequency_std, frequency_jitter_std)),
             damping_std=identified.level_damping_std,
             modal_mass_std=fit.modes_found.own_modal_mass_std,
         )

@@ -98,11 +98,6 @@ class NextMeasurements(AbstractTable[NextMeasurement]):
     drive_known_only: bool = eqx.field(static=True)
     notes: tuple[Fact, ...] = setting(default=())
 
-    @property
-    def message(self) -> str:
-        """The status in words."""
-        return self.status.message
-
     def summary(self) -> tuple[str, ...]:
         """See `AbstractResult`."""
         lines = [f"NextMeasurements: {len(self)} states that narrow the band of {self.target} most"]
@@ -113,7 +108,7 @@ class NextMeasurements(AbstractTable[NextMeasurement]):
         if len(self) > _SHOWN:
             lines.append(f"and {len(self) - _SHOWN} more")
         if self.status != AdviceStatus.COMPLETE:
-            lines.append(f"status: {self.message}")
+            lines.append(f"status: {self.status.message}")
         return (*lines, *(f"note: {note}" for note in self.notes))
 
     def variables(self) -> dict[str, Variable]:

@@ -57,7 +57,7 @@ from snrmjax.model.modes import LinearModes
 from snrmjax.model.structures import Structure, modes_of
 from snrmjax.numerics.blocks import on_one_core
 from snrmjax.numerics.facts import Fact
-from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
 from snrmjax.numerics.units import HERTZ
 
 _MOVED = 2.0  # standard deviations of a level's error, from which on the fit says so
@@ -78,10 +78,13 @@ class JointFit(AbstractResult):
     covariance: Float[np.ndarray, "unknown unknown"]
     problem: BalanceProblem
     noise: NoiseEstimate
-    residuals: Float[np.ndarray, "state part"]  # whitened, of unit variance if all is right
+    # Of unit variance if all is right.
+    residuals: Float[np.ndarray, "state part"] = quantity(
+        "state part", "1", "whitened residual", name="residual"
+    )
     drive_known_only: bool = eqx.field(static=True)
     free: tuple[str, ...] = eqx.field(static=True)
-    notes: tuple[Fact, ...] = eqx.field(static=True)
+    notes: tuple[Fact, ...] = setting()
     status: FitStatus = eqx.field(static=True)
     level_numbers: tuple[int, ...] = eqx.field(static=True)  # of the file; `data` counts from 0
 
@@ -164,11 +167,6 @@ class JointFit(AbstractResult):
         """What the free unknowns are called."""
         return tuple(name for name, _ in named_unknowns(self.unknowns, self.data, self.free))
 
-    def labels(self) -> tuple[str, ...]:
-        """`names` with the levels' own numbers, for readers."""
-        named = named_unknowns(self.unknowns, self.data, self.free, self.level_numbers)
-        return tuple(name for name, _ in named)
-
     def units(self) -> tuple[str, ...]:
         """Units of the free unknowns; a curve's terms count at the largest amplitude."""
         return tuple(unit for _, unit in named_unknowns(self.unknowns, self.data, self.free))
@@ -200,9 +198,11 @@ class JointFit(AbstractResult):
         std, data, per = np.sqrt(np.diag(self.covariance)), self.data, ("parameter",)
         state, force = ("state",), "V" if self.drive_known_only else "N"
         measured, numbers = np.asarray(data.force), np.array(self.level_numbers)
-        parts = Variable(("state", "part"), self.residuals, "1", "whitened residual")
+        # With the levels' own numbers, for readers.
+        named = named_unknowns(self.unknowns, data, self.free, self.level_numbers)
+        labels = [name for name, _ in named]
         return {
-            "parameter": Variable(per, np.array(self.labels()), "", "free unknown"),
+            "parameter": Variable(per, np.array(labels), "", "free unknown"),
             "value": Variable(per, np.asarray(self.vector()[0]), "", "value, in `unit`"),
             "std": Variable(per, std, "", "1σ, in `unit`"),
             "unit": Variable(per, np.array(self.units()), "", "unit of the parameter"),
@@ -212,7 +212,7 @@ class JointFit(AbstractResult):
             "velocity_m_s": Variable(
                 state, np.abs(np.asarray(self.motion().velocity)), "m/s", "velocity of the mode"
             ),
-            "residual": parts,
+            **super().variables(),
         }
 
     def attributes(self) -> dict[str, str | float | int]:
@@ -222,7 +222,7 @@ class JointFit(AbstractResult):
             "damping": self.unknowns.modal_damping.label,
             "noise_scale": self.noise.scale,
             "status": self.status.message,
-            "notes": "\n".join(map(str, self.notes)),
+            **super().attributes(),
         }
 
 
@@ -299,8 +299,10 @@ def fit_jointly(
         FitStatus.CONVERGED if posterior.settled else FitStatus.NOT_SETTLED,
     )
     if not all(choice.kind in SMOOTH and choice.argument != "velocity" for choice in choices):
-        wander = np.full(n, view.wandering / (1.0 if view.believed else view.noise.scale))
-        errors = np.column_stack([np.asarray(measured.std)[:, :3], wander])
+        jitter = np.full(
+            n, view.stiffness_jitter_std / (1.0 if view.believed else view.noise.scale)
+        )
+        errors = np.column_stack([np.asarray(measured.std)[:, :3], jitter])
         best = fit_families(
             *(unknowns, view.problem, released, view.noise, errors), believed=view.believed
         )
@@ -325,7 +327,7 @@ def fit_jointly(
         level_numbers=numbers,
     )
     notes = notes_on_instruments(fit, LEVEL_ERRORS)
-    notes += _notes(fit, 0.5 * view.wandering, level_std)
+    notes += _notes(fit, 0.5 * view.stiffness_jitter_std, level_std)
     return dataclasses.replace(fit, notes=tuple(notes))
 
 
@@ -347,17 +349,19 @@ def corrected_states(data: SteadyStates, fit: JointFit) -> SteadyStates:
     )
 
 
-def _notes(fit: JointFit, wandering: float, stated: Float[np.ndarray, " error"]) -> list[Fact]:
+def _notes(
+    fit: JointFit, frequency_jitter_std: float, stated: Float[np.ndarray, " error"]
+) -> list[Fact]:
     """All that a reader of a joint fit should know.
 
-    Arguments: `wandering` 1σ of the natural frequency from state to state, relative; `stated` 1σ
-    of levels' errors.
+    Arguments: `frequency_jitter_std` 1σ of the natural frequency from state to state, relative;
+    `stated` 1σ of levels' errors.
     """
     notes = []
     if not fit.converged:
         notes.append(Fact("fit_not_converged", reason=fit.status.message))
     level, n_levels = np.asarray(fit.data.level), fit.data.n_levels
-    notes += notes_on_noise(fit.noise, wandering, stated, n_levels)
+    notes += notes_on_noise(fit.noise, frequency_jitter_std, stated, n_levels)
     if np.any((stated == 0) & (fit.noise.level_std > 0)):
         shifts = np.asarray(fit.unknowns.level) * np.asarray(fit.prior.level)
         force = [np.median(np.asarray(fit.data.force)[level == k]) for k in range(n_levels)]

@@ -12,7 +12,7 @@ from snrmjax.identify.test_model.states import LEVEL_ERRORS
 from snrmjax.numerics.facts import Fact
 
 _BESIDE = np.radians(5.0)  # from resonance, with every state farther on the same side
-_ALIKE = 1.1  # ratio of levels' amplitudes below which they are one
+_ONE_AMPLITUDE = 1.1  # ratio of levels' amplitudes below which they are one
 _TREND = 4  # levels: fewer are in order by chance too often
 _BREACH = 2.0  # standard deviations that are worth a word
 _CHANCE = 1e-3  # of stated errors that are right to be called too small
@@ -40,12 +40,15 @@ class NoiseEstimate(eqx.Module):
 
 
 def notes_on_noise(
-    noise: NoiseEstimate, wandering: float, given: Float[np.ndarray, " error"], n_levels: int
+    noise: NoiseEstimate,
+    frequency_jitter_std: float,
+    given: Float[np.ndarray, " error"],
+    n_levels: int,
 ) -> list[Fact]:
     """Where the noise and the level-to-level variance are not as stated.
 
-    Arguments: `wandering` 1σ of the natural frequency from state to state, relative; `given` the
-    stated 1σ of levels' errors.
+    Arguments: `frequency_jitter_std` 1σ of the natural frequency from state to state, relative;
+    `given` the stated 1σ of levels' errors.
     """
     notes = []
     size = {"scale": noise.scale, "scale_std": noise.scale_std}
@@ -53,8 +56,8 @@ def notes_on_noise(
         notes.append(Fact("noise_exceeded", **size))
     if noise.overstated:
         notes.append(Fact("noise_overstated", **size))
-    if wandering > 0:
-        notes.append(Fact("frequency_wanders", std=wandering, noise_stated=noise.stated))
+    if frequency_jitter_std > 0:
+        notes.append(Fact("frequency_wanders", std=frequency_jitter_std, noise_stated=noise.stated))
     shared = np.where(given > 0, 0.0, noise.level_std)
     if np.any(shared > 0):
         beyond = bool(noise.stated or np.any(given > 0))
@@ -168,6 +171,6 @@ def notes_on_reach(motion: Motion, level: np.ndarray) -> list[Fact]:
         )
     size = np.asarray(motion.displacement)
     peaks = np.array([size[level == k].max() for k in np.unique(level)])
-    if len(peaks) > 1 and peaks.max() < _ALIKE * peaks.min():
+    if len(peaks) > 1 and peaks.max() < _ONE_AMPLITUDE * peaks.min():
         notes.append(Fact("levels_of_one_amplitude", apart=float(peaks.max() / peaks.min() - 1)))
     return notes

@@ -46,7 +46,7 @@ class View(NamedTuple):
     gain: complex  # of the force, and phase of the velocity, as guessed beforehand
     free: tuple[str, ...]
     noise: NoiseEstimate
-    wandering: float  # 1σ of relative stiffness from state to state
+    stiffness_jitter_std: float  # 1σ of relative stiffness from state to state
 
     @property
     def believed(self) -> bool:
@@ -85,9 +85,9 @@ def view_of(
         problem = dataclasses.replace(problem, prior=known)
         states = states._replace(mass_std=0.0)
         posterior = fit(states, compare_levels=False, rounds=rounds._replace(start=posterior))
-    wandering = _wandering_stiffness(posterior)
-    if wandering > 0:
-        wander_std = np.full(len(states.level), wandering / posterior.hyper.noise)
+    stiffness_jitter_std = _stiffness_jitter_std(posterior)
+    if stiffness_jitter_std > 0:
+        wander_std = np.full(len(states.level), stiffness_jitter_std / posterior.hyper.noise)
         states = states._replace(errors=np.column_stack([states.errors, wander_std]))
     posterior = fit(states, over_sizes=True, rounds=rounds._replace(start=posterior))
     if "force_gain" in free:
@@ -114,7 +114,7 @@ def view_of(
         prior=dataclasses.replace(problem.prior, level=jax.device_put(level)),
     )
     posterior = posterior._replace(covariance=wider**2 * posterior.covariance)
-    return View(posterior, problem, guess, free, noise, wandering)
+    return View(posterior, problem, guess, free, noise, stiffness_jitter_std)
 
 
 def _with_common_gain_in_the_force(posterior: TestPosterior) -> TestPosterior:
@@ -243,7 +243,7 @@ def _noise_of(posterior: TestPosterior, stated: bool) -> NoiseEstimate:
     return NoiseEstimate(noise, std, np.array(posterior.hyper.level_std), stated)
 
 
-def _wandering_stiffness(posterior: TestPosterior) -> float:
+def _stiffness_jitter_std(posterior: TestPosterior) -> float:
     """1σ of relative stiffness from state to state, zero unless the residuals ask for it.
 
     Errors of force and phase move the balance alike along a response; a natural frequency that

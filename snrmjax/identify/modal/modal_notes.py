@@ -18,7 +18,7 @@ from snrmjax.numerics.units import HERTZ
 _FEW_LINES = 8.0  # in the half-power band, below which leakage may count
 _BIASED = 0.01  # relative bias of damping that is worth a note
 _TURNED = np.radians(5.0)  # mean phase that is worth a note
-_CERTAIN = 3.0  # standard errors
+_PHASE_STDS = 3.0  # standard errors of a mean phase, below which it may be none
 _MISFIT = 1.5  # rms residual over stated σ that is worth a note
 
 
@@ -120,7 +120,7 @@ def fit_notes(
             )
     for k, (phase, std) in enumerate(zip(modes.mean_phase, modes.mean_phase_std, strict=True)):
         at = {"mode": k + 1, "frequency_hz": hertz[k]}
-        if abs(phase) > max(_TURNED, _CERTAIN * std):
+        if abs(phase) > max(_TURNED, _PHASE_STDS * std):
             turn = {"phase_deg": float(np.degrees(phase)), "std_deg": float(np.degrees(std))}
             notes.append(Fact("residues_turned", **at, **turn))
         if modes.collinearity[k] < REAL:

@@ -8,8 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from snrmjax.identify.curves.family_base import AbstractCurve
-from snrmjax.identify.pointwise.points_result import AmplitudeArgument
+from snrmjax.identify.curves.family_base import AbstractCurve, Argument
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.result import AbstractResult, Variable, quantity
 
@@ -49,7 +48,7 @@ class Backbone(AbstractResult):
     modal_constant: Float[Array, ""]  # Φ_r Φᵀb, 1/kg: acceleration per newton at resonance
     smallest: Float[Array, ""]  # amplitude of the smallest state used
     largest: Float[Array, ""]  # amplitude of the largest state used
-    argument: AmplitudeArgument = eqx.field(static=True)
+    argument: Argument = eqx.field(static=True)
     sensor: str = eqx.field(static=True)
     coordinates: ClassVar[tuple[str, ...]] = ("velocity_m_s",)
 

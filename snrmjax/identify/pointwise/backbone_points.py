@@ -9,12 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
+from snrmjax.identify.curves.family_base import Argument
 from snrmjax.identify.pointwise.inversion import closed_form, invert_phasor
 from snrmjax.identify.pointwise.inversion_result import PointStatus, SnrmPoints
-from snrmjax.identify.pointwise.points_result import (
-    AmplitudeArgument,
-    BackbonePoints,
-)
+from snrmjax.identify.pointwise.points_result import BackbonePoints
 from snrmjax.identify.pointwise.snrm import reference_sensor
 from snrmjax.measure.indicators import appropriation_of
 from snrmjax.measure.signals import peak_amplitude
@@ -28,7 +26,7 @@ AmplitudeMeasure = Literal["fundamental", "peak"]
 INPUTS = ("log_force", "log_velocity", "phase")
 """The measured quantities whose errors are carried to the points."""
 
-OFF_RESONANCE = 4.0
+NOISE_GROWTH = 4.0
 """Error of a point 90° off resonance over that of one at resonance, where no noise is stated."""
 
 OUTPUTS = ("squared_frequency", "modal_damping", "log_amplitude")
@@ -39,7 +37,7 @@ def identify_points(
     data: SteadyStates,
     modes: LinearModes,
     *,
-    amplitude: AmplitudeArgument = "displacement",
+    amplitude: Argument = "displacement",
     measure: AmplitudeMeasure = "fundamental",
 ) -> BackbonePoints:
     """Invert the SNRM function for every steady state: one point of the backbone from each.
@@ -84,7 +82,7 @@ def _identify(
     data: SteadyStates,
     modes: LinearModes,
     r: int,
-    amplitude: AmplitudeArgument,
+    amplitude: Argument,
     measure: AmplitudeMeasure,
 ) -> BackbonePoints:
     # States without a force or a frequency are solved for harmless ones and masked afterwards:
@@ -277,7 +275,7 @@ def _ratio(part: Float[Array, " state"], whole: Float[Array, " state"]) -> Float
 def _solve(
     modes: LinearModes,
     r: int,
-    amplitude: AmplitudeArgument,
+    amplitude: Argument,
     frequency: Array,
     inputs: Float[Array, "state input"],
     share: Float[Array, "state sensor"],
@@ -348,4 +346,4 @@ def off_resonance_error_factor(
     √(1 + (4 sin φ)²), φ the phase of the mode's velocity: at resonance a point needs no correction
     for the distance from resonance, and away from it the correction brings its own errors.
     """
-    return np.sqrt(1.0 + (OFF_RESONANCE * np.sin(np.angle(mode_velocity))) ** 2)
+    return np.sqrt(1.0 + (NOISE_GROWTH * np.sin(np.angle(mode_velocity))) ** 2)

@@ -1,15 +1,14 @@
 """Points of the backbone and of the damping, one from each steady state."""
 
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
+from snrmjax.identify.curves.family_base import Argument
 from snrmjax.identify.pointwise.inversion_result import PointStatus
 from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
-
-AmplitudeArgument = Literal["displacement", "velocity"]
 
 
 class BackbonePoints(AbstractResult):
@@ -46,7 +45,7 @@ class BackbonePoints(AbstractResult):
     filter_residual: Float[Array, " state"]  # part of the mode's motion that its shape misses
     status: Int[Array, " state"] = quantity("state", "", "outcome", of=PointStatus)
     sensor: str = setting()
-    argument: AmplitudeArgument = eqx.field(static=True)
+    argument: Argument = eqx.field(static=True)
 
     def variables(self) -> dict[str, Variable]:
         """Those of the fields, with the measured velocity's magnitude and phase."""

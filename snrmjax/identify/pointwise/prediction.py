@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
+from snrmjax.identify.curves.family_base import Argument
 from snrmjax.identify.pointwise.backbone import Backbone
-from snrmjax.identify.pointwise.points_result import AmplitudeArgument
 from snrmjax.identify.pointwise.prediction_result import PredictedResponse, Resonance
 from snrmjax.identify.pointwise.snrm import nonlinear_mode_velocity
 from snrmjax.model.modes import LinearModes, residual_velocity
@@ -20,7 +20,8 @@ from snrmjax.numerics.facts import Fact
 LARGEST_AMPLITUDE_RATIO = 1.5
 """Predictions end, unless asked for more, at this multiple of the largest measured amplitude."""
 
-_SCAN = 4096
+_SCAN = 4096  # amplitudes
+_SMALLEST = 0.02  # of its largest amplitude: where the main curve starts
 
 
 def resonances(
@@ -67,7 +68,6 @@ def predict_response(
     from_frequency: float = 0.0,
     to_frequency: float = np.inf,
     points_per_side: int = 200,
-    smallest_fraction: float = 0.02,
     largest_amplitude_ratio: float = LARGEST_AMPLITUDE_RATIO,
 ) -> list[PredictedResponse]:
     """The whole response to a force, both sides of resonance and the unstable part included.
@@ -78,9 +78,9 @@ def predict_response(
     damping of small changes of amplitude is negative: both follow from the averaged equations.
 
     Arguments: `force` in N, frequencies in rad/s; `points_per_side` on either side of every
-    resonance; the main curve starts at `smallest_fraction` of its largest amplitude, and all end
-    at `largest_amplitude_ratio` times the largest measured amplitude. Beyond the measured
-    amplitudes the backbone is extrapolated along its end slopes, which no measurement supports.
+    resonance; curves end at `largest_amplitude_ratio` times the largest measured amplitude. Beyond
+    the measured amplitudes the backbone is extrapolated along its end slopes, which no measurement
+    supports.
     Returns the connected curves, the main one first, isolated ones after it; the `note` of each
     says where it extrapolates.
     Raises `ValueError` for a force or a ratio that is not positive.
@@ -112,7 +112,7 @@ def predict_response(
             backbone,
             modes,
             force,
-            max(low, smallest_fraction * high) if main else low,
+            max(low, _SMALLEST * high) if main else low,
             high,
             points_per_side,
             closed=not main,
@@ -145,7 +145,7 @@ class _OnBackbone(NamedTuple):
     damping: Float[np.ndarray, " point"]
     squared_slope: Float[np.ndarray, " point"]
     damping_slope: Float[np.ndarray, " point"]
-    argument: AmplitudeArgument
+    argument: Argument
 
     def excess(self, load: float) -> Float[np.ndarray, " point"]:
         """v·2ζ̃ω̃ − |A|F: zero at a phase resonance."""

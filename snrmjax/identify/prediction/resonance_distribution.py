@@ -10,6 +10,7 @@ from jaxtyping import Complex, Float
 from snrmjax.identify.pointwise.prediction import LARGEST_AMPLITUDE_RATIO
 from snrmjax.identify.prediction.new_level import NewLevel
 from snrmjax.model.modes import LinearModes, residual_velocity
+from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
 
 QUANTILES = (0.025, 0.16, 0.5, 0.84, 0.975)
@@ -40,10 +41,9 @@ class ResonanceDistribution(AbstractResult):
     another_day: bool  # whether the errors are another day's too
 
     @property
-    def holds(self) -> str:
-        """Which errors the quantiles hold, in words."""
-        more = " and another day's" if self.another_day else ""
-        return f"a further level's errors{more}"
+    def holds(self) -> Fact:
+        """Which errors the quantiles hold."""
+        return Fact("errors_of_a_level", another_day=self.another_day)
 
     def variables(self) -> dict[str, Variable]:
         """Frequency and velocity at `QUANTILES`."""
@@ -52,7 +52,7 @@ class ResonanceDistribution(AbstractResult):
 
     def attributes(self) -> dict[str, str | float | int]:
         """The force, the range, probabilities, and which errors the quantiles hold."""
-        return {**super().attributes(), "holds": self.holds}
+        return {**super().attributes(), "holds": str(self.holds)}
 
 
 class KnownCurves(NamedTuple):

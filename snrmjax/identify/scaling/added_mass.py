@@ -9,7 +9,7 @@ from snrmjax.identify.modal.modal_fit import LinearModalFit
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.units import HERTZ
 
-_CERTAIN = 3.0  # standard errors of a shift, without which it gives no scale
+_SHIFT_STDS = 3.0  # standard errors of a shift, without which it gives no scale
 _LARGE = 0.1  # relative shift of frequency, beyond which the shapes change too
 _STEP = 1e-7
 
@@ -42,7 +42,7 @@ def squared_shapes(
     after, after_std = _partners(without, with_mass)
     shift, spread = before - after, np.hypot(own_std, after_std)
     for k in range(len(before)):
-        if shift[k] < _CERTAIN * spread[k]:
+        if shift[k] < _SHIFT_STDS * spread[k]:
             raise ValueError(
                 f"the added mass of {mass:.4g} kg must lower the frequency of mode {k + 1}, but "
                 f"it goes from {before[k] / HERTZ:.7g} to {after[k] / HERTZ:.7g} Hz, "

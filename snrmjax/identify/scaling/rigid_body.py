@@ -8,7 +8,7 @@ from jaxtyping import Float
 from snrmjax.identify.modal.modal_fit import LinearModalFit
 from snrmjax.numerics.facts import Fact
 
-_CERTAIN = 5.0  # standard errors of a low residual
+_RESIDUAL_STDS = 5.0  # standard errors of a low residual
 _APART = 1.2  # ratio of the residual's mass and the stated one that is worth a note
 
 
@@ -40,7 +40,7 @@ def rigid_body_mode(
     residual = residual_std = np.nan
     if drive is not None and std[at] > 0:
         residual, residual_std = sign * lower[at], std[at]
-    shows = residual < -_CERTAIN * residual_std
+    shows = residual < -_RESIDUAL_STDS * residual_std
     if free is None:
         note = (Fact("low_residual_of_free_mass", mass_kg=float(-1 / residual)),) if shows else ()
         return RigidBodyMode(None, 0.0, note)

@@ -14,7 +14,7 @@ from snrmjax.identify.scaling.scaled_modes import ScaledModes
 from snrmjax.numerics.facts import Fact
 
 _PER = {"force": "N", "voltage": "V", "acceleration": "m/s²"}
-_CERTAIN = 3.0  # standard errors of a drive point's residue, without which it gives no scale
+_RESIDUE_STDS = 3.0  # standard errors of a drive point's residue, without which it gives no scale
 _DRIVE_NAMES = ("drive_point", "drive point", "driving_point", "driving point")
 
 
@@ -52,7 +52,7 @@ class DrivePoint(NamedTuple):
         d, sign = self._place(fit)
         drive_residue = sign * residue[d]
         std = fit.residue_std[d] * np.abs(residue[d] / fit.residue[d])
-        sure = np.abs(drive_residue) > _CERTAIN * std
+        sure = np.abs(drive_residue) > _RESIDUE_STDS * std
         hertz = fit.natural_frequency / 2 / np.pi
         if np.all(drive_residue[sure] < 0) and sure.any():
             raise ValueError(

@@ -26,7 +26,7 @@ from snrmjax.identify.test_model.linear_gaussian import LinearRows
 from snrmjax.identify.test_model.states import TestStates
 
 _STEPS = 4  # towards every state's most likely errors
-_NOTHING = 1e-8  # relative or rad, by which the last step moves
+_NO_STEP = 1e-8  # relative or rad, by which the last step moves
 _FARTHEST = 0.3  # relative or rad, of a state's error
 _SOFTEST = 1e-3  # of the squared frequencies, that a stiffness is for its logarithm
 _LOST = 1e100  # slopes that no mode has
@@ -131,7 +131,7 @@ class Balance(NamedTuple):
             parts = np.stack([slopes.real, slopes.imag], axis=1)
             errors = -np.einsum("nie,ni->ne", parts, pull) * self.states.errors**2
             errors = np.clip(errors, -_FARTHEST, _FARTHEST)
-            if np.max(np.abs(errors - last)) < _NOTHING:
+            if np.max(np.abs(errors - last)) < _NO_STEP:
                 break
         return errors
 

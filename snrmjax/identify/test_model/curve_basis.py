@@ -22,7 +22,7 @@ MOST_KNOTS = 42
 _BEYOND = (1.15, 1.3)  # knots over the largest amplitude, for levels whose record is too small
 _NEAREST = 1.1  # ratio of two knots' amplitudes
 N_POWERS = 2
-_NOTHING = 1e-6  # of the largest variance: a direction of the sizes that counts for nothing
+_NO_VARIANCE = 1e-6  # of the largest variance: a direction of the sizes that counts for nothing
 
 
 class CurveBasis(NamedTuple):
@@ -46,7 +46,7 @@ class CurveBasis(NamedTuple):
         functions = np.column_stack([np.ones_like(knots), knots, np.linalg.pinv(bends)])
         apart_by = np.subtract.outer(np.arange(len(bends)), np.arange(len(bends))) / SIZES_ALIKE
         values, vectors = np.linalg.eigh(np.exp(-0.5 * apart_by**2))
-        keep = values > _NOTHING * np.max(values, initial=0.0)
+        keep = values > _NO_VARIANCE * np.max(values, initial=0.0)
         directions = vectors[:, keep] * np.sqrt(values[keep])
         pieces = CubicSpline(knots, functions, bc_type="natural").c
         return cls(largest, knots, pieces, directions)

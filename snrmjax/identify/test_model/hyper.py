@@ -24,7 +24,7 @@ from snrmjax.identify.test_model.linear_gaussian import (
 from snrmjax.identify.test_model.states import TestStates
 
 _STRAIGHT = 1e-4  # size of bends, below which no test sees them
-_NOTHING = 1e-4  # over a prior's scale, that a size is at least
+_SMALLEST_SIZE = 1e-4  # over a prior's scale, that a size is at least
 _FARTHEST = 5.0  # 1σ, of a change of the bends' size
 _MOST = 0.5  # 1σ of a level's error, relative or rad: beyond it levels are not one structure's
 _LEAST = 4.0  # nats below the likeliest, from which on sizes are left out
@@ -125,11 +125,11 @@ def bounds_of(
     levels = []
     for stated, prior in zip(states.level_std, priors.LEVELS, strict=True):
         held = np.log(stated) if stated > 0 else None
-        wide = (np.log(_NOTHING * prior.scale), np.log(_MOST))
+        wide = (np.log(_SMALLEST_SIZE * prior.scale), np.log(_MOST))
         levels.append(wide if held is None else (held, held))
     n = basis.directions.shape[1]
     left = len(point) - FIRST_ALONG - n
-    more = [(np.log(_NOTHING * priors.DISCREPANCY.scale), 0.0)] * left
+    more = [(np.log(_SMALLEST_SIZE * priors.DISCREPANCY.scale), 0.0)] * left
     return [noise, size, size, *levels, *[(-_FARTHEST, _FARTHEST)] * n, *more]
 
 

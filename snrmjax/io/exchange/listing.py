@@ -3,15 +3,12 @@
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
-from snrmjax.io.columns import is_ours
 from snrmjax.io.laboratory.contents import LaboratoryFile, NumberTable
 from snrmjax.io.laboratory.names import role_of
 from snrmjax.measure.recordings.channels import Channel
-from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
 from snrmjax.measure.recordings.velocity_states import number_levels
 from snrmjax.numerics.facts import Fact
 
@@ -83,92 +80,35 @@ def _first(table: NumberTable, role: str) -> str:
     return next((name for name in table.columns if role_of(name) == role), "")
 
 
-class _Candidate(NamedTuple):
-    """A channel or column that may be force or response: what the file or its name says it is."""
-
-    name: str
-    kind: str
-    unit: str  # that the file states
-
-
 def suggested_command(paths: Sequence[Path], held: LaboratoryFile) -> list[str]:
-    """A command line that imports the file, with what names and units say; capitals are open."""
+    """Command lines for the file, with names guessed; capitals and brackets are to be filled in."""
     files = " ".join(shlex.quote(str(path)) for path in paths)
-    tables = sorted(held.tables, key=lambda table: (not _first(table, "frequency"), -table.n_rows))
-    ratios = False
-    if held.responses and not held.recordings:
-        dataset, candidates = "responses", _of_channels(held.responses[0].responses)
-        ratios = not any(candidate.kind == "force" and candidate.unit for candidate in candidates)
-    elif held.recordings and not (tables and _first(tables[0], "frequency")):
-        record = held.recordings[0]
-        dataset, candidates = record.name or "record", _of_channels(record.channels)
-    elif tables:
-        dataset, table = tables[0].name, tables[0]
-        candidates = [
-            _Candidate(name, role_of(name), table.units.get(name, ""))
-            for name in table.columns
-            if role_of(name) != "frequency"
-        ]
-    else:
-        return []
-    several = len(held.tables) + bool(held.recordings) + bool(held.responses) > 1
-    words = ["--dataset", dataset] if several else []
-    if dataset == "responses" or not tables or not is_ours(tables[0].columns):
-        words += _channels_of_import(candidates, held.levels, ratios=ratios)
-    quoted = " ".join(word if word.isupper() else shlex.quote(word) for word in words)
+    ratios = bool(held.responses) and not held.recordings
+    channels: Sequence[Channel] = ()
+    if ratios or held.recordings:
+        channels = held.responses[0].responses if ratios else held.recordings[0].channels
+    kinds = {
+        channel.name: channel.quantity for channel in channels if channel.quantity != "unknown"
+    }
+    names = [channel.name for channel in channels] or [
+        name for table in held.tables[:1] for name in table.columns
+    ]
+    roles = {name: kinds.get(name) or role_of(name) for name in names}
+
+    def likeliest(*wanted: str) -> str:
+        return next((name for role in wanted for name in names if roles[name] == role), "CHANNEL")
+
+    force = "--force-amplitude NEWTONS" if ratios else ""
+    if not ratios or "force" in kinds.values():
+        force = f"--force {shlex.quote(likeliest('force', 'voltage', 'drive'))} [--force-unit UNIT]"
+    response = shlex.quote(likeliest(*_MOTIONS, "amplitude", "real"))
     lines = [
-        "import it (fill in words in capitals, and check the guesses):",
-        f"  snrmjax import {files} {quoted} --out imported".replace("  --out", " --out"),
+        "import it (check the names; units where the file states none):",
+        f"  snrmjax import {files} {force} --response {response}[:QUANTITY:UNIT] --out imported",
     ]
     if ratios:
-        sensor = _at_the_force(held.responses) or "SENSOR"
-        modes = f"  snrmjax modes {files} --drive-point {shlex.quote(sensor)} --out model.toml"
         lines += [
             "or, of an impact or broadband test, linear modes (the sensor at the force):",
-            modes,
+            f"  snrmjax modes {files} --drive-point SENSOR --out model.toml",
         ]
     return lines
-
-
-def _channels_of_import(
-    candidates: Sequence[_Candidate], levels: Sequence[float], *, ratios: bool
-) -> list[str]:
-    """Options for force and response, each the likeliest of the candidates."""
-    known = sorted(candidates, key=lambda candidate: not candidate.unit)
-
-    def likeliest(*kinds: str) -> _Candidate:
-        matching = (candidate for kind in kinds for candidate in known if candidate.kind == kind)
-        return next(matching, _Candidate("CHANNEL", "", ""))
-
-    if ratios:
-        known_level = levels and np.isfinite(levels[0]) and levels[0] > 0
-        words = ["--force-amplitude", "z" if known_level else "NEWTONS"]
-    else:
-        force = likeliest("force", "voltage", "drive")
-        words = ["--force", force.name, *([] if force.unit else ["--force-unit", "UNIT"])]
-    candidate = likeliest(*_MOTIONS, "amplitude", "real")
-    if candidate.name == "CHANNEL" and len(candidates) == 1:
-        candidate = candidates[0]
-    kind = candidate.kind if candidate.kind in _MOTIONS else "" if candidate.unit else "QUANTITY"
-    words += ["--response", f"{candidate.name}:{kind}" if kind else candidate.name]
-    return words if candidate.unit else [*words, "--unit", "UNIT"]
-
-
-def _at_the_force(sets: Sequence[FrequencyResponses]) -> str:
-    """The response at the place and along the axis of a reference; nothing where nobody said."""
-    for responses in sets:
-        for reference in responses.references:
-            for response in responses.responses:
-                same = response.direction.lstrip("+-") == reference.direction.lstrip("+-")
-                if reference.point and response.point == reference.point and same:
-                    return response.name
-    return ""
-
-
-def _of_channels(channels: Sequence[Channel]) -> list[_Candidate]:
-    return [
-        _Candidate(channel.name, role_of(channel.name), "")
-        if channel.quantity == "unknown"
-        else _Candidate(channel.name, channel.quantity, channel.unit or channel.si_unit)
-        for channel in channels
-    ]

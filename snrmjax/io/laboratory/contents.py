@@ -1,6 +1,6 @@
 """What a laboratory's file holds, whatever its format."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -14,7 +14,7 @@ Kind = Literal["uff", "matlab", "hdf5", "netcdf", "tdms", "csv"]
 
 
 class NumberTable(NamedTuple):
-    """Columns of numbers by name, all of one length; see `number_table`.
+    """Columns of numbers by name, all of one length.
 
     One row may be a steady state (frequency, force, amplitude, phase), a step of a record or a
     line of a spectrum. Numbers are as they stand in the file, real or complex; NaN where a field is
@@ -64,42 +64,3 @@ class LaboratoryFile(NamedTuple):
     def is_empty(self) -> bool:
         """Whether nothing was found."""
         return not (self.recordings or self.responses or self.tables)
-
-
-def number_table(
-    name: str,
-    columns: Mapping[str, Num[np.ndarray, " row"]],
-    units: Mapping[str, str] | None = None,
-    words: Mapping[str, Sequence[str]] | None = None,
-) -> NumberTable:
-    """A table of numbers, checked.
-
-    Raises `ValueError` for no column, no row, an empty name, columns of unequal length or of
-    anything but real and complex numbers, and a unit of a column that is not there.
-
-    >>> number_table("states", {"frequency": [79.0, 79.5], "force": [0.1, 0.1]}).n_rows
-    2
-    """
-    held = {key: np.asarray(values) for key, values in columns.items()}
-    if not held or "" in held:
-        raise ValueError(f"table {name} needs columns with names.")
-    for key, values in held.items():
-        if values.ndim != 1 or values.dtype.kind not in "biufc":
-            raise ValueError(
-                f"column {key} of table {name} must be a vector of numbers, but has shape "
-                f"{values.shape} and type {values.dtype}."
-            )
-    lengths = {values.size for values in held.values()}
-    if len(lengths) > 1 or not lengths.pop():
-        listed = ", ".join(f"{key} {values.size}" for key, values in held.items())
-        raise ValueError(f"columns of table {name} must have one length above 0, but: {listed}.")
-    known = dict(units or {})
-    for key in known:
-        if key not in held:
-            raise ValueError(f"table {name} states a unit of {key!r}, which is no column.")
-    texts = {key: tuple(map(str, column)) for key, column in (words or {}).items()}
-    n_rows = next(iter(held.values())).size
-    for key, column in texts.items():
-        if len(column) != n_rows or key in held:
-            raise ValueError(f"column {key} of table {name} must have {n_rows} texts of its own.")
-    return NumberTable(name, held, known, texts)

@@ -9,7 +9,7 @@ from snrmjax.io.units import HERTZ
 from snrmjax.pipelines.simulate import SimulatedMode, SimulatedResponses
 from snrmjax.report.figures.identification import save_figure
 from snrmjax.report.figures.simulation import normal_mode_figure, simulated_response_figure
-from snrmjax.simulate.continuation.response_curve import ResponseCurve
+from snrmjax.simulate.continuation.response_curve import Branch, ResponseCurve
 
 
 def write(folder: Path, found: SimulatedResponses | SimulatedMode) -> None:
@@ -36,7 +36,7 @@ def headline(found: SimulatedResponses | SimulatedMode) -> list[str]:
 
 def _largest(curve: ResponseCurve, sensor: str) -> str:
     speed = np.abs(curve.velocity[:, 1, curve.sensors.index(sensor)])
-    name = "" if curve.branch == "main" else f" ({curve.branch})"
+    name = "" if curve.branch == Branch.MAIN else f" ({curve.branch})"
     if not speed.size:
         return f"force {curve.force:g} N{name}: no response"
     top = int(np.argmax(speed))

@@ -1,4 +1,4 @@
-"""What identifications, joint fits, predictions, modal fits and calibrations have to tell."""
+"""What identifications, joint fits, predictions and advice have to tell."""
 
 from collections.abc import Sequence
 
@@ -199,6 +199,11 @@ def _trend(error: str, change: float, there: float, p_value: float, load: object
     )
 
 
+def _errors_of_a_level(another_day: bool) -> str:
+    day = " and another day's" if another_day else ""
+    return f"a further level's errors{day}"
+
+
 def _resonance_range(
     probability: float,
     ratio: float,
@@ -215,9 +220,8 @@ def _resonance_range(
         ]
     (low, high), (slow, fast) = frequency_hz, velocity
     if np.isfinite(low) and np.isfinite(high):
-        day = " and another day's" if another_day else ""
         band = f"{low:.6g} to {high:.6g} Hz, {slow:.3g} to {fast:.3g} m/s"
-        words.append(f"95 % {band} (a further level's errors{day})")
+        words.append(f"95 % {band} ({_errors_of_a_level(another_day)})")
     return "; ".join(words)
 
 
@@ -227,37 +231,6 @@ def _not_located(points: Sequence[tuple[str, float]], force: float) -> str:
         f"{len(points)} resonances or folds under {force:g} N could not be located ({listed}) and "
         "have no band."
     )
-
-
-def _amplitude_dependence(
-    mode: int,
-    frequency_hz: float,
-    of_damping: bool,
-    change: float,
-    allowed: float,
-    left: float,
-    velocities: tuple[float, float],
-) -> str:
-    name, unit, factor = "frequency", "Hz", 0.5 / np.pi
-    if of_damping:
-        name, unit, factor = "damping", "%", 100.0
-    low, high = velocities
-    return (
-        f"the {name} of mode {mode} ({frequency_hz:.6g} Hz) depends on the amplitude: "
-        f"{factor * change:+.3g} {unit} from {low:.3g} to {high:.3g} m/s, where the errors allow "
-        f"{factor * allowed:.2g} {unit}; at the lowest level some {factor * left:.2g} {unit} may "
-        "be left, which is added to its error (1σ)"
-    )
-
-
-def _low_residual(mass_kg: float, ratio: float, off: bool) -> str:
-    more = ""
-    if off:
-        more = (
-            f", {ratio:.2g} times the stated mass: the force acts off the centre of mass, or the "
-            "suspension's modes or missed modes are in it"
-        )
-    return f"the low residual at the drive point is that of {mass_kg:.4g} kg{more}"
 
 
 SENTENCES: dict[str, Wording] = {
@@ -331,121 +304,10 @@ SENTENCES: dict[str, Wording] = {
         "so read the band upwards of zero."
     ),
     "resonance_of_a_level": _resonance_range,
+    "errors_of_a_level": _errors_of_a_level,
     # Advice.
     "advice_of_unconverged_fit": (
         "the fit that this advice rests on has not converged: another fit may advise other states"
     ),
     "band_narrower": "the {curve} band becomes {share:%.2g} narrower",
-    # Linear modes.
-    "leakage": lambda mode, frequency_hz, lines, bias: (
-        f"the half-power band of mode {mode} ({frequency_hz:.6g} Hz) has {lines:.1f} lines: if "
-        "these are averages of random excitation under Hann's window, leakage makes its damping "
-        f"some {100 * bias:.2g} % too high, which is not in the error; model it (window hann), or "
-        "measure with finer lines"
-    ),
-    "residues_turned": lambda mode, frequency_hz, phase_deg, std_deg: (
-        f"the residues of mode {mode} ({frequency_hz:.6g} Hz) are turned by {phase_deg:.2g}° ± "
-        f"{1.96 * std_deg:.2g}° from real ones: an instrument's phase (free it), a neighbouring "
-        "mode that was missed, or complex modes"
-    ),
-    "complex_mode": (
-        "mode {mode} ({frequency_hz:.6g} Hz) is complex: modal phase collinearity "
-        "{collinearity:.2f}; its real shape is an approximation"
-    ),
-    "misfit_of_sensor": (
-        "the residuals of {sensor} are {times:.2g} times what is stated of its errors: the errors "
-        "of the modes are scaled by that"
-    ),
-    "modal_fit_not_settled": "the least-squares fit had not settled after its last step",
-    "leakage_modelled": (
-        "leakage of Hann's window is modelled: averages of stationary random excitation, windows "
-        "of {window_s:.4g} s"
-    ),
-    "decay_residuals_correlated": (
-        "residuals of neighbouring samples are correlated (a mode that was missed, or a decay that "
-        "is not linear): errors are widened for it"
-    ),
-    "coherence_in_part": "the coherence is stated in part and not used",
-    "coherence_is_one": "the coherence is 1 at most lines: it says nothing of errors",
-    "one_level_for_modes": ("one level alone: nothing says whether it was low enough to be linear"),
-    "levels_not_compared": "level {other} cannot be compared with level {level}: {reason}",
-    "levels_agree": (
-        "the two lowest levels agree within their errors: no amplitude dependence shows"
-    ),
-    "amplitude_dependence": _amplitude_dependence,
-    # Scales of shapes.
-    "scaled_by_drive_point": "scaled by the drive point {sensor}",
-    "scaled_by_added_mass": "scaled by an added mass of {mass_kg:.4g} kg at {sensor}",
-    "scaled_by_sensor_masses": "scaled by the masses at the sensors",
-    "scaled_by_known_shape": "scaled by the shape stated at {sensor}",
-    "not_scaled": "not scaled",
-    "shapes_not_scaled": (
-        "shapes and participations are not mass-normalised: only frequencies, damping ratios and "
-        "ratios of a shape hold; the gain of the force must be free in what follows"
-    ),
-    "participations_per_volt": (
-        "participations are per volt: states with `drive_v` and the gain of the force in newtons "
-        "per volt free, or fixed to one, fit this model"
-    ),
-    "mode_not_scaled": lambda frequency_hz, residue, std: (
-        f"mode at {frequency_hz:.6g} Hz left out: its residue at the drive point is {residue:.3g} "
-        f"± {1.96 * std:.2g} 1/kg (95 %), from which no shape follows"
-    ),
-    "forced_fixture": (
-        "the forced fixture of {mass_kg:.4g} kg moves as the sensors' masses balance it"
-    ),
-    "effective_masses": lambda masses_kg, at_sensors_kg: (
-        f"effective masses: {', '.join(f'{one:.4g}' for one in masses_kg)} kg by modes, of "
-        f"{at_sensors_kg:.4g} kg at the sensors"
-    ),
-    "shape_for_all_modes": "the shape {value:.6g} at {sensor} was taken for every mode",
-    "added_mass_shift": lambda mode, mass_kg, shift_hz, std_hz, first_order: (
-        f"mode {mode}: the mass of {mass_kg:.4g} kg lowers the frequency by {shift_hz:.4g} ± "
-        f"{1.96 * std_hz:.2g} Hz; the first-order formula would give a squared shape "
-        f"{100 * first_order:+.2g} % from this one"
-    ),
-    "added_mass_large": (
-        "the added mass is so large that shapes change with it: take a smaller one"
-    ),
-    "low_residual_of_free_mass": (
-        "the low residual at the drive point is that of a free mass of {mass_kg:.4g} kg or of "
-        "modes below the band: it is written as a rigid-body mode where the structure is said to "
-        "be free"
-    ),
-    "rigid_body_of_stated_mass": "the rigid-body mode is that of the stated mass alone",
-    "low_residual_of_mass": _low_residual,
-    "rigid_body_of_residuals": lambda mass_kg, std_kg, scaled_by: (
-        f"rigid-body mode from the low residuals ({scaled_by}): the force feels {mass_kg:.4g} ± "
-        f"{1.96 * std_kg:.2g} kg"
-    ),
-    # Calibrations.
-    "equal_errors_assumed": lambda some_stated: (
-        "every point is given the same relative error, as "
-        f"{'not all are' if some_stated else 'none is'} stated."
-    ),
-    "harmonics_without_error": "harmonics are left out: no error is stated for them.",
-    "no_motion_for_calibration": (
-        "no balanced motion was found for any state: nothing was fitted."
-    ),
-    "no_mode_at_start": "the start has no such mode at some velocities: begin nearer.",
-    "calibration_not_converged": (
-        "the fit did not converge: values and standard deviations are not those of a minimum; "
-        "begin nearer, or fit fewer parameters."
-    ),
-    "states_without_motion": (
-        "no balanced motion was found for the states {states}: they have no weight."
-    ),
-    "calibration_noise": lambda scale: (
-        f"residuals are {scale:.2g} times the stated noise: it is understated or the model lacks "
-        "something; the standard deviations are widened."
-        if not scale < 1
-        else f"residuals are only {scale:.2g} times the stated noise: it is overstated."
-    ),
-    "parameters_without_data": "the data say nothing about {names}.",
-    "parameters_hardly_known": (
-        "the backbone says next to nothing about {names}: state `prior_std`."
-    ),
-    "parameters_at_limit": (
-        "{names} ended ten times off the start: begin nearer, or state `prior_std`."
-    ),
 }

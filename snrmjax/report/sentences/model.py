@@ -9,7 +9,7 @@ def _shape_of_effect(part: Part, power: float | None, harmonic: int | None) -> s
         return "It changes what is recorded, not the motion."
     if part is Part.TIME:
         return "It changes in the course of the test, not with the amplitude."
-    changes = {None: "", 0: " at all amplitudes alike"}.get(
+    changes = {None: "", 0.0: " at all amplitudes alike"}.get(
         power, f" with the power {power:g} of the amplitude" if power else ""
     )
     shows = "" if harmonic is None else f" and shows in harmonic {harmonic}"

@@ -60,15 +60,15 @@ def _grid(n: int, row: float, legends: float) -> tuple[Figure, list[Axes]]:
 
 
 def _histogram(axes: Axes, output: Sequence[Scalar]) -> None:
-    every = np.concatenate([one.values for one in output])
-    found = every[np.isfinite(every)]
-    shown = display_on_axis(found, output[0].unit)
+    pooled = np.concatenate([one.values for one in output])
+    known = pooled[np.isfinite(pooled)]
+    shown = display_on_axis(known, output[0].unit)
     if output[0].is_count:
-        edges = np.arange(found.min() - 0.5, found.max() + 1.0)
+        edges = np.arange(known.min() - 0.5, known.max() + 1.0)
     else:
         # Far outliers are not drawn apart: they would leave the rest one bar.
-        low, high = np.quantile(found, [0.001, 0.999])
-        edges = np.linspace(low, high, _bins(found.size)) / shown.size
+        low, high = np.quantile(known, [0.001, 0.999])
+        edges = np.linspace(low, high, _bins(known.size)) / shown.size
     for one, colour in zip(output, _colours(len(output)), strict=True):
         values = one.values[np.isfinite(one.values)] / shown.size
         if not values.size:
@@ -97,8 +97,8 @@ def main_effects_figure(
     width = PAGE if len(names) > 1 else COLUMN
     figure, grid = panels(width, _ROW * len(shown) + 0.4, len(shown), len(names))
     for k, (line, one) in enumerate(zip(grid, shown, strict=True)):
-        every = np.concatenate([output.values for output in one.outputs])
-        y = display_on_axis(every, one.outputs[0].unit)
+        pooled = np.concatenate([output.values for output in one.outputs])
+        y = display_on_axis(pooled, one.outputs[0].unit)
         for j, (axes, name) in enumerate(zip(line, names, strict=True)):
             x = display_on_axis(quantities[name], units[name])
             _scatter(axes, one, name, quantities[name], (x, y))
@@ -152,8 +152,8 @@ def _scatter(
 
 def _share(axes: Axes, shown: OutputEffects, name: str) -> None:
     """The share of variance above a panel, of the smallest and the largest force."""
-    found = [effects[name] for effects in shown.effects]
-    shares = [100 * max(one.share, 0.0) for one in found if one is not None]
+    known = [effects[name] for effects in shown.effects]
+    shares = [100 * max(one.share, 0.0) for one in known if one is not None]
     if not shares:
         return
     low, high = (f"{value:.0f}" for value in (min(shares), max(shares)))
@@ -204,13 +204,13 @@ def failures_figure(
     second = plain(_named(names[1], units)) if len(names) > 1 else "Number of the member"
     name_axes(grid[0], "Failed members", plain(_named(names[0], units)), second)
     for axes, name in zip(grid[1:], names, strict=True):
-        found = failure_share(quantities[name], failures.failed)
-        middle = 0.5 * (found.edges[1:] + found.edges[:-1])
+        along = failure_share(quantities[name], failures.failed)
+        middle = 0.5 * (along.edges[1:] + along.edges[:-1])
         shown: Style = {"color": IDENTIFIED, "alpha": 0.35}
-        axes.bar(middle, 100 * found.share, np.diff(found.edges), **shown, label="share failed")
-        bars = 100 * np.abs(np.array([found.share - found.low, found.high - found.share]))
+        axes.bar(middle, 100 * along.share, np.diff(along.edges), **shown, label="share failed")
+        bars = 100 * np.abs(np.array([along.share - along.low, along.high - along.share]))
         style: Style = {"fmt": "none", "ecolor": "0.3", "elinewidth": 0.8}
-        axes.errorbar(middle, 100 * found.share, bars, **style, label="95 % interval")
+        axes.errorbar(middle, 100 * along.share, bars, **style, label="95 % interval")
         name_axes(axes, "", plain(_named(name, units)), "Failed (%)")
     legend(figure)
     return figure
@@ -237,10 +237,10 @@ def _map(axes: Axes, failures: Failures, places: Sequence[np.ndarray]) -> None:
 def counts_figure(counts: Sequence[tuple[str, dict[str, int]]]) -> Figure:
     """How often each answer was given: one panel a question, such as the verdict."""
     figure, (line,) = panels(PAGE if len(counts) > 1 else COLUMN, 2.8, 1, len(counts))
-    for axes, (title, found) in zip(line, counts, strict=True):
-        names = [short_name(name) for name in found]
-        axes.barh(np.arange(len(found)), list(found.values()), color=MEASURED, alpha=0.6)
-        axes.set_yticks(np.arange(len(found)), [plain(name or "none") for name in names])
+    for axes, (title, answers) in zip(line, counts, strict=True):
+        names = [short_name(name) for name in answers]
+        axes.barh(np.arange(len(answers)), list(answers.values()), color=MEASURED, alpha=0.6)
+        axes.set_yticks(np.arange(len(answers)), [plain(name or "none") for name in names])
         axes.invert_yaxis()
         name_axes(axes, title, "Members", "")
     return figure

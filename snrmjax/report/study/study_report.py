@@ -67,53 +67,53 @@ def write_study_report(folder: Path, data: "xarray.Dataset") -> StudyDigest:
 
     Returns the study's numbers.
     """
-    found = digest(data)
-    _write_table(folder / "summary.csv", summary_frame(found.summaries))
-    effects = effects_frame(found)
+    study = digest(data)
+    _write_table(folder / "summary.csv", summary_frame(study.summaries))
+    effects = effects_frame(study)
     if len(effects):
         _write_table(folder / "main_effects.csv", effects)
     sections = (
-        _distributions(folder, found),
-        _effects(folder, found),
+        _distributions(folder, study),
+        _effects(folder, study),
         _bands(folder, data),
         _answers(folder, data),
-        _failures(folder, found, data),
+        _failures(folder, study, data),
     )
     stated = {
         "computed": data.attrs.get("computed"),
-        "members": found.n_members,
-        "sampling": found.sampling,
-        "varied": ", ".join(found.quantities),
+        "members": study.n_members,
+        "sampling": study.sampling,
+        "varied": ", ".join(study.quantities),
         **{name: data.attrs.get(f"{name}_version") for name in ("snrmjax", "jax", "numpy")},
     }
     report = Report(
         title=f"Study: {data.attrs.get('title', 'study')}",
         done=[(name, str(value)) for name, value in stated.items() if value],
-        result=study_sentence(found),
-        notes=[str(fact) for fact in found.facts],
+        result=study_sentence(study),
+        notes=[str(fact) for fact in study.facts],
         sections=[section for section in sections if section is not None],
     )
     write_report(folder / "report.html", report)
-    return found
+    return study
 
 
-def members_ended(found: StudyDigest) -> str:
+def members_ended(study: StudyDigest) -> str:
     """How many members failed, or have no peak in the range, in one sentence."""
-    outside = found.failures.n_outside
-    failed = found.failures.n_failed - outside
-    text = f"{found.n_members} members, " + (
+    outside = study.failures.n_outside
+    failed = study.failures.n_failed - outside
+    text = f"{study.n_members} members, " + (
         f"of which {failed} failed" if failed else "none failed"
     )
     return text + (f"; {outside} have no peak in the range." if outside else ".")
 
 
-def study_sentence(found: StudyDigest) -> str:
+def study_sentence(study: StudyDigest) -> str:
     """What a study found, in one or two plain sentences."""
-    if not found.effects:
-        return members_ended(found)
-    last, effects = found.effects[0].outputs[-1], found.effects[0].effects[-1]  # the largest force
+    if not study.effects:
+        return members_ended(study)
+    last, effects = study.effects[0].outputs[-1], study.effects[0].effects[-1]  # the largest force
     (row,) = (
-        s for s in found.summaries if (s.scalar.name, s.scalar.force) == (last.name, last.force)
+        s for s in study.summaries if (s.scalar.name, s.scalar.force) == (last.name, last.force)
     )
     shown = display(row.quantiles, last.unit)
     low, _, median, _, high = (number(v) for v in row.quantiles / shown.size)
@@ -124,7 +124,7 @@ def study_sentence(found: StudyDigest) -> str:
     if order:
         name, one = order[0]
         text += f"; {name} alone makes {100 * max(one.share, 0.0):.0f} % of its variance"
-    return f"{members_ended(found)} {text}."
+    return f"{members_ended(study)} {text}."
 
 
 def summary_table(rows: Sequence[ScalarSummary], caption: str) -> ReportTable:
@@ -149,14 +149,14 @@ def _cells(row: ScalarSummary) -> tuple[str, ...]:
     )
 
 
-def _effects_table(found: StudyDigest) -> ReportTable:
+def _effects_table(study: StudyDigest) -> ReportTable:
     """The strongest quantities of every output, and what none of them explains alone."""
 
     def cell(name: str, one: MainEffect) -> str:
         return f"{name}: {100 * max(one.share, 0.0):.0f} ± {100 * one.half_width:.0f} %"
 
     rows = []
-    for output, effects in found.each_effect:
+    for output, effects in study.each_effect:
         order = ranked_effects(effects)
         if order:
             rest = 1.0 - sum(max(one.share, 0.0) for _, one in order)
@@ -173,9 +173,9 @@ def _effects_table(found: StudyDigest) -> ReportTable:
     )
 
 
-def _status_table(found: StudyDigest, data: "xarray.Dataset") -> ReportTable:
+def _status_table(study: StudyDigest, data: "xarray.Dataset") -> ReportTable:
     """How many members ended in which way."""
-    counts = found.failures.counts
+    counts = study.failures.counts
     share = 100 / sum(counts.values())
     rows = [
         (
@@ -199,10 +199,10 @@ def _saved(folder: Path, name: str, figure: Figure, caption: str) -> ReportFigur
     return ReportFigure(done, caption)
 
 
-def _distributions(folder: Path, found: StudyDigest) -> Section:
+def _distributions(folder: Path, study: StudyDigest) -> Section:
     shown = [
         output
-        for output in found.outputs
+        for output in study.outputs
         if (output[0].name in _SPREAD or not output[0].is_count)
         and any(one.varies for one in output)
     ]
@@ -214,29 +214,29 @@ def _distributions(folder: Path, found: StudyDigest) -> Section:
     caption = "All outputs over the members; further quantiles are in summary.csv."
     rows = [
         row
-        for row in found.summaries
+        for row in study.summaries
         if not row.scalar.is_count or (row.varies and row.scalar.name in _SPREAD)
     ]
     return Section("Distributions", (), figures, [summary_table(rows, caption)])
 
 
-def _effects(folder: Path, found: StudyDigest) -> Section | None:
-    if not found.quantities or not found.effects:
+def _effects(folder: Path, study: StudyDigest) -> Section | None:
+    if not study.quantities or not study.effects:
         return None
     figures = []
-    for k in range(0, len(found.effects), _ROWS):
-        shown = found.effects[k : k + _ROWS]
-        strongest: dict[str, float] = dict.fromkeys(found.quantities, 0.0)
+    for k in range(0, len(study.effects), _ROWS):
+        shown = study.effects[k : k + _ROWS]
+        strongest: dict[str, float] = dict.fromkeys(study.quantities, 0.0)
         for one in (effects for panel in shown for effects in panel.effects):
             for name, effect in ranked_effects(one):
                 strongest[name] = max(strongest[name], effect.share)
         names = sorted(strongest, key=lambda name: -strongest[name])[:_COLUMNS]
-        several = len(found.effects) > _ROWS
+        several = len(study.effects) > _ROWS
         name = f"main_effects_{k // _ROWS + 1}" if several else "main_effects"
-        drawn = {name: found.quantities[name] for name in names}
-        figure = main_effects_figure(shown, drawn, found.units)
+        drawn = {name: study.quantities[name] for name in names}
+        figure = main_effects_figure(shown, drawn, study.units)
         figures.append(_saved(folder, name, figure, EFFECTS))
-    table = _effects_table(found)
+    table = _effects_table(study)
     tables = [table] if table.rows else []
     return Section("Main effects", (), figures, tables)
 
@@ -275,14 +275,14 @@ def _answers(folder: Path, data: "xarray.Dataset") -> Section | None:
     return Section("Answers", (), figures, tables)
 
 
-def _failures(folder: Path, found: StudyDigest, data: "xarray.Dataset") -> Section:
-    table = _status_table(found, data)
-    if not found.failures.n_failed:
+def _failures(folder: Path, study: StudyDigest, data: "xarray.Dataset") -> Section:
+    table = _status_table(study, data)
+    if not study.failures.n_failed:
         return Section("Failures", ("Every member has its whole result.",), (), [table])
-    text = f"{found.failures.n_failed} of {found.n_members} members have no whole result."
-    if not found.quantities:
+    text = f"{study.failures.n_failed} of {study.n_members} members have no whole result."
+    if not study.quantities:
         return Section("Failures", (text,), (), [table])
-    names = most_telling(found.quantities, found.failures.failed)[:_TELLING]
-    drawn = {name: found.quantities[name] for name in names}
-    figure = failures_figure(found.failures, drawn, found.units)
+    names = most_telling(study.quantities, study.failures.failed)[:_TELLING]
+    drawn = {name: study.quantities[name] for name in names}
+    figure = failures_figure(study.failures, drawn, study.units)
     return Section("Failures", (text,), [_saved(folder, "failures", figure, FAILED)], [table])

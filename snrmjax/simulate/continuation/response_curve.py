@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from enum import StrEnum
 from typing import ClassVar
 
 import equinox as eqx
@@ -55,6 +56,16 @@ def motions_of(balance: HarmonicBalance, points: Float[np.ndarray, "point unknow
     return {**named, "sensors": modes.sensors}
 
 
+class Branch(StrEnum):
+    """How a response curve was reached."""
+
+    MAIN = "main"  # from rest
+    GIVEN_START = "isolated, from a given start"
+    PHASE_RESONANCE = "isolated, from a phase resonance"
+    EQUILIBRIUM = "about another equilibrium"
+    RANDOM_START = "isolated, from a random start"
+
+
 class ResponseCurve(MotionCurve):
     """One forced response in order along the curve, unstable parts included.
 
@@ -71,7 +82,7 @@ class ResponseCurve(MotionCurve):
     truncation: Float[np.ndarray, " point"] | None = None  # estimated, like `multipliers`
     # Kinds of events that are there but were not located.
     not_located: tuple[str, ...] = setting(default=())
-    branch: str = setting(default="main")  # or how an isolated one was reached
+    branch: Branch = setting(default=Branch.MAIN)
     n_solves: int = setting(default=0)  # linear systems factorised to trace the curve
 
     @property
@@ -98,7 +109,7 @@ class ResponseCurve(MotionCurve):
     def summary(self) -> tuple[str, ...]:
         """Force, range, largest velocity, stability, events and status."""
         n = len(self.frequency)
-        of = "" if self.branch == "main" else f" ({self.branch})"
+        of = "" if self.branch is Branch.MAIN else f" ({self.branch})"
         lines = [f"forced response at {self.force:.4g} N{of}: {n} points"]
         if n:
             height = np.abs(self.velocity[:, 1])
@@ -140,7 +151,7 @@ def assembled(
     steps: StepControl,
     *,
     stability: bool = True,
-    branch: str = "main",
+    branch: Branch = Branch.MAIN,
 ) -> list[ResponseCurve]:
     """Curves with their events and bifurcations inserted, velocities and multipliers.
 

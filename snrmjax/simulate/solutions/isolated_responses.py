@@ -17,7 +17,7 @@ from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, linear_co
 from snrmjax.simulate.balance.labelled import HERTZ
 from snrmjax.simulate.continuation.continuation import CurveStatus, StepControl, TracedCurve
 from snrmjax.simulate.continuation.curve_tracing import response_balances, trace_through
-from snrmjax.simulate.continuation.response_curve import ResponseCurve, assembled
+from snrmjax.simulate.continuation.response_curve import Branch, ResponseCurve, assembled
 from snrmjax.simulate.solutions.controlled import phase_controlled
 from snrmjax.simulate.solutions.forced_response import (
     DEFAULT_SETTINGS,
@@ -159,10 +159,10 @@ def isolated_responses(
 
 def _starts(
     balance: HarmonicBalance, ends: np.ndarray, search: IsolatedSearch, resonances: list[Start]
-) -> list[tuple[np.ndarray, float, str]]:
+) -> list[tuple[np.ndarray, float, Branch]]:
     """Coefficients, frequency and origin of every start."""
     model, n = balance.model, balance.n_coefficients
-    rows: list[tuple[np.ndarray, float, str]] = []
+    rows: list[tuple[np.ndarray, float, Branch]] = []
     for coefficients, frequency in search.starts:
         x = np.asarray(coefficients, dtype=np.float64)
         if x.shape != (n, model.n_modes):
@@ -170,8 +170,8 @@ def _starts(
                 f"every start must have coefficients of shape {(n, model.n_modes)}, but one has "
                 f"{x.shape}."
             )
-        rows.append((x, float(frequency), "isolated, from a given start"))
-    rows += [(x, w, "isolated, from a phase resonance") for x, w in resonances]
+        rows.append((x, float(frequency), Branch.GIVEN_START))
+    rows += [(x, w, Branch.PHASE_RESONANCE) for x, w in resonances]
     wells = [e for e in equilibria(model) if e.stable]
     rng = np.random.default_rng(search.seed)
     j, scale = model.modes.mode_of_interest, float(balance.displacement_scale)
@@ -179,11 +179,11 @@ def _starts(
         for well in wells:
             x = np.zeros((n, model.n_modes))
             x[0] = well.displacement
-            rows.append((x.copy(), float(frequency), "about another equilibrium"))
+            rows.append((x.copy(), float(frequency), Branch.EQUILIBRIUM))
             linear = linear_coefficients(
                 model, balance.force, jnp.asarray(frequency), balance.harmonic_order
             )
-            rows.append((x + np.asarray(linear), float(frequency), "about another equilibrium"))
+            rows.append((x + np.asarray(linear), float(frequency), Branch.EQUILIBRIUM))
     for k in range(search.n_starts):
         frequency = rng.uniform(ends[0], ends[1])
         amplitude = scale * 10 ** rng.uniform(-1.5, 0.5)
@@ -192,7 +192,7 @@ def _starts(
         x = np.zeros((n, model.n_modes))
         x[0] = wells[k % len(wells)].displacement if wells else 0.0
         x[1, j], x[2, j] = amplitude * np.cos(angle), amplitude * np.sin(angle)
-        rows.append((x, float(frequency), "isolated, from a random start"))
+        rows.append((x, float(frequency), Branch.RANDOM_START))
     return rows
 
 
@@ -218,13 +218,13 @@ class _Solutions(NamedTuple):
     """Motions that Newton's method reached inside the range, and how many it did not."""
 
     points: list[np.ndarray]  # scaled
-    origins: list[str]
+    origins: list[Branch]
     n_failed: int
     n_outside: int
 
 
 def _solutions(
-    balance: HarmonicBalance, named: list[tuple[np.ndarray, float, str]], ends: np.ndarray
+    balance: HarmonicBalance, named: list[tuple[np.ndarray, float, Branch]], ends: np.ndarray
 ) -> _Solutions:
     """Newton's method from every start."""
     count = len(named)

@@ -126,7 +126,7 @@ def ranked_effects(effects: Effects) -> list[tuple[str, MainEffect]]:
     return sorted(known, key=lambda pair: -pair[1].share)
 
 
-def effects_frame(found: StudyDigest) -> pd.DataFrame:
+def effects_frame(study: StudyDigest) -> pd.DataFrame:
     """The table that is main_effects.csv: all shares of variance."""
     return pd.DataFrame(
         {
@@ -136,7 +136,7 @@ def effects_frame(found: StudyDigest) -> pd.DataFrame:
             "first_order_share": one.share,
             "half_width_95": one.half_width,
         }
-        for output, effects in found.each_effect
+        for output, effects in study.each_effect
         for name, one in ranked_effects(effects)
     )
 

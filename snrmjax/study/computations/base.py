@@ -1,7 +1,7 @@
 """What is computed for every member of a study, and what comes out of it."""
 
 import abc
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -144,18 +144,21 @@ def joined(parts: Sequence[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
-def one_by_one(
-    computation: AbstractComputation,
-    members: Members,
-    compute: Callable[[Structure, np.ndarray | None, int], dict],
-) -> dict[str, np.ndarray]:
-    """Rows of members that are computed singly; a `ValueError` becomes the member's status."""
-    parts = []
-    for k, model in enumerate(members.models):
-        force = None if members.forces is None else members.forces[k]
-        try:
-            parts.append(compute(jax.device_put(model), force, members.seeds[k]))
-        except ValueError as error:
-            reason = str(error).splitlines()[0]
-            parts.append(with_refused(computation, None, {0: f"refused: {reason}"}))
-    return joined(parts)
+class AbstractSingly(AbstractComputation):
+    """What is computed member by member; a `ValueError` becomes the member's status."""
+
+    @abc.abstractmethod
+    def member(self, model: Structure, force: np.ndarray | None, seed: int) -> dict:
+        """The rows of one member."""
+
+    def rows(self, members: Members) -> dict[str, np.ndarray]:
+        """The rows of all of them."""
+        parts = []
+        for k, model in enumerate(members.models):
+            force = None if members.forces is None else members.forces[k]
+            try:
+                parts.append(self.member(jax.device_put(model), force, members.seeds[k]))
+            except ValueError as error:
+                reason = str(error).splitlines()[0]
+                parts.append(with_refused(self, None, {0: f"refused: {reason}"}))
+        return joined(parts)

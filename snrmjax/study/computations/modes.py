@@ -1,6 +1,5 @@
 """Nonlinear normal modes of the members, and their damped modes."""
 
-import abc
 from typing import ClassVar
 
 import equinox as eqx
@@ -14,10 +13,8 @@ from snrmjax.simulate.solutions.normal_modes import nonlinear_normal_mode
 from snrmjax.study.computations.base import (
     MEMBER,
     TEXT,
-    AbstractComputation,
-    Members,
+    AbstractSingly,
     Output,
-    one_by_one,
 )
 
 _AT = ("point",)
@@ -31,7 +28,7 @@ _SUMMARY = {
 }
 
 
-class AbstractModes(AbstractComputation):
+class AbstractModes(AbstractSingly):
     """A nonlinear mode of every member, point by point."""
 
     members_a_chunk: ClassVar[int] = 32
@@ -41,14 +38,6 @@ class AbstractModes(AbstractComputation):
         """See `AbstractComputation.outputs`."""
         name, unit, meaning = self.further
         return {**_SUMMARY, name: Output(_AT, "f8", unit, meaning)}
-
-    def rows(self, members: Members) -> dict[str, np.ndarray]:
-        """See `AbstractComputation.rows`."""
-        return one_by_one(self, members, self._one)
-
-    @abc.abstractmethod
-    def _one(self, model: Structure, force: np.ndarray | None, seed: int) -> dict:
-        """The rows of one member."""
 
 
 class NormalModes(AbstractModes):
@@ -60,10 +49,11 @@ class NormalModes(AbstractModes):
     to_frequency: float
     harmonic_order: int = eqx.field(static=True, default=9)
 
-    def _one(self, model: Structure, force: np.ndarray | None, seed: int) -> dict:
-        found = nonlinear_normal_mode(model, self.to_frequency, harmonic_order=self.harmonic_order)
-        speed = np.abs(found.velocity[:, 1, 0])
-        return {**_rows(found.status, found.frequency, speed), "point_energy_j": found.energy}
+    def member(self, model: Structure, force: np.ndarray | None, seed: int) -> dict:
+        """See `AbstractSingly.member`."""
+        mode = nonlinear_normal_mode(model, self.to_frequency, harmonic_order=self.harmonic_order)
+        speed = np.abs(mode.velocity[:, 1, 0])
+        return {**_rows(mode.status, mode.frequency, speed), "point_energy_j": mode.energy}
 
 
 class DampedModes(AbstractModes):
@@ -75,12 +65,13 @@ class DampedModes(AbstractModes):
     largest_velocity: float
     harmonic_order: int = eqx.field(static=True, default=9)
 
-    def _one(self, model: Structure, force: np.ndarray | None, seed: int) -> dict:
-        found = damped_normal_mode(model, self.largest_velocity, harmonic_order=self.harmonic_order)
-        rows = _rows(found.status, found.frequency, np.abs(found.velocity[:, 1, 0]))
-        if found.status == CurveStatus.AMPLITUDE_LIMIT:  # which was asked for: a whole mode
+    def member(self, model: Structure, force: np.ndarray | None, seed: int) -> dict:
+        """See `AbstractSingly.member`."""
+        mode = damped_normal_mode(model, self.largest_velocity, harmonic_order=self.harmonic_order)
+        rows = _rows(mode.status, mode.frequency, np.abs(mode.velocity[:, 1, 0]))
+        if mode.status == CurveStatus.AMPLITUDE_LIMIT:  # which was asked for: a whole mode
             rows["status"] = np.array(["largest_velocity"])
-        return {**rows, "point_damping_ratio": found.damping_ratio}
+        return {**rows, "point_damping_ratio": mode.damping_ratio}
 
 
 def _rows(status: CurveStatus, frequency: np.ndarray, speed: np.ndarray) -> dict:

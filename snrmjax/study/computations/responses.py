@@ -25,7 +25,6 @@ from snrmjax.study.computations.base import (
 )
 
 GRID = "frequency_hz"
-_FOLD = ("fold_frequency_hz", "fold_velocity_m_s")
 
 
 class ResponseRange(eqx.Module):
@@ -47,7 +46,48 @@ class ResponseRange(eqx.Module):
         return ResponseSettings(harmonic_order=self.harmonic_order, stability=self.stability)
 
 
-class Peaks(AbstractComputation):
+class AbstractResponses(AbstractComputation):
+    """Forced responses of every member under every force."""
+
+    within: eqx.AbstractVar[ResponseRange]
+    forces: eqx.AbstractVar[OfForces]
+
+    def outputs(self) -> dict[str, Output]:
+        """Peak, resonance and folds of every response."""
+        at = self.forces.dimensions
+        return {
+            "status": Output(at, TEXT, "", "how the curve ended"),
+            "n_points": Output(at, "i4", "1", "points of the curve"),
+            "peak_frequency_hz": Output(at, "f8", "Hz", "frequency of the highest peak"),
+            "peak_velocity_m_s": Output(at, "f8", "m/s", "velocity at the highest peak"),
+            "resonance_frequency_hz": Output(at, "f8", "Hz", "strongest phase resonance"),
+            "resonance_velocity_m_s": Output(at, "f8", "m/s", "velocity at phase resonance"),
+            "n_folds": Output(at, "i4", "1", "folds of the curve"),
+            "n_not_located": Output(at, "i4", "1", "events that are there but were not located"),
+            "fold_frequency_hz": Output(("fold",), "f8", "Hz", "frequency of a fold"),
+            "fold_velocity_m_s": Output(("fold",), "f8", "m/s", "velocity at a fold"),
+        }
+
+    def axes(self) -> dict[str, Axis]:
+        """The forces, where there are several."""
+        return self.forces.axes()
+
+    def traced(
+        self, members: Members
+    ) -> tuple[Sequence[tuple[ResponseCurve, ...]], dict[str, np.ndarray]]:
+        """The curves of every member and force, and what `outputs` has of them."""
+        loads, within = self.forces.of(members), self.within
+        models = [m for m in members.models for _ in range(loads.shape[1])]
+        batch = forced_response_batch(models, loads.ravel(), *within.ends, settings=within.settings)
+        rows = {
+            name: self.forces.shaped(np.asarray(one.values))
+            for name, one in batch.variables().items()
+        }
+        folds = np.concatenate([_at_folds(parts) for parts in batch.curves], axis=1)
+        return batch.curves, {**rows, "fold_frequency_hz": folds[0], "fold_velocity_m_s": folds[1]}
+
+
+class Peaks(AbstractResponses):
     """Highest peak, strongest phase resonance and all folds of every forced response.
 
     A member whose response has no peak between the ends of the range has the status
@@ -67,42 +107,27 @@ class Peaks(AbstractComputation):
     grid_points: int = eqx.field(static=True, default=0)
 
     def outputs(self) -> dict[str, Output]:
-        """See `AbstractComputation.outputs`."""
-        at = self.forces.dimensions
-        named = {
-            "status": Output(at, TEXT, "", "how the curve ended"),
-            "n_points": Output(at, "i4", "1", "points of the curve"),
-            "peak_frequency_hz": Output(at, "f8", "Hz", "frequency of the highest peak"),
-            "peak_velocity_m_s": Output(at, "f8", "m/s", "velocity at the highest peak"),
-            "resonance_frequency_hz": Output(at, "f8", "Hz", "strongest phase resonance"),
-            "resonance_velocity_m_s": Output(at, "f8", "m/s", "velocity at phase resonance"),
-            "n_folds": Output(at, "i4", "1", "folds of the curve"),
-            "n_not_located": Output(at, "i4", "1", "events that are there but were not located"),
-            "fold_frequency_hz": Output(("fold",), "f8", "Hz", "frequency of a fold"),
-            "fold_velocity_m_s": Output(("fold",), "f8", "m/s", "velocity at a fold"),
-        }
+        """Those of responses, and bounds on the grid."""
+        named = super().outputs()
         if self.grid_points:
             for name, which in (("upper", "highest"), ("lower", "lowest")):
                 text = f"{which} velocity of the response at this frequency"
-                named[f"{name}_velocity_m_s"] = Output((*at, GRID), "f8", "m/s", text)
+                dimensions = *self.forces.dimensions, GRID
+                named[f"{name}_velocity_m_s"] = Output(dimensions, "f8", "m/s", text)
         return named
 
     def axes(self) -> dict[str, Axis]:
-        """See `AbstractComputation.axes`."""
-        axes = self.forces.axes()
+        """The forces and the grid."""
+        axes = super().axes()
         if self.grid_points:
             axes[GRID] = Axis(self._grid / HERTZ, "Hz", "frequency of the force")
         return axes
 
     def rows(self, members: Members) -> dict[str, np.ndarray]:
         """See `AbstractComputation.rows`."""
-        curves, summary = traced_members(self.within, self.forces, members)
-        folds = [_at_folds(parts) for parts in curves]
-        summary["status"] = np.array(
-            [peak_status(*one) for one in zip(curves, summary["status"].tolist(), strict=True)]
-        )
-        rows = {name: self.forces.shaped(values) for name, values in summary.items()}
-        rows |= dict(zip(_FOLD, np.concatenate(folds, axis=1), strict=True))
+        curves, rows = self.traced(members)
+        ends = zip(curves, rows["status"].ravel().tolist(), strict=True)
+        rows["status"] = self.forces.shaped(np.array([peak_status(*one) for one in ends]))
         if self.grid_points:
             bounds = np.array([velocity_bounds(parts, self._grid) for parts in curves])
             rows["upper_velocity_m_s"] = self.forces.shaped(bounds[:, 1])
@@ -114,7 +139,7 @@ class Peaks(AbstractComputation):
         return np.linspace(*self.within.ends, self.grid_points)
 
 
-class Curves(AbstractComputation):
+class Curves(AbstractResponses):
     """Whole forced responses, unstable parts included, point by point.
 
     `forces` in N; None: `force_n` varies.
@@ -127,10 +152,10 @@ class Curves(AbstractComputation):
     forces: OfForces = eqx.field(default=None, converter=of_forces)
 
     def outputs(self) -> dict[str, Output]:
-        """See `AbstractComputation.outputs`."""
+        """Those of responses, and their points."""
         at = ("point",)
         return {
-            **Peaks(self.within, self.forces).outputs(),
+            **super().outputs(),
             "point_frequency_hz": Output(at, "f8", "Hz", "frequency of the force"),
             "point_velocity_re_m_s": Output(at, "f8", "m/s", "velocity in phase with the force"),
             "point_velocity_im_m_s": Output(at, "f8", "m/s", "velocity a quarter period ahead"),
@@ -138,39 +163,21 @@ class Curves(AbstractComputation):
             "point_branch": Output(at, "i1", "1", "number of the branch: a response may have two"),
         }
 
-    def axes(self) -> dict[str, Axis]:
-        """See `AbstractComputation.axes`."""
-        return self.forces.axes()
-
     def rows(self, members: Members) -> dict[str, np.ndarray]:
         """See `AbstractComputation.rows`."""
-        curves, summary = traced_members(self.within, self.forces, members)
-        folds = np.concatenate([_at_folds(parts) for parts in curves], axis=1)
-        every = [(branch, one) for parts in curves for branch, one in enumerate(parts)]
-        velocity = np.concatenate([one.velocity[:, 1, 0] for _, one in every])
+        curves, rows = self.traced(members)
+        branches = [part for parts in curves for part in parts]
+        number = [branch for parts in curves for branch in range(len(parts))]
+        sizes = [len(part.frequency) for part in branches]
+        velocity = np.concatenate([part.velocity[:, 1, 0] for part in branches])
         return {
-            **{name: self.forces.shaped(values) for name, values in summary.items()},
-            "fold_frequency_hz": folds[0],
-            "fold_velocity_m_s": folds[1],
-            "point_frequency_hz": np.concatenate([one.frequency for _, one in every]) / HERTZ,
+            **rows,
+            "point_frequency_hz": np.concatenate([part.frequency for part in branches]) / HERTZ,
             "point_velocity_re_m_s": velocity.real,
             "point_velocity_im_m_s": velocity.imag,
-            "point_stability": np.concatenate([one.stability for _, one in every]).astype("i1"),
-            "point_branch": np.concatenate([np.full(len(o.frequency), b) for b, o in every]).astype(
-                "i1"
-            ),
+            "point_stability": np.concatenate([part.stability for part in branches]).astype("i1"),
+            "point_branch": np.repeat(number, sizes).astype("i1"),
         }
-
-
-def traced_members(
-    within: ResponseRange, forces: OfForces, members: Members
-) -> tuple[Sequence[tuple[ResponseCurve, ...]], dict[str, np.ndarray]]:
-    """The curves of every member and force, and their summary by the names of the store."""
-    loads = forces.of(members)
-    models = [m for m in members.models for _ in range(loads.shape[1])]
-    batch = forced_response_batch(models, loads.ravel(), *within.ends, settings=within.settings)
-    columns = {name: np.asarray(one.values) for name, one in batch.variables().items()}
-    return batch.curves, columns
 
 
 def peak_status(curves: Sequence[ResponseCurve], status: str) -> str:
@@ -233,6 +240,6 @@ def bounds_over(
 
 def _at_folds(curves: Sequence[ResponseCurve]) -> Float[np.ndarray, "quantity fold"]:
     """Frequency in Hz and velocity in m/s of all folds of a response."""
-    found = [(one, one.at_events("fold")) for one in curves]
-    frequency = np.concatenate([one.frequency[at] for one, at in found]) / HERTZ
-    return np.array([frequency, np.concatenate([np.abs(c.velocity[at, 1, 0]) for c, at in found])])
+    folds = [(curve, curve.at_events("fold")) for curve in curves]
+    frequency = np.concatenate([curve.frequency[at] for curve, at in folds]) / HERTZ
+    return np.array([frequency, np.concatenate([np.abs(c.velocity[at, 1, 0]) for c, at in folds])])

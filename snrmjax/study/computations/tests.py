@@ -17,11 +17,9 @@ from snrmjax.simulate.virtual_test.recording import NO_ERRORS, MeasurementErrors
 from snrmjax.study.computations.base import (
     MEMBER,
     TEXT,
-    AbstractComputation,
+    AbstractSingly,
     Axis,
-    Members,
     Output,
-    one_by_one,
 )
 from snrmjax.study.computations.responses import ResponseRange
 
@@ -40,7 +38,7 @@ _FOUND = {
 }
 
 
-class AbstractIdentified(AbstractComputation):
+class AbstractIdentified(AbstractSingly):
     """Backbone and damping by the pointwise inverse method, at shares of the amplitude range."""
 
     def outputs(self) -> dict[str, Output]:
@@ -54,8 +52,8 @@ class AbstractIdentified(AbstractComputation):
 
     def identified(self, data: SteadyStates, model: Structure) -> dict[str, np.ndarray]:
         """One member's row."""
-        found: Identification = identify_backbone(data, model)
-        backbone, status = found.backbone, np.asarray(found.points.status)
+        identification: Identification = identify_backbone(data, model)
+        backbone, status = identification.backbone, np.asarray(identification.points.status)
         values = backbone.sampled(_POINTS)
         row = {
             "velocity_m_s": values.velocity,
@@ -86,11 +84,8 @@ class VirtualTests(AbstractIdentified):
     errors: MeasurementErrors = NO_ERRORS
     points_per_level: int = eqx.field(static=True, default=5)
 
-    def rows(self, members: Members) -> dict[str, np.ndarray]:
-        """See `AbstractComputation.rows`."""
-        return one_by_one(self, members, self._one)
-
-    def _one(self, model: Structure, force: np.ndarray | None, seed: int) -> dict:
+    def member(self, model: Structure, force: np.ndarray | None, seed: int) -> dict:
+        """See `AbstractSingly.member`."""
         test = phase_resonance_test(
             *(model, self.levels, *self.within.ends),
             points_per_level=self.points_per_level,
@@ -107,15 +102,12 @@ class Identifications(AbstractIdentified):
 
     data: SteadyStates
 
-    def rows(self, members: Members) -> dict[str, np.ndarray]:
-        """See `AbstractComputation.rows`."""
-        return one_by_one(self, members, self._one)
-
-    def _one(self, model: Structure, force: np.ndarray | None, seed: int) -> dict:
+    def member(self, model: Structure, force: np.ndarray | None, seed: int) -> dict:
+        """See `AbstractSingly.member`."""
         return self.identified(self.data, model)
 
 
-class Diagnoses(AbstractComputation):
+class Diagnoses(AbstractSingly):
     """The same measured steady states diagnosed against the model of every member."""
 
     kind: ClassVar[str] = "diagnose"
@@ -135,18 +127,15 @@ class Diagnoses(AbstractComputation):
             "gap_after": Output(at, "f8", "1", "the same with the effects"),
         }
 
-    def rows(self, members: Members) -> dict[str, np.ndarray]:
-        """See `AbstractComputation.rows`."""
-        return one_by_one(self, members, self._one)
-
-    def _one(self, model: Structure, force: np.ndarray | None, seed: int) -> dict:
-        found = diagnose_model(model, self.data)
-        name = "+".join(found.effects)
+    def member(self, model: Structure, force: np.ndarray | None, seed: int) -> dict:
+        """See `AbstractSingly.member`."""
+        diagnosis = diagnose_model(model, self.data)
+        name = "+".join(diagnosis.effects)
         return {
             "status": np.array(["answered"]),
-            "verdict": np.array([str(found.verdict.value)]),
+            "verdict": np.array([str(diagnosis.verdict.value)]),
             "effects": np.array([name]),
-            "probability": np.array([found.probabilities.get(name or "none", np.nan)]),
-            "gap_before": np.array([found.gap.before]),
-            "gap_after": np.array([found.gap.after]),
+            "probability": np.array([diagnosis.probabilities.get(name or "none", np.nan)]),
+            "gap_before": np.array([diagnosis.gap.before]),
+            "gap_after": np.array([diagnosis.gap.after]),
         }

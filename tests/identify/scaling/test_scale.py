@@ -4,10 +4,13 @@ import numpy as np
 import pytest
 from truths.modal_structures import HERTZ, base_response, chain, receptance
 
-from snrmjax.identify.modal.base_motion import relative_to_base
 from snrmjax.identify.modal.linear_fit import fit_linear_modes
-from snrmjax.identify.modal.modes_of_tests import find_modes
-from snrmjax.identify.modal.state_responses import levels_by_velocity, responses_of_states
+from snrmjax.identify.modal.modes_of_tests import (
+    find_modes,
+    levels_by_velocity,
+    relative_to_base,
+    responses_of_states,
+)
 from snrmjax.identify.scaling.scale import (
     AddedMassTest,
     Calibration,

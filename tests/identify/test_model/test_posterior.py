@@ -7,7 +7,7 @@ import pytest
 from truths.exact_states import CONSTANT, damping, squared
 
 from snrmjax.identify.test_model import states as measured
-from snrmjax.identify.test_model.posterior import few_levels_factor, fit_test
+from snrmjax.identify.test_model.posterior import fit_test, students_factor
 from snrmjax.identify.test_model.walk import Rounds
 from snrmjax.numerics.blocks import on_one_core
 
@@ -195,7 +195,7 @@ def test_few_levels_widen_a_band_as_students_t_does(n_levels):
     """Means of draws whose spread is found from them: 95 % of 20 000 lie inside."""
     draws = np.random.default_rng(n_levels).normal(size=(20000, n_levels))
     spread = draws.std(axis=1, ddof=1)
-    band = 1.96 * few_levels_factor(n_levels) * spread / np.sqrt(n_levels)
+    band = 1.96 * students_factor(n_levels - 1) * spread / np.sqrt(n_levels)
     # Two levels count as three: t = 4.303 of one degree of freedom holds 85.5 %.
     wanted = 2 / np.pi * np.arctan(4.303) if n_levels == 2 else 0.95
     assert np.mean(np.abs(draws.mean(axis=1)) < band) == pytest.approx(wanted, abs=0.006)

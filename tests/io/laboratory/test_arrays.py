@@ -289,3 +289,15 @@ def test_blanks_without_their_bytes(tmp_path):
     assert scipy.io.loadmat(path)["note"].tolist() == [" "]
     (table,) = read_laboratory_file(path).tables
     np.testing.assert_array_equal(table.columns["frequency"], HERTZ)
+
+
+def test_elements_of_no_type_are_refused(tmp_path):
+    """Zeros where an element begins: within scipy they end the process."""
+    path = tmp_path / "zeros.mat"
+    scipy.io.savemat(path, {"frequency": HERTZ, "H": HERTZ + 1j})
+    content = bytearray(path.read_bytes())
+    at = content.index(HERTZ.tobytes()) - 8
+    content[at : at + 8] = bytes(8)
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"zeros\.mat is damaged .*type 0"):
+        read_laboratory_file(path)

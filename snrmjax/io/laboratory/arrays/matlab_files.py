@@ -1,5 +1,6 @@
 """MATLAB files: v4 to v7 by scipy, v7.3 by h5py."""
 
+import struct
 import warnings
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from snrmjax.io.laboratory.contents import LaboratoryFile
 from snrmjax.io.laboratory.libraries import damaged_if_it_fails
 from snrmjax.numerics.facts import Fact
 
+_MATRIX, _COMPRESSED = 14, 15  # types of elements
 _LARGEST = 2**29  # bytes of a file before v7.3, which is read whole, and numbers of its variables
 
 
@@ -46,12 +48,32 @@ def _tree_of_old(path: Path) -> tuple[dict[str, Node], list[Fact]]:
         for name, sides, _ in scipy.io.whosmat(path):
             if np.prod(sides, dtype=float) > _LARGEST:
                 raise ValueError(f"{name} states {' by '.join(map(str, sides))} numbers")
+        content = path.read_bytes()
+        if content.startswith(b"MATLAB 5"):
+            _check_elements(memoryview(content)[128:], "<" if content[126:128] == b"IM" else ">")
         loaded: dict[str, Any] = scipy.io.loadmat(path, mat_dtype=False)
     notes: list[Fact] = []
     nodes = {
         key: _node(variable, key, notes) for key, variable in loaded.items() if key[:2] != "__"
     }
     return {key: node for key, node in nodes.items() if node is not None}, notes
+
+
+def _check_elements(content: memoryview, order: str) -> None:
+    """Raises `ValueError` for an element of no known type, which ends the process within scipy.
+
+    What is compressed has a checksum of its own.
+    """
+    at = 0
+    while at + 8 <= len(content):
+        kind, size = struct.unpack_from(f"{order}II", content, at)
+        if kind >> 16:  # a small one, within its tag
+            kind, size = kind & 0xFFFF, 0
+        if not 1 <= kind <= 18:
+            raise ValueError(f"it has an element of the type {kind}")
+        if kind == _MATRIX:
+            _check_elements(content[at + 8 : at + 8 + size], order)
+        at += 8 + (size if kind == _COMPRESSED else -(-size // 8) * 8)
 
 
 def _node(value: Any, name: str, notes: list[Fact]) -> Node | None:

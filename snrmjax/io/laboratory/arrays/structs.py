@@ -7,7 +7,7 @@ import numpy as np
 
 from snrmjax.io.laboratory.arrays.records import recording_of
 from snrmjax.io.laboratory.arrays.value_tree import Node, Numbers, held
-from snrmjax.io.laboratory.contents import Kind, LaboratoryFile, NumberTable, number_table
+from snrmjax.io.laboratory.contents import Kind, LaboratoryFile, NumberTable
 from snrmjax.io.laboratory.names import role_of
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses, frequency_responses
@@ -20,36 +20,25 @@ _MOST_NAMED = 6
 _WIDEST = 64  # columns of a matrix that become columns of a table
 
 
-class Columns(NamedTuple):
-    """A table to be: columns of one length with their units."""
-
-    values: dict[str, np.ndarray]
-    units: dict[str, str]
-    words: dict[str, tuple[str, ...]]
-
-
 class Struct(NamedTuple):
     """What a struct holds; tables by their place below it."""
 
     recordings: list[TimeRecording]
     responses: list[FrequencyResponses]
-    tables: dict[str, Columns]
+    tables: dict[str, NumberTable]  # without names
     notes: list[Fact]
 
     def numbered(self) -> tuple[NumberTable, ...]:
-        """The tables, checked."""
-        return tuple(
-            number_table(name or "table", columns.values, columns.units, columns.words)
-            for name, columns in self.tables.items()
-        )
+        """The tables by name."""
+        return tuple(table._replace(name=name or "table") for name, table in self.tables.items())
 
     def add(self, key: str, below: "Struct") -> None:
         """Take in what a field holds."""
         self.recordings.extend(below.recordings)
         self.responses.extend(below.responses)
         self.notes.extend(note for note in below.notes if note not in self.notes)
-        for place, columns in below.tables.items():
-            self.tables[f"{key}.{place}" if place else key] = columns
+        for place, table in below.tables.items():
+            self.tables[f"{key}.{place}" if place else key] = table
 
 
 def file_of_tree(
@@ -110,36 +99,36 @@ def _entries(name: str, structs: Sequence[Mapping[str, Node]]) -> Struct:
         raise ValueError(f"{name} is a list of {len(structs)} entries, more than {_MOST_ENTRIES}.")
     several = len(structs) > 1
     contents = Struct([], [], {}, [])
-    parts: dict[str, list[tuple[int, Columns]]] = {}
+    parts: dict[str, list[tuple[int, NumberTable]]] = {}
     for k, fields in enumerate(structs, 1):
         below = read_struct(f"{name}({k})" if several else name, fields, entry=several)
         contents.add("", below._replace(tables={}))
-        for place, columns in below.tables.items():
-            parts.setdefault(place, []).append((k, columns))
-    for place, rows in parts.items():
-        contents.tables[place] = _joined(rows) if several else rows[0][1]
+        for place, table in below.tables.items():
+            parts.setdefault(place, []).append((k, table))
+    for place, numbered in parts.items():
+        contents.tables[place] = _joined(numbered) if several else numbered[0][1]
     return contents
 
 
-def _joined(parts: Sequence[tuple[int, Columns]]) -> Columns:
+def _joined(parts: Sequence[tuple[int, NumberTable]]) -> NumberTable:
     """Tables of several entries under one another; NaN where an entry lacks a column."""
-    names = list(dict.fromkeys(key for _, table in parts for key in table.values))
-    sized = [(len(next(iter(table.values.values()))), table) for _, table in parts]
-    entry = np.repeat([float(k) for k, _ in parts], [n for n, _ in sized])
-    values = {"entry" if "entry" not in names else "entry number": entry}
+    tables = [table for _, table in parts]
+    names = list(dict.fromkeys(key for table in tables for key in table.columns))
+    entry = np.repeat([float(k) for k, _ in parts], [table.n_rows for table in tables])
+    columns = {"entry" if "entry" not in names else "entry number": entry}
     units: dict[str, str] = {}
     for key in names:
-        values[key] = np.concatenate(
-            [table.values.get(key, np.full(n, np.nan)) for n, table in sized]
+        columns[key] = np.concatenate(
+            [table.columns.get(key, np.full(table.n_rows, np.nan)) for table in tables]
         )
-        stated = [table.units[key] for _, table in sized if key in table.units]
+        stated = [table.units[key] for table in tables if key in table.units]
         units |= {key: stated[0]} if stated else {}
-    texts = dict.fromkeys(key for _, table in sized for key in table.words if key not in values)
     words = {
-        key: tuple(word for n, table in sized for word in table.words.get(key, ("",) * n))
-        for key in texts
+        key: tuple(word for table in tables for word in table.words.get(key, ("",) * table.n_rows))
+        for key in dict.fromkeys(key for table in tables for key in table.words)
+        if key not in columns
     }
-    return Columns(values, units, words)
+    return NumberTable("", columns, units, words)
 
 
 def _read_numbers(
@@ -181,7 +170,8 @@ def _read_numbers(
             if (len(word) == n or (entry and len(word) == 1)) and key not in columns
         }
         in_order = {key: columns[key] for key in (*group, *repeated)}
-        contents.tables["" if len(groups) == 1 else f"rows{n}"] = Columns(in_order, units, texts)
+        place = "" if len(groups) == 1 else f"rows{n}"
+        contents.tables[place] = NumberTable("", in_order, units, texts)
 
 
 def _spread(

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from snrmjax.io.laboratory.contents import LaboratoryFile, NumberTable, number_table
+from snrmjax.io.laboratory.contents import LaboratoryFile, NumberTable
 from snrmjax.io.laboratory.uff.abscissa import abscissa, even_abscissa
 from snrmjax.io.laboratory.uff.axis_units import UnitSystem, axis_unit, unit_system
 from snrmjax.io.laboratory.uff.data_sets import direction_of, read_data_sets, stated
@@ -226,4 +226,4 @@ def _table(
         units |= {key: channel.unit} if channel.unit else {}
     if level := group[0]["z_axis_value"]:
         columns["z_axis_value"] = np.full(len(group[0]["x"]), float(level))
-    return number_table(name, columns, units)
+    return NumberTable(name, columns, units)
