@@ -44,7 +44,7 @@ _MEANINGS = {
 }
 
 
-class Correction(NamedTuple):
+class ImportCorrection(NamedTuple):
     """How a table is read again, relative to how it was read: what options of an import say."""
 
     response: float = 1.0  # factor of the velocities
@@ -69,7 +69,7 @@ class Finding(NamedTuple):
     evidence: Fact | str
     advice: Fact | str  # the line or option that mends it
     rows: tuple[int, ...] = ()
-    corrections: tuple[Correction, ...] = ()  # that an import can do, the likeliest first
+    corrections: tuple[ImportCorrection, ...] = ()  # that an import can do, the likeliest first
     title: Fact | None = None  # where the kind is wider than what was found
 
     @property

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
-from snrmjax.doctor.findings import Correction, Finding, Kind
+from snrmjax.doctor.findings import Finding, ImportCorrection, Kind
 from snrmjax.doctor.judgement import CheckedStates, Judged, Scale, any_mass, judge
 from snrmjax.doctor.priors import CLEARLY, MODAL_MASS, OTHER_SCALE, SCATTER
 from snrmjax.identify.test_model.states import TestStates
@@ -23,7 +23,7 @@ class Meaning(NamedTuple):
     name: str
     change: Callable[[Phasors, Float[np.ndarray, " state"]], Phasors]  # of V and Ω
     kind: Kind | None  # None as recorded
-    correction: Correction | None = None
+    correction: ImportCorrection | None = None
     log_jacobian: float = 0.0  # of a recorded phasor's logarithm to the one that is read
 
 
@@ -33,7 +33,7 @@ _PHASE: Kind = "conjugated_response"
 _UNIT: Kind = "degrees_for_radians"
 AS_RECORDED = Meaning("as_recorded", lambda v, _: v, None)
 OPPOSITE = Meaning("opposite", lambda v, _: -v, "shape_not_mass_normalised")
-CONJUGATED = Meaning("conjugated", lambda v, _: v.conj(), _PHASE, Correction(conjugate=True))
+CONJUGATED = Meaning("conjugated", lambda v, _: v.conj(), _PHASE, ImportCorrection(conjugate=True))
 OTHERS = (
     OPPOSITE,
     CONJUGATED,
@@ -42,15 +42,18 @@ OTHERS = (
         "acceleration",
         lambda v, w: v / (1j * w),
         _ACCELERATION,
-        Correction(quantity="acceleration"),
+        ImportCorrection(quantity="acceleration"),
     ),
     Meaning(
-        "displacement", lambda v, w: v * 1j * w, _DISPLACEMENT, Correction(quantity="displacement")
+        "displacement",
+        lambda v, w: v * 1j * w,
+        _DISPLACEMENT,
+        ImportCorrection(quantity="displacement"),
     ),
     Meaning(
         "radians_as_degrees",
         lambda v, _: np.abs(v) * np.exp(1j * _DEGREES * np.angle(v)),
-        *(_UNIT, Correction(phase_unit="rad"), float(np.log(_DEGREES))),
+        *(_UNIT, ImportCorrection(phase_unit="rad"), float(np.log(_DEGREES))),
     ),
 )
 OF_SIZES = (
@@ -61,7 +64,7 @@ OF_SIZES = (
 IN_DEGREES = Meaning(
     "degrees_as_radians",
     lambda v, _: v,
-    *(_UNIT, Correction(phase_unit="deg"), -float(np.log(_DEGREES))),
+    *(_UNIT, ImportCorrection(phase_unit="deg"), -float(np.log(_DEGREES))),
 )
 
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from snrmjax.doctor.findings import Correction, Finding, Severity
+from snrmjax.doctor.findings import Finding, ImportCorrection, Severity
 from snrmjax.doctor.judgement import Judged, Scale, judge
 from snrmjax.doctor.priors import BAND, CERTAIN, MODAL_MASS, MORE_DAMPING, OTHER_SCALE
 from snrmjax.identify.test_model.states import TestStates
@@ -43,7 +43,9 @@ def scale_findings(
     if abs(abs(off) - 0.5 * np.log(2)) < near:
         column = "response" if off > 0 else "force"
         evidence, advice = Fact("rms", scale=size, column=column), Fact("advice_rms", column=column)
-        correction = Correction(response=2**0.5) if off > 0 else Correction(force=2**0.5)
+        correction = (
+            ImportCorrection(response=2**0.5) if off > 0 else ImportCorrection(force=2**0.5)
+        )
         return [
             Finding("rms_for_peak", "error", where, evidence, advice, corrections=(correction,))
         ]
@@ -66,7 +68,7 @@ def scale_findings(
     if of_force >= of_shape:
         evidence = Fact("voltage_for_force", scale=size, gain=kappa)
         volts = Finding("volts_as_force", severity, where, evidence, Fact("advice_voltage"))
-        found.append(volts._replace(corrections=(Correction(force_unit="V"),)))
+        found.append(volts._replace(corrections=(ImportCorrection(force_unit="V"),)))
     if of_shape >= of_force:
         evidence, advice = Fact("shape_scale", scale=size), Fact("advice_shape", factor=kappa**0.5)
         found.append(Finding("shape_not_mass_normalised", severity, where, evidence, advice))
@@ -82,13 +84,13 @@ class _MixedUnit(NamedTuple):
     mass: float  # over the model's
 
     @property
-    def correction(self) -> Correction:
+    def correction(self) -> ImportCorrection:
         """Reading with the right unit."""
         written = {"m/s²": "m/s2", "µm": "um", "inches": "in", "pounds": "lbf"}
         unit = written.get(self.unit, self.unit)
         if self.column == "force":
-            return Correction(force=1 / self.mass, force_unit=unit)
-        return Correction(response=self.mass, unit=unit)
+            return ImportCorrection(force=1 / self.mass, force_unit=unit)
+        return ImportCorrection(response=self.mass, unit=unit)
 
 
 def _mixed_units() -> Iterator[_MixedUnit]:
@@ -166,4 +168,4 @@ def shaker_damping(fit: Judged, model: Structure, where: str) -> list[Finding]:
         return []
     evidence = Fact("shaker_damping", ratio=float(times.min()), frequency_off=abs(away))
     volts = Finding("volts_as_force", "warning", where, evidence, Fact("advice_shaker_damping"))
-    return [volts._replace(corrections=(Correction(force_unit="V"),))]
+    return [volts._replace(corrections=(ImportCorrection(force_unit="V"),))]

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from snrmjax.doctor.check import check_test
-from snrmjax.doctor.findings import Checkup, Correction, Finding
+from snrmjax.doctor.findings import Checkup, Finding, ImportCorrection
 from snrmjax.io.exchange.import_map import ImportMap, read_import_map
 from snrmjax.io.files import FilePath
 from snrmjax.io.laboratory.checkups import read_recordings
@@ -90,10 +90,10 @@ def is_certain(one: Finding) -> bool:
     return bool(_options_of_own(correction)) and correction.force_unit != "V"
 
 
-def _joined(findings: Sequence[Finding]) -> Correction:
+def _joined(findings: Sequence[Finding]) -> ImportCorrection:
     """Several findings' corrections as one; each was found with the others' errors mended."""
     every = [finding.corrections[0] for finding in findings]
-    return Correction(
+    return ImportCorrection(
         response=math.prod(one.response for one in every),
         force=math.prod(one.force for one in every),
         unit="".join(one.unit for one in every),
@@ -103,7 +103,7 @@ def _joined(findings: Sequence[Finding]) -> Correction:
     )
 
 
-def _command(correction: Correction, read: FilesRead) -> str:
+def _command(correction: ImportCorrection, read: FilesRead) -> str:
     """The import that does a correction; empty where no options of it can."""
     own = read.map_file is None
     options = _options_of_own(correction) if own else _options_of_laboratory(correction, read.told)
@@ -117,7 +117,7 @@ def _command(correction: Correction, read: FilesRead) -> str:
     return f"`{' '.join(quoted)}`"
 
 
-def _options_of_own(correction: Correction) -> list[str]:
+def _options_of_own(correction: ImportCorrection) -> list[str]:
     """Options that read our own table as what it is; none where it does not hold enough."""
     if correction.force_unit == "V":
         return ["--force-unit", "V"]
@@ -130,7 +130,7 @@ def _options_of_own(correction: Correction) -> list[str]:
     return [*words, *(["--phase-sign", "lag"] if correction.conjugate else [])]
 
 
-def _options_of_laboratory(correction: Correction, told: ImportMap) -> list[str]:
+def _options_of_laboratory(correction: ImportCorrection, told: ImportMap) -> list[str]:
     """Likewise of a laboratory's files by a map: where the units that a finding names are all."""
     kinds = {response.quantity for response in told.responses}
     named = correction.response == 1 or correction.unit

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 import snrmjax as sj
 from snrmjax.cli import app
-from snrmjax.doctor.findings import Checkup, Correction, Finding
+from snrmjax.doctor.findings import Checkup, Finding, ImportCorrection
 from snrmjax.io.exchange.import_map import ImportMap, ResponseMap
 from snrmjax.pipelines import check as mends
 
@@ -144,14 +144,14 @@ def test_two_errors_of_which_one_needs_the_other_are_mended_at_once(folder):
 @pytest.mark.parametrize(
     ("correction", "options"),
     [
-        (Correction(response=9.80665, unit="g"), "--unit g"),
-        (Correction(force=4.4482216, force_unit="lbf"), "--force-unit lbf"),
-        (Correction(force_unit="V"), "--force-unit V"),
-        (Correction(conjugate=True), "--phase-sign lag"),
-        (Correction(phase_unit="rad"), "--phase-unit rad"),
-        (Correction(response=1e-3, unit="mm"), ""),  # no unit of an acceleration
-        (Correction(response=2**0.5), ""),  # nor one by name
-        (Correction(quantity="displacement"), ""),  # which its columns state
+        (ImportCorrection(response=9.80665, unit="g"), "--unit g"),
+        (ImportCorrection(force=4.4482216, force_unit="lbf"), "--force-unit lbf"),
+        (ImportCorrection(force_unit="V"), "--force-unit V"),
+        (ImportCorrection(conjugate=True), "--phase-sign lag"),
+        (ImportCorrection(phase_unit="rad"), "--phase-unit rad"),
+        (ImportCorrection(response=1e-3, unit="mm"), ""),  # no unit of an acceleration
+        (ImportCorrection(response=2**0.5), ""),  # nor one by name
+        (ImportCorrection(quantity="displacement"), ""),  # which its columns state
     ],
 )
 def test_options_of_a_laboratorys_files_are_those_of_their_map(correction, options):
