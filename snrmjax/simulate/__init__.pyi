@@ -21,7 +21,7 @@ from .solutions.time_integration import (
     IntegrationAccuracy,
     MotionStatus,
     settled_motion,
-    stepped_sine,
+    stepped_motions,
 )
 from .virtual_test.controlled_test import phase_controlled_test
 from .virtual_test.equipment import Instruments, Shaker
@@ -81,7 +81,7 @@ __all__ = [
     "settled_motion",
     "solve_at_frequency",
     "steady_states_of",
-    "stepped_sine",
+    "stepped_motions",
     "stepped_sine_test",
     "velocity_phasors",
 ]

@@ -170,6 +170,83 @@ def swapped(old, new, content=MODEL):
     return content.replace(old, new, 1)
 
 
+# What the frequency of mode 1 is not, and what is expected.
+NO_FREQUENCIES = {
+    **dict.fromkeys(['"79.02"', '""', "true", "2024-01-01", "[79.02]"], "a number"),
+    **dict.fromkeys(["nan", "inf", "1" + "0" * 400, "0x" + "F" * 5000], "a finite number"),
+    **dict.fromkeys(["-3.2", "0"], "positive"),
+    "1.5e308": "below 1e300 Hz",
+}
+# What other numbers are not: the line, what it becomes, the place, and what is expected.
+OUT_OF_RANGE = [
+    ("damping_ratio = 0.05", "damping_ratio = -0.05", "mode 1", "from 0 to below 1"),
+    ("damping_ratio = 0.05", "damping_ratio = 1.0", "mode 1", "from 0 to below 1"),
+    ("participation = -108.5", "participation = 0", "mode 2", "other than zero"),
+    ("participation = 247.8", "participation = -inf", "mode 1", "a finite number"),
+    ("participation = 1.5", "participation = 0.0", "rigid_body_mode 1", "other than zero"),
+    ("frequency_std_hz = 0.02", "frequency_std_hz = -0.02", "mode 1", "zero or positive"),
+    ("damping_ratio_std = 0.001", "damping_ratio_std = -1", "mode 1", "zero or positive"),
+    ("std = 1e10", "std = -1.0", "monomial '1111' in [potential]", "zero or positive"),
+    ("level_gain_std = 0.01", "level_gain_std = -0.01", "[measurement]", "zero or positive"),
+    ("tip = -3", "tip = inf", "the shape of mode 1", "a finite number"),
+    ("tip = -3", 'tip = "x"', "the shape of mode 1", "a number"),
+    ("112 = -2.5e6", '112 = "-2.5e6"', "[potential]", "a number"),
+    ("coefficient = 3.4e12", "coefficient = nan", "monomial '1111' in [potential]", "finite"),
+    ("stiffness = 1000", 'stiffness = "stiff"', "effect 2", "a number"),
+    ("stiffness = 1000", "stiffness = inf", "effect 2", "a finite number"),
+]
+# A line that is missing, and the place that lacks its key.
+MISSING = {
+    "frequency_hz = 79.02\n": "mode 1 of",
+    "damping_ratio = 0\n": "mode 2 of",
+    "participation = 247.8\n": "mode 1 of",
+    "shape = { tip = 0.0, midspan = -10.5 }\n": "mode 2 of",
+    "participation = 1.5\n": "rigid_body_mode 1 of",
+    "coefficient = 3.4e12, ": "monomial '1111'",
+    "stiffness = 1000\n": "(gap_stiffness)",
+}
+# A key, how it is misspelt, and the place of it.
+MISSPELT = [
+    ("damping_ratio =", "dampin_ratio =", "mode 1 of"),
+    ("frequency_hz =", "frequency_rad_s =", "mode 1 of"),
+    ("frequency_hz =", "frequency =", "mode 1 of"),
+    ("frequency_std_hz =", "frequency_std =", "mode 1 of"),
+    ("level_phase_std_deg =", "level_phase_std =", "[measurement] of"),
+    (" std =", " sdt =", "monomial '1111'"),
+    ("stiffness =", "stifness =", "effect 2 of model.toml (gap_stiffness)"),
+    ("potential", "potentials", "model.toml"),
+]
+
+
+@pytest.mark.parametrize("value", NO_FREQUENCIES)
+def test_refuses_what_is_no_frequency(tmp_path, value, check_message):
+    with pytest.raises(ValueError, match="`frequency_hz` must be") as error:
+        read(tmp_path, swapped("79.02", value))
+    check_message(error, [NO_FREQUENCIES[value], "mode 1 of model.toml has"])
+
+
+@pytest.mark.parametrize(("line", "other", "place", "expected"), OUT_OF_RANGE)
+def test_refuses_numbers_out_of_range(tmp_path, line, other, place, expected, check_message):
+    with pytest.raises(ValueError, match=f"`{line.partition(' ')[0]}` must be") as error:
+        read(tmp_path, swapped(line, other))
+    check_message(error, [expected, f"{place} of model.toml"])
+
+
+@pytest.mark.parametrize("line", MISSING)
+def test_refuses_a_missing_key(tmp_path, line, check_message):
+    with pytest.raises(ValueError, match=f"lacks the key `{line.partition(' ')[0]}`") as error:
+        read(tmp_path, swapped(line, ""))
+    check_message(error, [MISSING[line], "model.toml"])
+
+
+@pytest.mark.parametrize(("key", "other", "place"), MISSPELT)
+def test_refuses_a_misspelt_key_and_says_which_is_meant(tmp_path, key, other, place, check_message):
+    word, meant = (name.strip(" =") for name in (other, key))
+    with pytest.raises(ValueError, match=f"unknown key '{word}'") as error:
+        read(tmp_path, swapped(key, other))
+    check_message(error, [place, f"did you mean `{meant}`"])
+
+
 BAD = {
     "empty": ("", ["model.toml", "at least one mode with a shape", "[[mode]]"]),
     "no mode": ('name = "x"\n[potential]\n111 = 1\n', ["model.toml", "at least one mode"]),
@@ -188,126 +265,15 @@ BAD = {
     "endless number": (swapped("79.02", "9" * 5000), ["model.toml", "too many digits"]),
     "NUL bytes": (MODEL.encode() + b"\0", ["model.toml", "not a UTF-8 text"]),
     "Latin-1": (b"# \xfc\n" + MODEL.encode(), ["model.toml", "not a UTF-8 text"]),
-    "unknown table": (
-        swapped("[potential]", "[potentials]"),
-        ["model.toml", "'potentials'", "did you mean `potential`"],
-    ),
     "unknown list": (
         MODEL.replace("[[effect]]", "[[effects]]"),
         ["model.toml", "'effects'", "did you mean `effect`"],
     ),
     "unknown key at the top": (swapped("name", "title"), ["model.toml", "unknown key 'title'"]),
-    "unknown key of a mode": (
-        swapped("damping_ratio = 0.05", "dampin_ratio = 0.05"),
-        ["mode 1 of model.toml", "'dampin_ratio'", "did you mean `damping_ratio`"],
-    ),
-    "frequency in rad/s": (
-        swapped("frequency_hz = 427", "frequency_rad_s = 2683"),
-        ["mode 2 of model.toml", "'frequency_rad_s'", "did you mean `frequency_hz`"],
-    ),
-    "frequency without unit": (
-        swapped("frequency_hz = 427", "frequency = 427"),
-        ["mode 2 of model.toml", "'frequency'", "did you mean `frequency_hz`"],
-    ),
-    "std without unit": (
-        swapped("frequency_std_hz", "frequency_std"),
-        ["mode 1 of model.toml", "'frequency_std'", "did you mean `frequency_std_hz`"],
-    ),
-    "unknown key of a rigid-body mode": (
-        swapped("participation = 1.5", "participation = 1.5\nfrequency_hz = 1"),
-        ["rigid_body_mode 1 of model.toml", "'frequency_hz'"],
-    ),
-    "unknown key of the measurement": (
-        swapped("level_phase_std_deg", "level_phase_std"),
-        ["[measurement] of model.toml", "'level_phase_std'", "did you mean `level_phase_std_deg`"],
-    ),
-    "unknown key of a coefficient": (
-        swapped("std = 1e10", "sdt = 1e10"),
-        ["monomial '1111'", "[potential] of model.toml", "'sdt'", "did you mean `std`"],
-    ),
-    "missing frequency": (
-        swapped("frequency_hz = 79.02\n", ""),
-        ["mode 1 of model.toml lacks", "`frequency_hz`"],
-    ),
-    "missing damping": (
-        swapped("damping_ratio = 0\n", ""),
-        ["mode 2 of model.toml lacks", "`damping_ratio`"],
-    ),
-    "missing participation": (
-        swapped("participation = 247.8\n", ""),
-        ["mode 1 of model.toml lacks", "`participation`"],
-    ),
-    "missing shape": (
-        swapped("shape = { tip = 0.0, midspan = -10.5 }\n", ""),
-        ["mode 2 of model.toml lacks", "`shape`"],
-    ),
-    "missing rigid-body participation": (
-        swapped("participation = 1.5\n", ""),
-        ["rigid_body_mode 1 of model.toml lacks", "`participation`"],
-    ),
-    "missing coefficient": (
-        swapped("coefficient = 3.4e12, ", ""),
-        ["monomial '1111'", "model.toml lacks", "`coefficient`"],
-    ),
-    "negative frequency": (
-        swapped("79.02", "-3.2"),
-        ["`frequency_hz` must be positive, but mode 1 of model.toml has -3.2."],
-    ),
-    "zero frequency": (swapped("427", "0"), ["`frequency_hz`", "positive", "mode 2", "0"]),
-    "frequency too large": (swapped("427", "1.5e308"), ["`frequency_hz`", "mode 2", "1.5e+308"]),
-    "negative damping": (swapped("0.05", "-0.05"), ["`damping_ratio`", "mode 1", "-0.05"]),
-    "damping of one": (
-        swapped("0.05", "1.0"),
-        ["`damping_ratio`", "from 0 to below 1", "mode 1 of model.toml", "1.0"],
-    ),
-    "zero participation": (
-        swapped("-108.5", "0"),
-        ["`participation`", "other than zero", "mode 2 of model.toml", "0"],
-    ),
-    "zero rigid-body participation": (
-        swapped("participation = 1.5", "participation = 0.0"),
-        ["`participation`", "other than zero", "rigid_body_mode 1 of model.toml"],
-    ),
-    "negative std": (
-        swapped("frequency_std_hz = 0.02", "frequency_std_hz = -0.02"),
-        ["`frequency_std_hz`", "zero or positive", "mode 1 of model.toml", "-0.02"],
-    ),
-    "negative damping std": (
-        swapped("damping_ratio_std = 0.001", "damping_ratio_std = -1"),
-        ["`damping_ratio_std`", "mode 1 of model.toml", "-1"],
-    ),
-    "negative coefficient std": (
-        swapped("std = 1e10", "std = -1.0"),
-        ["`std`", "monomial '1111'", "model.toml", "-1.0"],
-    ),
-    "negative gain std": (
-        swapped("level_gain_std = 0.01", "level_gain_std = -0.01"),
-        ["`level_gain_std`", "[measurement] of model.toml", "-0.01"],
-    ),
-    "text as a number": (swapped("79.02", '"79.02"'), ["`frequency_hz`", "mode 1", "'79.02'"]),
-    "empty text as a number": (swapped("79.02", '""'), ["`frequency_hz`", "a number", "has ''."]),
-    "truth value as a number": (swapped("79.02", "true"), ["`frequency_hz`", "mode 1", "True"]),
-    "date as a number": (swapped("79.02", "2024-01-01"), ["`frequency_hz`", "mode 1", "date"]),
-    "list as a number": (swapped("79.02", "[79.02]"), ["`frequency_hz`", "mode 1", "[79.02]"]),
-    "nan": (swapped("79.02", "nan"), ["`frequency_hz`", "finite", "mode 1 of model.toml", "nan"]),
-    "infinity": (swapped("247.8", "-inf"), ["`participation`", "finite", "mode 1", "-inf"]),
-    "infinity in a shape": (
-        swapped("tip = -3", "tip = inf"),
-        ["`tip`", "finite", "shape of mode 1 of model.toml", "inf"],
-    ),
-    "huge integer": (swapped("79.02", "1" + "0" * 400), ["`frequency_hz`", "finite", "mode 1"]),
-    "unprintable integer": (
-        swapped("79.02", "0x" + "F" * 5000),
-        ["`frequency_hz`", "finite", "mode 1", "too long"],
-    ),
     "shape as a number": (swapped("{ midspan = 11.8, tip = -3 }", "11.8"), ["`shape`", "table"]),
     "empty shape": (
         swapped("{ midspan = 11.8, tip = -3 }", "{}"),
         ["shape of mode 1 of model.toml", "at least one sensor"],
-    ),
-    "text in a shape": (
-        swapped("tip = -3", 'tip = "x"'),
-        ["`tip`", "a number", "shape of mode 1 of model.toml", "'x'"],
     ),
     "a mode lacks a sensor": (
         swapped("{ tip = 0.0, midspan = -10.5 }", "{ midspan = -10.5 }"),
@@ -379,14 +345,6 @@ BAD = {
         swapped("112 = -2.5e6", "112 = -2.5e6\n121 = 1.0"),
         ["[potential] of model.toml", "'121'", "twice"],
     ),
-    "text as a coefficient": (
-        swapped("-2.5e6", '"-2.5e6"'),
-        ["`112`", "a number", "[potential] of model.toml", "'-2.5e6'"],
-    ),
-    "nan as a coefficient": (
-        swapped("3.4e12", "nan"),
-        ["`coefficient`", "finite", "monomial '1111' in [potential] of model.toml", "nan"],
-    ),
     "unknown effect": (
         swapped('"quadratic_damping"', '"quadratic_dampng"'),
         ["effect 1 of model.toml", "'quadratic_dampng'", "did you mean `quadratic_damping`"],
@@ -407,18 +365,6 @@ BAD = {
         swapped('"gap_stiffness"', "3"),
         ["`kind`", "a text", "effect 2 of model.toml", "3"],
     ),
-    "unknown parameter": (
-        swapped("stiffness = 1000", "stifness = 1000"),
-        ["effect 2 of model.toml (gap_stiffness)", "'stifness'", "did you mean `stiffness`"],
-    ),
-    "missing parameter": (
-        swapped("stiffness = 1000\n", ""),
-        ["effect 2 of model.toml (gap_stiffness)", "lacks", "`stiffness`"],
-    ),
-    "text as a parameter": (
-        swapped("stiffness = 1000", 'stiffness = "stiff"'),
-        ["`stiffness`", "a number", "effect 2 of model.toml (gap_stiffness)", "'stiff'"],
-    ),
     "parameter of another effect": (
         MINIMAL + '[[effect]]\nkind = "coulomb_friction"\nforce = 1\nsmoothing_velocity = 1\n',
         ["effect 1 of model.toml (coulomb_friction)", "unknown key 'smoothing_velocity'"],
@@ -434,10 +380,6 @@ BAD = {
     "mass that leaves nothing": (
         MINIMAL + '[[effect]]\nkind = "added_mass"\nmass = -1\n',
         ["`mass`", "above -1", "effect 1 of model.toml (added_mass)"],
-    ),
-    "infinite parameter": (
-        swapped("stiffness = 1000", "stiffness = inf"),
-        ["`stiffness`", "finite", "effect 2 of model.toml (gap_stiffness)", "inf"],
     ),
 }
 

@@ -69,7 +69,7 @@ RESULTS = {
         ("IntegratedMotion: 4 harmonics", "velocity_re_m_s", "m/s"),
     ),
     "stepped sine": (
-        lambda: sj.simulate.stepped_sine(
+        lambda: sj.simulate.stepped_motions(
             oscillator(), FORCE, (1.4, 1.5), cycles_per_step=20, harmonic_order=3
         ),
         ("IntegratedMotion: 2 motions", "frequency_hz", "Hz"),

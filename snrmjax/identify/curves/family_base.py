@@ -215,8 +215,9 @@ class AbstractFamily(AbstractCurve):
 
     def linearised(self, amplitude: Float[np.ndarray, " point"]) -> Linearised:
         """See `AbstractCurve`; nothing compiles."""
-        scale, terms = float(self.scale), jax.tree.map(np.asarray, self.terms())
-        drawn = _drawn(np.asarray(amplitude) / scale, np.asarray(self.parameters), terms, np)
+        host = jax.tree.map(np.asarray, self)
+        scale, terms = float(host.scale), host.terms()
+        drawn = _drawn(np.asarray(amplitude) / scale, host.parameters, terms, np)
         columns = drawn.basis @ terms.mix
         if columns.shape[-1] > 2:
             columns[..., 2] += drawn.by_third
@@ -254,9 +255,10 @@ def packed(family: AbstractFamily, room: int = 0) -> PackedCurve:
 
     On the host, where nothing compiles for one more size, if it can be.
     """
-    terms, parameters = family.terms(), family.parameters
-    traced = any(isinstance(a, jax.core.Tracer) for a in jax.tree.leaves((terms, parameters)))
+    traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(family))
     xp: Any = jnp if traced else np
+    family = family if traced else jax.tree.map(np.asarray, family)
+    terms, parameters = family.terms(), family.parameters
     n, k, h = parameters.shape[0], len(terms.exponents), max(len(terms.knots) - 2, 0)
     size, powers = (-(-most // _SIZE) * _SIZE for most in (max(n, room), k))
 
@@ -269,7 +271,7 @@ def packed(family: AbstractFamily, room: int = 0) -> PackedCurve:
     mix = [filled(terms.mix[:k], powers, size), filled(terms.mix[k : k + h], size, size)]
     return PackedCurve(
         parameters=filled(parameters, size),
-        scale=family.scale,
+        scale=jnp.asarray(family.scale),
         made_of=Terms(
             exponents=filled(terms.exponents, powers),
             is_free=filled(terms.is_free, powers),

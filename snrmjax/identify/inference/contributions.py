@@ -89,7 +89,7 @@ class Contributions(AbstractTable[Contribution]):
 def _bend_slopes(fit: JointFit) -> Float[np.ndarray, "row unknown"]:
     """Derivatives, by the unknowns, of what is expected near zero of both curves."""
     curves = fit.unknowns.squared_frequency, fit.unknowns.modal_damping
-    first, second = (np.asarray(curve.terms().prior) for curve in curves)
+    first, second = (jax.tree.map(np.asarray, curve).terms().prior for curve in curves)
     slopes = np.zeros((len(first) + len(second), len(fit.covariance)))
     n = first.shape[1]
     slopes[: len(first), :n], slopes[len(first) :, n : n + second.shape[1]] = first, second

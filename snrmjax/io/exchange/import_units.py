@@ -9,7 +9,7 @@ from jaxtyping import Float
 from snrmjax.io.exchange.import_map import Assumptions, ImportMap
 from snrmjax.io.files import near_miss
 from snrmjax.io.laboratory.physical_units import UnitMeaning, unit_meaning
-from snrmjax.measure.recordings.channels import SI_UNIT
+from snrmjax.measure.recordings.channels import SI_UNIT, Quantity
 from snrmjax.numerics.facts import Fact
 
 AMPLITUDE_FACTORS = {"peak": 1.0, "": 1.0, "rms": np.sqrt(2.0), "peak_to_peak": 0.5}
@@ -55,14 +55,15 @@ def force_meaning(mapping: ImportMap, file_unit: str, what: str) -> Force:
 
 def motion_meaning(
     quantity: str, unit: str, file_unit: str, channel: str, *, is_ratio: bool = False
-) -> tuple[str, float, str]:
+) -> tuple[Quantity, float, str]:
     """Quantity, factor into SI and unit of a response.
 
     Raises `ValueError` with a question where they are not stated or contradict one another.
     """
     stated = unit or file_unit
     if not stated:
-        example = f"{channel}:{quantity or 'velocity'}:{SI_UNIT.get(quantity or 'velocity', '')}"  # type: ignore[call-overload]
+        of: Quantity = next((known for known in SI_UNIT if known == quantity), "velocity")
+        example = f"{channel}:{of}:{SI_UNIT[of]}"
         raise ValueError(
             f"in which unit is {channel}? State it: --response {example}, or --unit for all "
             "responses."
@@ -91,7 +92,7 @@ def motion_meaning(
             f"{channel} is called {quantity} (--response), but its unit {stated} is of "
             f"{meaning.dimension}: which of both is right?"
         )
-    return meaning.dimension, meaning.factor, stated
+    return meaning.quantity, meaning.factor, stated
 
 
 def amplitude_factor(mapping: ImportMap, units: Mapping[str, str], assumed: Assumptions) -> float:

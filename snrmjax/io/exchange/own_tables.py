@@ -45,7 +45,7 @@ def restated(states: SteadyStates, mapping: ImportMap) -> SteadyStates:
     factors = np.ones((states.n_states, len(orders)), dtype=complex)
     if mapping.unit:
         quantity, factor, _ = motion_meaning("", mapping.unit, "", "the velocity")
-        channel = Channel("", quantity)  # type: ignore[arg-type]
+        channel = Channel("", quantity)
         factors = factor * velocity_factors([channel], orders, np.asarray(states.frequency))[:, 0]
     factors = factors * AMPLITUDE_FACTORS[mapping.amplitude]
     phasors = np.concatenate(

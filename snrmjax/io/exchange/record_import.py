@@ -57,7 +57,7 @@ def mapped_record(
         quantity, factor, unit = motion_meaning(
             response.quantity, response.unit, old.unit, response.channel
         )
-        channels[k] = old._replace(quantity=quantity, unit=unit, calibration=factor)  # type: ignore[arg-type]
+        channels[k] = old._replace(quantity=quantity, unit=unit, calibration=factor)
         sensor = sensor_of(response, mapping, number + 1, assumed)
         filled.append(ResponseMap(response.channel, quantity, response.unit, sensor))
     if mapping.drive:

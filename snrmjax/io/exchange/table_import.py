@@ -203,7 +203,7 @@ def _response(
             )
         phasor = values * np.exp(1j * source.phase(phase, "--phase"))
     sensor = sensor_of(response, mapping, number, assumed)
-    turn = velocity_factors([Channel(name, quantity)], [1], omega)[:, 0, 0]  # type: ignore[arg-type]
+    turn = velocity_factors([Channel(name, quantity)], [1], omega)[:, 0, 0]
     filled = response._replace(quantity=quantity, sensor=sensor, phase=phase, imaginary=imaginary)
     return phasor * factor * turn, filled, factor * turn
 

@@ -27,7 +27,7 @@ _MOST_CHANNELS = 4096
 _ALIKE = 1e-12  # relative, of two steps in the properties of one device
 
 
-class TdmsSamples(AbstractSamples):
+class _TdmsSamples(AbstractSamples):
     """Channels of one group. The file is open until this is forgotten."""
 
     def __init__(self, file: Any, channels: Sequence[Any], n_samples: int, name: str) -> None:
@@ -36,13 +36,13 @@ class TdmsSamples(AbstractSamples):
 
     @property
     def shape(self) -> tuple[int, int]:
-        """See `AbstractSamples.shape`."""
+        """Channels and samples."""
         return len(self._channels), self._samples
 
     def read(
         self, channels: Sequence[int], start: int, stop: int
     ) -> Num[np.ndarray, "channel sample"]:
-        """See `AbstractSamples.read`."""
+        """A stretch of some channels."""
         rows = []
         for k in channels:
             with damaged_if_it_fails(self._name, "a TDMS file"):
@@ -139,7 +139,7 @@ def _recording(
         group = _contents(file)[name]
         opened = [group[channel.name] for channel in channels]
         kept.pop_all()  # it stays open until the samples are forgotten
-    samples = TdmsSamples(file, opened, length, path.name)
+    samples = _TdmsSamples(file, opened, length, path.name)
     listed = []
     for channel in channels:
         unit = _unit(channel)

@@ -52,7 +52,7 @@ def beam_source(stated: BeamDescription, file: str) -> ReductionSource:
         basis = beam_modes(beam, stated.modes)
     except ValueError as error:
         raise ValueError(f"{file}: {error}") from error
-    seen = seen_of(beam, basis, stated.sensors, stated.force_at)
+    seen = _seen_of(beam, basis, stated.sensors, stated.force_at)
     known = have_values((basis, seen))
     if known:
         seen = jax.tree.map(np.asarray, seen)
@@ -80,7 +80,7 @@ def beam_source(stated: BeamDescription, file: str) -> ReductionSource:
     )
 
 
-def _require_moving(stated: BeamDescription, seen: "SeenModes", file: str) -> None:
+def _require_moving(stated: BeamDescription, seen: "_SeenModes", file: str) -> None:
     largest = float(np.max(seen.largest))
     for name, at in stated.sensors:
         if not np.max(np.abs(seen.sensors[name])) > _NOWHERE * largest:
@@ -90,7 +90,7 @@ def _require_moving(stated: BeamDescription, seen: "SeenModes", file: str) -> No
         raise ValueError(f"[force] of {file} is {place}, where no mode moves.")
 
 
-class SeenModes(NamedTuple):
+class _SeenModes(NamedTuple):
     """What sensors and the force see of the modes."""
 
     sensors: dict[str, Float[Array, " mode"]]  # kg^-1/2
@@ -100,14 +100,14 @@ class SeenModes(NamedTuple):
 
 
 @eqx.filter_jit
-def seen_of(
+def _seen_of(
     beam: Beam,
     basis: ReductionBasis,
     sensors: tuple[tuple[str, float], ...],
     force_at: float | None,
-) -> SeenModes:
+) -> _SeenModes:
     """Shapes at the sensors and participation of the force; places are fractions of the length."""
-    return SeenModes(
+    return _SeenModes(
         {name: shape_at(beam, basis, at) for name, at in sensors},
         participation(beam, basis, force_at),
         basis.largest,

@@ -65,11 +65,7 @@ def integrated_cycle(
     def slope(phase: Array, state: Array, _: None) -> Array:
         q, v, memory = whole(state)
         drive = load * (orders @ jnp.cos(jnp.arange(len(orders)) * phase))
-        inner = terms.stiffness * q + terms.damping * v
-        inner = inner + model.memoryless_force(q[None], v[None])[0]
-        for effect, states in zip(effects, memory, strict=True):
-            inner = inner.at[j].add(effect.state_force(q[j], v[j], states))
-        rates = tuple(map(lambda e, states: memory_rate(e, q[j], v[j], states), effects, memory))
+        inner, rates = inner_force(model, effects, q, v, memory)
         return ravel_pytree((v, (drive - inner) / terms.mass, rates))[0] / frequency
 
     term, width = diffrax.ODETerm(slope), 2 * jnp.pi / n_samples
@@ -97,7 +93,10 @@ def integrated_cycle(
             longer = jnp.where(last, jnp.maximum(step, taken * factor), taken * factor)
             step = jnp.where(good, longer, taken * factor)
             if effects:
-                new = _with_memory(effects, j, whole(state), whole(new), taken / frequency)
+                (q0, v0, _), (q1, v1, held) = whole(state), whole(new)
+                ends = (q0[j], v0[j]), (q1[j], v1[j])
+                states = memory_after_step(effects, held, *ends, taken / frequency)
+                new = ravel_pytree((q1, v1, states))[0]
             return jnp.where(good, to, phase), jnp.where(good, new, state), step, count + 1
 
         state, step = carry
@@ -147,44 +146,47 @@ def _moved_memory(old: AbstractHysteresis, new: AbstractHysteresis, states: Arra
     return jnp.interp(wanted, slip, states)
 
 
-def memory_rate(effect: AbstractHysteresis, q: Array, v: Array, states: Array) -> Array:
-    """Rates of the memory in a step, through which sliders are held: see `memory_after_step`."""
-    if isinstance(effect, AbstractSliders):
-        return jnp.zeros_like(states)
-    return effect.state_rate(q, v, states)
+def inner_force(
+    model: Structure, effects: tuple[AbstractHysteresis, ...], q: Array, v: Array, memory: Memory
+) -> tuple[Float[Array, " mode"], Memory]:
+    """What stiffness, damping and effects pull with, and the rates of friction's memory in a step.
 
-
-def _with_memory(
-    effects: tuple[AbstractHysteresis, ...], j: int, old: tuple, new: tuple, time: Array
-) -> Float[Array, " unknown"]:
-    """The new state with the sliders moved along the way of q, its turning point included."""
-    ends = (old[0][j], old[1][j]), (new[0][j], new[1][j])
-    moved = (
-        memory_after_step(e, states, *ends, time) for e, states in zip(effects, new[2], strict=True)
-    )
-    return ravel_pytree((*new[:2], tuple(moved)))[0]
+    Sliders are held through a step: see `memory_after_step`.
+    """
+    terms, j = model.linear_terms(), model.modes.mode_of_interest
+    inner = terms.stiffness * q + terms.damping * v + model.memoryless_force(q[None], v[None])[0]
+    rates = []
+    for effect, states in zip(effects, memory, strict=True):
+        inner = inner.at[j].add(effect.state_force(q[j], v[j], states))
+        held = isinstance(effect, AbstractSliders)
+        rates.append(jnp.zeros_like(states) if held else effect.state_rate(q[j], v[j], states))
+    return inner, tuple(rates)
 
 
 def memory_after_step(
-    effect: AbstractHysteresis,
-    states: Array,
+    effects: tuple[AbstractHysteresis, ...],
+    memory: Memory,
     begin: tuple[Array, Array],
     end: tuple[Array, Array],
     time: Array,
-) -> Array:
+) -> Memory:
     """Memory after a step of an integrator through which sliders were held.
 
-    Arguments: `states` as the integrator leaves them; q (kg^1/2 m) and q̇ (kg^1/2 m/s) of the mode
+    Arguments: `memory` as the integrator leaves it; q (kg^1/2 m) and q̇ (kg^1/2 m/s) of the mode
     of interest at the `begin` and at the `end` of the step, of length `time` in s. A turning point
     within the step is passed; other effects than sliders keep what the integrator found.
     """
-    if not isinstance(effect, AbstractSliders):
-        return states
     (q0, v0), (q1, v1) = begin, end
     turns = v0 * v1 < 0
     until = time * v0 / jnp.where(turns, v0 - v1, 1.0)
     turning = jnp.where(turns, q0 + 0.5 * v0 * until, q0)
-    return effect.moved_states(q1, effect.moved_states(turning, states))
+
+    def after(effect: AbstractHysteresis, states: Array) -> Array:
+        if not isinstance(effect, AbstractSliders):
+            return states
+        return effect.moved_states(q1, effect.moved_states(turning, states))
+
+    return tuple(map(after, effects, memory))
 
 
 def _diffrax() -> Any:

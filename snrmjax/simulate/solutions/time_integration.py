@@ -126,7 +126,7 @@ def settled_motion(
     (True, True)
     """
     positive("frequency", frequency)
-    motions = stepped_sine(
+    motions = stepped_motions(
         *(model, force, jnp.asarray(frequency, dtype=jnp.float64)[None]),
         cycles_per_step=max_cycles,
         start=start,
@@ -136,7 +136,7 @@ def settled_motion(
     return jax.tree.map(lambda part: part[0], motions)
 
 
-def stepped_sine(
+def stepped_motions(
     model: Structure,
     force: Float[Array, ""] | float,
     frequencies: Float[Array, " step"] | np.ndarray,

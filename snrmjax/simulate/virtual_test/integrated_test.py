@@ -4,7 +4,7 @@ import numpy as np
 
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import over_cores
-from snrmjax.simulate.solutions.time_integration import IntegratedMotion, stepped_sine
+from snrmjax.simulate.solutions.time_integration import IntegratedMotion, stepped_motions
 from snrmjax.simulate.virtual_test.appropriation import around, mode_phase
 from snrmjax.simulate.virtual_test.recording import VisitedStates
 
@@ -31,7 +31,7 @@ def stepped_states(
     times = np.linspace(0.0, 1.0, len(forces) * len(steps)).reshape(len(forces), -1)
 
     def swept(level: int) -> IntegratedMotion:
-        return stepped_sine(
+        return stepped_motions(
             *(model, forces[level], steps),
             cycles_per_step=cycles_per_step,
             test_orders=times[level],

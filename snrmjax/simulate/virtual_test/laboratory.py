@@ -32,9 +32,9 @@ from snrmjax.model.effect_base import (
 from snrmjax.model.modes import reference_sensor
 from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.simulate.solutions.hysteresis_cycles import (
+    inner_force,
     memory_after_step,
     memory_at_rest,
-    memory_rate,
     scaled_friction,
 )
 from snrmjax.simulate.virtual_test.equipment import (
@@ -283,11 +283,7 @@ def _equations(
     friction: tuple[AbstractHysteresis, ...],
 ) -> Callable[[LabMotion, Array], tuple[LabMotion, Array]]:
     """Rates of a motion under a voltage, and the force that the cell reads."""
-    terms, drive, j = (
-        structure.linear_terms(),
-        structure.modes.participation,
-        structure.modes.mode_of_interest,
-    )
+    terms, drive = structure.linear_terms(), structure.modes.participation
     per_force = drive / terms.mass
     inertia = 1 + shaker.mass * (drive @ per_force)
 
@@ -299,23 +295,13 @@ def _equations(
 
     def slope(motion: LabMotion, voltage: Array) -> tuple[LabMotion, Array]:
         q, v = motion.displacement, motion.velocity
-        inner = (
-            terms.damping * v
-            + terms.stiffness * q
-            + structure.memoryless_force(q[None], v[None])[0]
-        )
-        for effect, states in zip(friction, motion.memory, strict=True):
-            inner = inner.at[j].add(effect.state_force(q[j], v[j], states))
+        inner, memory = inner_force(structure, friction, q, v, motion.memory)
         free = -inner / terms.mass
         force = jnp.zeros(())
         if attached:
             # The armature's inertia is part of the force: F = push − m (Γ·q̈), q̈ = free + Γ F.
             push = pushed(drive @ q, drive @ v, voltage)
             force = (push - shaker.mass * (drive @ free)) / inertia
-        memory = tuple(
-            memory_rate(effect, q[j], v[j], states)
-            for effect, states in zip(friction, motion.memory, strict=True)
-        )
         return LabMotion(v, free + per_force * force, memory), force
 
     return slope
@@ -342,11 +328,8 @@ def _integrator(
         mean = jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, one, two, three, four)
         moved = after(h, mean)
         way = [(at.displacement[j], at.velocity[j]) for at in (motion, moved)]
-        memory = (
-            memory_after_step(effect, states, way[0], way[1], h)
-            for effect, states in zip(friction, moved.memory, strict=True)
-        )
-        return moved._replace(memory=tuple(memory))
+        memory = memory_after_step(friction, moved.memory, way[0], way[1], h)
+        return moved._replace(memory=memory)
 
     return step
 

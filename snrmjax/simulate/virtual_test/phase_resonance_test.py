@@ -86,7 +86,7 @@ def phase_resonance_test(
     reached.
 
     By harmonic balance it steps infinitely slowly and records exact states, at `order` from 0
-    to 1 in the order of the rows. By time integration it is `stepped_sine`: each level starts
+    to 1 in the order of the rows. By time integration it is `stepped_motions`: each level starts
     from rest, goes up in `steps_per_sweep` equal steps of at most `cycles_per_step` cycles and
     down again, jumps where a step's transient throws it off, and records of its own steps the
     settled ones, at their time in the test; fewer than `points_per_level` where a coarse

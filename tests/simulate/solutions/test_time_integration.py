@@ -17,7 +17,7 @@ from snrmjax.simulate.solutions.time_integration import (
     IntegrationAccuracy,
     MotionStatus,
     settled_motion,
-    stepped_sine,
+    stepped_motions,
 )
 
 HZ = 2 * np.pi
@@ -180,7 +180,7 @@ def test_a_coarse_sweep_jumps_early_as_scipy_says(stiffening, time_domain):
         grid = np.linspace(0.95, 1.35, n_steps)
         steps[n_steps] = grid[grid < 1.17] * OMEGA
         options = {"cycles_per_step": 40, "accuracy": IntegrationAccuracy(0.0, 1e-10)}
-        sweep = stepped_sine(model, 1.0, steps[n_steps], **options)
+        sweep = stepped_motions(model, 1.0, steps[n_steps], **options)
         assert np.all(sweep.n_cycles == 40)
         height[n_steps] = np.abs(fundamental(sweep))
         if n_steps == 16:
@@ -203,7 +203,7 @@ def test_a_sweep_down_jumps_up_at_the_other_fold(stiffening):
     model, curve = stiffening
     lower = curve.frequency[curve.at_events("fold")].min()
     steps = np.linspace(1.2, 0.95, 51) * OMEGA
-    sweep = stepped_sine(model, 1.0, steps, cycles_per_step=400)
+    sweep = stepped_motions(model, 1.0, steps, cycles_per_step=400)
     jump = int(np.argmax(np.diff(np.abs(fundamental(sweep)))))
     assert steps[jump + 1] < 1.0005 * lower
     assert steps[jump] > lower - 0.005 * OMEGA
@@ -215,7 +215,7 @@ def test_a_sweep_down_jumps_up_at_the_other_fold(stiffening):
 def test_drift_moves_the_resonance_from_step_to_step():
     drift = make_effect("frequency_drift", {"relative_drift": 0.02})
     steps, orders = np.linspace(490.0, 510.0, 4), np.array([0.0, 0.25, 0.75, 1.0])
-    sweep = stepped_sine(oscillator(effects=[drift]), 1.0, steps, test_orders=orders)
+    sweep = stepped_motions(oscillator(effects=[drift]), 1.0, steps, test_orders=orders)
     moved = OMEGA * (1 + 0.02 * orders)
     phasor = PARTICIPATION / (moved**2 - steps**2 + 2j * RATIO * moved * steps)
     np.testing.assert_allclose(fundamental(sweep), 1j * steps * SHAPE * phasor, rtol=3e-4)
@@ -316,7 +316,7 @@ def test_wrong_settings_of_a_settled_motion_are_named(options, message):
 def test_wrong_settings_of_a_sweep_are_named(options, message):
     given = {"force": 1.0, "frequencies": [500.0, 510.0]} | options
     with pytest.raises(ValueError, match=message):
-        stepped_sine(oscillator(), **given)
+        stepped_motions(oscillator(), **given)
 
 
 def test_without_diffrax_the_extra_is_named(monkeypatch):

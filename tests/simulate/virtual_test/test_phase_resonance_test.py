@@ -332,7 +332,7 @@ def test_a_drifting_structure_is_stepped_through_in_time():
     assert np.all(np.asarray(states.frequency) % 1 < 1e-9)
     np.testing.assert_allclose(
         states.velocity[:, 0], response_of_drifting(0.02, states), rtol=3e-4
-    )  # `stepped_sine` settles to an estimated 1e-4
+    )  # `stepped_motions` settles to an estimated 1e-4
     assert np.all(np.abs(np.cos(phases(states)) ** 2 - 0.6) < 0.1)
 
 

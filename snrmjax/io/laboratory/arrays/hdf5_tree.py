@@ -19,9 +19,7 @@ from snrmjax.io.laboratory.libraries import damaged_if_it_fails, library
 from snrmjax.io.laboratory.names import role_of
 from snrmjax.numerics.facts import Fact
 
-NETCDF = (".nc", ".nc4", ".cdf")
-"""Endings of HDF5 files that are called netCDF."""
-
+_NETCDF = (".nc", ".nc4", ".cdf")  # endings of HDF5 files that are called netCDF
 _MOST_OBJECTS = 20_000
 _DEEPEST = 24
 _LONGEST_TEXT = 2**17  # letters, or texts of a list
@@ -66,7 +64,7 @@ def open_tree(path: Path) -> tuple[dict[str, Node], list[Fact]]:
 
 def read_hdf5(path: Path) -> LaboratoryFile:
     """An HDF5 or netCDF 4 file. Raises `ValueError` as `read_laboratory_file` does."""
-    netcdf = path.suffix.lower() in NETCDF
+    netcdf = path.suffix.lower() in _NETCDF
     return file_of_tree(path.name, "netcdf" if netcdf else "hdf5", *open_tree(path))
 
 
