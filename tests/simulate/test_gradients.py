@@ -17,9 +17,7 @@ from snrmjax.model.structures import structure
 from snrmjax.simulate.balance.prescribed_motion import prescribed_motion
 from snrmjax.simulate.solutions.forced_response import forced_response
 from snrmjax.simulate.solutions.periodic_motion import (
-    motions_at_velocities,
     periodic_motion,
-    response_at_velocities,
 )
 
 FORCE = 0.12
@@ -119,22 +117,6 @@ def test_periodic_motion_with_a_force_that_is_not_finite(curve):
 
         return numbers_of(jax.vmap(one)(jnp.stack([force, jnp.asarray(np.nan), 1.01 * force])))
 
-    assert_gradients(motions, failed=[1])
-
-
-def test_motions_at_velocities(curve):
-    heights = np.array([0.2, 30.0, 0.7]) * np.abs(curve.velocity[:, 1, 0]).max()
-    found, which = response_at_velocities(oscillator(), curve, heights)
-    assert which.tolist() == [0, 2, 2, 0]  # the one that is never reached is not on the curve
-    rows = [0, 1, 2]
-    starts = (found.coefficients[jnp.array(rows)], found.frequency[jnp.array(rows)])
-
-    @jax.jit
-    def motions(shifts):
-        force, model = changed(shifts)
-        return numbers_of(motions_at_velocities(model, force, starts, heights))
-
-    # Heights in the order of the starts: 0.2, one never reached, 0.7.
     assert_gradients(motions, failed=[1])
 
 
