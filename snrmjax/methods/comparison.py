@@ -66,6 +66,15 @@ METHODS: dict[str, Method] = {
 """Methods that read a table of steady states, by name."""
 
 
+class Distance(NamedTuple):
+    """Medians over a method's points of their distance from the reference."""
+
+    method: str
+    frequency: float  # rad/s
+    damping: float  # relative
+    n_points: int
+
+
 class Comparison(NamedTuple):
     """What each method found, and what stopped those that could not run."""
 
@@ -73,6 +82,34 @@ class Comparison(NamedTuple):
     stopped: dict[str, str]  # method: why
     data: SteadyStates | None = None  # of tables, stepped sines and slow sweeps
     records: tuple[Fact, ...] = ()  # what each time record was taken for, and why
+
+    @property
+    def reference(self) -> MethodResult | None:
+        """From which distances are taken: the inverse SNRM, else the first with points."""
+        results = [result for result in self.results if result.found.any()]
+        return next((r for r in results if r.method == "snrm"), results[0] if results else None)
+
+    def distances(self) -> tuple[Distance, ...]:
+        """Of each method from the reference, at amplitudes that this covers."""
+        reference = self.reference
+        if reference is None:
+            return ()
+        at = np.asarray(reference.velocity)[reference.found]
+        distances = []
+        for result in self.results:
+            velocity = np.asarray(result.velocity)
+            kept = result.found & (velocity >= at.min()) & (velocity <= at.max())
+            if not kept.any():
+                continue
+            omega, ratio = (
+                np.interp(velocity[kept], at, np.asarray(curve)[reference.found])
+                for curve in (reference.natural_frequency, reference.damping_ratio)
+            )
+            off = np.abs(np.asarray(result.natural_frequency)[kept] - omega)
+            damping = np.abs(np.asarray(result.damping_ratio)[kept] / ratio - 1)
+            medians = float(np.median(off)), float(np.median(damping))
+            distances.append(Distance(result.method, *medians, int(kept.sum())))
+        return tuple(distances)
 
 
 def compare_methods(

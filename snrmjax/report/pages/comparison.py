@@ -45,6 +45,7 @@ _MARKERS = ("o", ".", "s", "D", "^", "v", "x")
 # Methods whose 1σ knows noise alone, and those that also take all forces for polynomials.
 _OF_NOISE = ("concerto", "arslan_ozguven", "rct", "phase_resonance", "resonant_decay")
 _OF_POLYNOMIALS = ("ssm", "pnlss")
+_AWAY = ("median_distance_from_snrm_hz", "median_relative_damping_distance_from_snrm")
 _FEW = 40  # points that are drawn large
 _CAPTION = (
     "Natural frequency and damping against the velocity amplitude at resonance, by each method "
@@ -146,54 +147,19 @@ def comparison_sentence(found: Comparison) -> str:
     """The result in a plain sentence."""
     results, stopped = found.results, found.stopped
     text = f"{len(results)} of {len(results) + len(stopped)} methods ran"
-    own = _reference(found)
-    near = [
-        distance for distance in _distances(found) if own is not None and distance[0] != own.method
-    ]
+    own, distances = found.reference, found.distances()
+    near = [d for d in distances if own is not None and d.method != own.method]
     if own is None or not near:
         return f"{text}."
     away = ", ".join(
-        f"{_NAMES.get(name, name)} {number(hertz, 2)} Hz and {number(100 * ratio, 2)} %"
-        for name, hertz, ratio, _ in near
+        f"{_NAMES.get(d.method, d.method)} {number(d.frequency / HERTZ, 2)} Hz and "
+        f"{number(100 * d.damping, 2)} %"
+        for d in near
     )
     return (
         f"{text}. Median distance from the {_NAMES[own.method]} in frequency and in damping: "
         f"{away}."
     )
-
-
-def _reference(found: Comparison) -> MethodResult | None:
-    """The result from which distances are taken: the inverse SNRM, else the first with points."""
-    results = [result for result in found.results if result.found.any()]
-    own = [result for result in results if result.method == "snrm"]
-    return next(iter([*own, *results]), None)
-
-
-def _distances(found: Comparison) -> list[tuple[str, float, float, int]]:
-    """Of each method: median distances from the reference in Hz and relative damping, points.
-
-    At amplitudes that the reference covers; empty where nothing was found.
-    """
-    own = _reference(found)
-    if own is None:
-        return []
-    has = own.found
-    at = np.asarray(own.velocity)[has]
-    rows = []
-    for result in found.results:
-        velocity = np.asarray(result.velocity)
-        kept = result.found & (velocity >= at.min()) & (velocity <= at.max())
-        if not kept.any():
-            continue
-        omega, ratio = (
-            np.interp(velocity[kept], at, np.asarray(curve)[has])
-            for curve in (own.natural_frequency, own.damping_ratio)
-        )
-        hertz = np.abs(np.asarray(result.natural_frequency)[kept] - omega) / HERTZ
-        damping = np.abs(np.asarray(result.damping_ratio)[kept] / ratio - 1)
-        away = float(np.median(hertz)), float(np.median(damping))
-        rows.append((result.method, *away, int(kept.sum())))
-    return rows
 
 
 def _notes(found: Comparison) -> list[str]:
@@ -233,9 +199,9 @@ def notes_on_bands(results: Sequence[MethodResult]) -> list[str]:
 
 def _summary(found: Comparison) -> dict:
     results, stopped = found.results, found.stopped
-    reference = _reference(found)
+    reference = found.reference
     own = reference is not None and reference.method == "snrm"
-    near = {name: (hertz, ratio) for name, hertz, ratio, _ in _distances(found) if own}
+    near = {d.method: (d.frequency / HERTZ, d.damping) for d in found.distances() if own}
     return {
         "records": [str(one) for one in found.records],
         "bands": notes_on_bands(results),
@@ -245,10 +211,7 @@ def _summary(found: Comparison) -> dict:
                 "failed": int((~result.found).sum()),
                 "states": result.n_states,
                 "record_s": result.test_seconds,
-                "median_distance_from_snrm_hz": near.get(result.method, (None, None))[0],
-                "median_relative_damping_distance_from_snrm": near.get(result.method, (None, None))[
-                    1
-                ],
+                **dict(zip(_AWAY, near.get(result.method, (None, None)), strict=True)),
                 "notes": [str(note) for note in result.notes],
             }
             for result in results
@@ -258,7 +221,7 @@ def _summary(found: Comparison) -> dict:
 
 
 def _table(found: Comparison) -> ReportTable:
-    near = {name: (hertz, ratio) for name, hertz, ratio, _ in _distances(found)}
+    near = {d.method: (d.frequency / HERTZ, d.damping) for d in found.distances()}
     rows = []
     for name in _EVERY:
         one = next((r for r in found.results if r.method == name), None)
@@ -277,7 +240,7 @@ def _table(found: Comparison) -> ReportTable:
         rows.append(
             (_NAMES[name], *counts, *gap, f"{int((~one.found).sum())}: {why}" if why else "")
         )
-    own = _reference(found)
+    own = found.reference
     of = "" if own is None else f" of the {_NAMES[own.method]}"
     header = (
         "method",
