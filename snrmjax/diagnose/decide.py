@@ -124,24 +124,24 @@ def decide(
         return Judgement(Verdict.UNKNOWN, tuple(reasons), (), _else_unknown(kept))
     if not fit.kinds:
         return Judgement(Verdict.NOTHING_MISSING, (), (), probabilities)
-    every = imitations_of(found, located)
-    every += doubts_on_gains(misfit, fit, errors)
-    every += missed_levels(levels, found, doubted=any(not one.identical for one in every))
+    objections = imitations_of(found, located)
+    objections += doubts_on_gains(misfit, fit, errors)
+    objections += missed_levels(levels, found, doubted=any(not one.identical for one in objections))
     if rival is not None:
-        every.append(rival.doubt)
-    if not every and outside > priors.NO_DOUBT:
+        objections.append(rival.doubt)
+    if not objections and outside > priors.NO_DOUBT:
         why = Fact("unknown_law", probability=outside, left=left_curve(misfit, fit))
-        every.append(Doubt(why, WIDER, identical=True))
-    doubted = tuple(one.reason for one in every)
-    if any(one.refutes for one in every):
+        objections.append(Doubt(why, WIDER, identical=True))
+    doubted = tuple(one.reason for one in objections)
+    if any(one.refutes for one in objections):
         kept = {
             name: p if name in (NONE, NOISE_REJECTED) else priors.OPEN * p
             for name, p in probabilities.items()
         }
-        return Judgement(Verdict.UNKNOWN, doubted, tuple(every), _else_unknown(kept))
-    unclear = every or any(len(group) > 1 for group in found.classes)
+        return Judgement(Verdict.UNKNOWN, doubted, tuple(objections), _else_unknown(kept))
+    unclear = objections or any(len(group) > 1 for group in found.classes)
     verdict = Verdict.AMBIGUOUS if unclear else Verdict.NAMED
-    return Judgement(verdict, doubted, tuple(every), probabilities)
+    return Judgement(verdict, doubted, tuple(objections), probabilities)
 
 
 def law_is_asked_for(judgement: Judgement, n_effects: int) -> bool:

@@ -50,7 +50,7 @@ from snrmjax.diagnose.diagnosis_result import (
 )
 from snrmjax.diagnose.laws.law_answer import LawAnswer, law_answer
 from snrmjax.diagnose.misfit.effect_fit import EffectFit, at_phases_of, at_reference, baseline_fit
-from snrmjax.diagnose.misfit.noise_model import notes_without_phases
+from snrmjax.diagnose.misfit.noise_model import notes_without_phases, unit_columns
 from snrmjax.diagnose.misfit.predictions import Predictions, predictions_of, scales_of
 from snrmjax.diagnose.misfit.reference import (
     driven_by_voltage,
@@ -233,8 +233,8 @@ def _completed(model: Structure, checked: _Checked) -> _Completed:
     whole = completed_model(model, misfit.baseline_parameters(fit.rows), fit.kinds, values)
     without = {}
     for place in held_out_places(misfit) if fit.kinds else ():
-        own, baseline = without_level(misfit, fit, place)
-        of_others = dict(zip(fit.labels, own.tolist(), strict=True))
+        parameters, baseline = without_level(misfit, fit, place)
+        of_others = dict(zip(fit.labels, parameters.tolist(), strict=True))
         level = int(misfit.level_numbers[place])
         without[level] = completed_model(model, baseline, fit.kinds, of_others).model
     there = {level: one for level, one in without.items() if one is not None}
@@ -298,10 +298,8 @@ def excluded_kinds(model: Structure, force_gain_std: float, *, phases: bool) -> 
 
 def _estimates(misfit: WeightedMisfit, fit: EffectFit) -> dict[str, Estimate]:
     """The effects' parameters and their 1σ."""
-    arms = misfit.noise.decorrelated(fit.slopes.T).T
-    size = np.linalg.norm(arms, axis=0)
-    size = np.where(size > 0, size, 1.0)
-    inverse = np.linalg.pinv((arms / size).T @ (arms / size), rcond=1e-12, hermitian=True)
+    arms, size = unit_columns(misfit.noise.decorrelated(fit.slopes.T).T)
+    inverse = np.linalg.pinv(arms.T @ arms, rcond=1e-12, hermitian=True)
     std = np.sqrt(np.diag(inverse)) / size
     return {
         label: Estimate(float(value), float(error))
@@ -311,12 +309,12 @@ def _estimates(misfit: WeightedMisfit, fit: EffectFit) -> dict[str, Estimate]:
 
 def _force_misfit(misfit: WeightedMisfit, baseline: EffectFit, fit: EffectFit) -> ForceMisfit:
     noise, chosen = misfit.noise, misfit.predictions.chosen
-    mine = noise.column < 2
-    used = np.unique(noise.state[mine])
+    rows = noise.column < 2
+    used = np.unique(noise.state[rows])
 
     def left_of(one: EffectFit) -> Float[np.ndarray, "state part"]:
         left = np.full((len(chosen.rows), 2), np.nan)
-        left[noise.state[mine], noise.column[mine]] = noise.without_shared(one.rows)[mine]
+        left[noise.state[rows], noise.column[rows]] = noise.without_shared(one.rows)[rows]
         return left[used]
 
     return ForceMisfit(chosen.rows[used], chosen.sensors[0], left_of(baseline), left_of(fit))

@@ -127,8 +127,8 @@ def weights_of(found: FoundEffects, refined: Refined | None = None) -> Weights:
     """
     sizes = _sizes_of(found.misfit)
     fits = {id(fit): fit for fit in (found.baseline, found.fit, *found.considered)}
-    every = [_weighed(found.misfit, fit, sizes) for fit in fits.values()]
-    weighed = sorted((one for one in every if one is not None), key=lambda one: one.log_weight)
+    fitted = [_weighed(found.misfit, fit, sizes) for fit in fits.values()]
+    weighed = sorted((one for one in fitted if one is not None), key=lambda one: one.log_weight)
     best = {one.kinds: one for one in weighed}
     done: list[Weighed] = []
     # Nothing, the likeliest effects alone, and then the likeliest answers of any size.
@@ -191,8 +191,8 @@ def marginal_of(
     design = np.concatenate([arms, noise.shared, columns], axis=1)
     known, unknown = np.full(arms.shape[1], -1), np.full(columns.shape[1], len(LEVELS))
     group = np.concatenate([known, noise.shared_kind, unknown])
-    left, own = noise.decorrelated(fit.rows), noise.decorrelated(arms.T).T
-    promised = float(np.sum((own @ np.linalg.lstsq(own, left, rcond=1e-10)[0]) ** 2))
+    left, slopes = noise.decorrelated(fit.rows), noise.decorrelated(arms.T).T
+    promised = float(np.sum((slopes @ np.linalg.lstsq(slopes, left, rcond=1e-10)[0]) ** 2))
     # Of answers under other noise: at a fit that explains its records χ² is the square of their
     # distance from it, whatever its own slopes are, and these are no part of the units.
     units = -misfit.n_rows * float(np.log(misfit.predictions.error_scale))
@@ -224,8 +224,8 @@ def log_evidence(model: Marginal, sizes: _Sizes) -> Evidence:
 
     def with_priors(point: np.ndarray) -> tuple[float, np.ndarray]:
         value, slopes = likelihood(point)
-        own, slope = prior_of_sizes.log_density(point)
-        return value + own, slopes + slope
+        prior, slope = prior_of_sizes.log_density(point)
+        return value + prior, slopes + slope
 
     ends = float(sizes.noise[0]), float(sizes.noise[-1])
     bounds = [ends, *(sizes.bounds[place] for place in used)]
@@ -277,8 +277,8 @@ def discrepancies(misfit: WeightedMisfit) -> Iterator[Float[np.ndarray, "row any
     yield _scaled(linear[:, [0]] * of_test)
     level, along = np.asarray(chosen.states.level), []
     for number in np.unique(level):
-        mine, curves = level == number, np.zeros((len(level), 4))
-        curves[mine] = hat_functions(phase[mine], 4)
+        of_level, curves = level == number, np.zeros((len(level), 4))
+        curves[of_level] = hat_functions(phase[of_level], 4)
         along += [(noise.column == k)[:, None] * curves[noise.state] for k in (0, 1)]
     yield _scaled(np.concatenate(along, axis=1))
 
@@ -315,8 +315,8 @@ def _sizes_of(misfit: WeightedMisfit) -> _Sizes:
         right = np.array([joint.log_density(one)[0] for one in noise[:, None]])
         wrong = np.full(len(noise), -np.inf)
     right = right - logsumexp(right)
-    every = (*levels, FlatSize(low, high)), (*ends, (low, high))
-    return _Sizes(*every, noise, right, wrong)
+    known_and_free = (*levels, FlatSize(low, high)), (*ends, (low, high))
+    return _Sizes(*known_and_free, noise, right, wrong)
 
 
 def _log_prior(n_effects: int) -> float:
@@ -332,8 +332,8 @@ def _arms(misfit: WeightedMisfit, fit: EffectFit) -> Float[np.ndarray, "row para
     law = coordinates(fit.labels, scales.amplitude)
     width = np.zeros(len(fit.values))
     for kind in fit.kinds:
-        mine = [k for k, label in enumerate(fit.labels) if label.startswith(f"{kind}.")]
-        width[mine] = _widths(kind, law.inward(fit.values)[mine], scales)
+        places = [k for k, label in enumerate(fit.labels) if label.startswith(f"{kind}.")]
+        width[places] = _widths(kind, law.inward(fit.values)[places], scales)
     return law.slopes(fit.values, fit.slopes) * width
 
 

@@ -58,11 +58,11 @@ _Part = tuple[np.ndarray, np.ndarray, np.ndarray]  # frequency, force, velocity
 def _of_level(diagnosis: Diagnosis, number: int, scale: float = 1.0) -> _Part:
     """Some states of a level, from low to high frequency, at forces so many times larger."""
     data, sensor = diagnosis.data, diagnosis.force_misfit.sensor
-    mine = np.flatnonzero(np.asarray(data.level) == number)
-    mine = mine[np.argsort(np.asarray(data.frequency)[mine], kind="stable")]
-    mine = mine[:: -(-len(mine) // 24)]
-    speed = np.abs(np.asarray(data.velocity)[mine, sensor])
-    return np.asarray(data.frequency)[mine], scale * np.asarray(data.force)[mine], scale * speed
+    rows = np.flatnonzero(np.asarray(data.level) == number)
+    rows = rows[np.argsort(np.asarray(data.frequency)[rows], kind="stable")]
+    rows = rows[:: -(-len(rows) // 24)]
+    speed = np.abs(np.asarray(data.velocity)[rows, sensor])
+    return np.asarray(data.frequency)[rows], scale * np.asarray(data.force)[rows], scale * speed
 
 
 def _states(diagnosis: Diagnosis, parts: list[_Part]) -> SteadyStates:

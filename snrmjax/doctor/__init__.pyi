@@ -1,4 +1,4 @@
 from .check import check_test
-from .findings import KINDS, Checkup, Finding
+from .findings import Checkup
 
-__all__ = ["KINDS", "Checkup", "Finding", "check_test"]
+__all__ = ["Checkup", "check_test"]

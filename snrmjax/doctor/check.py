@@ -68,8 +68,8 @@ def check_test(
     else:
         notes.append(Fact("no_table"))
     for one in recordings:
-        own, unseen = record_findings(one)
-        found += own
+        of_record, unseen = record_findings(one)
+        found += of_record
         notes += unseen
     return Checkup(gravest_first(found), tuple(dict.fromkeys(notes)))
 
@@ -174,17 +174,17 @@ def _finding(seen: CheckedStates, base: Judged, one: TestCorrection, where: str)
     match one.kind:
         case "drift":
             severity = "warning"
-            evidence, mend = Fact("drift", change=one.value, **misses), Fact("mend_drift")
+            evidence, advice = Fact("drift", change=one.value, **misses), Fact("advice_drift")
         case "different_structures":
             n = len(seen.files)
             evidence = Fact(
                 "structures_differ", file=one.file, change=one.value, n_files=n, **misses
             )
-            mend = Fact("mend_structures")
+            advice = Fact("advice_structures")
         case "volts_as_force":
-            evidence, mend, title = _of_gains(one, misses, seen.files)
+            evidence, advice, title = _of_gains(one, misses, seen.files)
         case "force_dropout":
-            severity, mend = "warning", Fact("mend_force_in_noise")
+            severity, advice = "warning", Fact("advice_force_in_noise")
             evidence = Fact(
                 "force_in_noise",
                 fall=deepest_fall(states),
@@ -193,13 +193,13 @@ def _finding(seen: CheckedStates, base: Judged, one: TestCorrection, where: str)
             )
         case "unsettled_steps":
             evidence = Fact("states_unsettled", share=one.value, **misses)
-            mend = Fact("mend_unsettled")
+            advice = Fact("advice_unsettled")
         case _:
             size = states.force if one.column == "force" else np.abs(states.velocity)
             rows = tuple(int(seen.row[k]) for k in np.flatnonzero(size > one.value * 0.999))
-            mend, limited = Fact("mend_clipped_states"), {"column": one.column, "rows": rows}
+            advice, limited = Fact("advice_clipped_states"), {"column": one.column, "rows": rows}
             evidence = Fact("states_clipped", limit=one.value, **limited, **misses)
-    return Finding(one.kind, severity, where, evidence, mend, rows, title=title)
+    return Finding(one.kind, severity, where, evidence, advice, rows, title=title)
 
 
 def _of_gains(
@@ -210,13 +210,13 @@ def _of_gains(
     few = np.flatnonzero(np.abs(gains - np.median(gains)) > 0.5 * GAIN_MATTERS)
     if not len(few) or 2 * len(few) >= len(gains):
         factors = tuple(np.exp(gains[1:] - gains[0]).tolist())
-        return Fact("force_gains_differ", gains=factors, **misses), Fact("mend_force_gains"), None
+        return Fact("force_gains_differ", gains=factors, **misses), Fact("advice_force_gains"), None
     factors = np.exp(gains - np.median(np.delete(gains, few))).tolist()
     levels = tuple(
         (k + 1, files.index((k,)) + 1 if (k,) in files else None, factors[k]) for k in few.tolist()
     )
     return (
         Fact("level_gains", gains=levels, **misses),
-        Fact("mend_level_gains", gains=levels),
+        Fact("advice_level_gains", gains=levels),
         Fact("levels_on_another_scale", levels=tuple(level for level, *_ in levels)),
     )

@@ -52,7 +52,7 @@ def doubt(
 
 def _fact(one: Finding) -> Fact:
     return Fact(
-        "column_misread", evidence=one.evidence, mend=one.mend, importable=bool(one.repairs)
+        "column_misread", evidence=one.evidence, advice=one.advice, importable=bool(one.corrections)
     )
 
 
@@ -75,8 +75,8 @@ def _far(points: BackbonePoints, model: Structure) -> tuple[Fact, ...]:
     if not far.any():
         return ()
     names = tuple(np.array(["natural frequency", "damping"])[far].tolist())
-    lowest, own = ((w / (2 * np.pi), ratio) for w, ratio in (found[0].tolist(), linear.tolist()))
-    return (Fact("far_from_linear_mode", quantities=names, lowest=lowest, linear=own),)
+    lowest, mode = ((w / (2 * np.pi), ratio) for w, ratio in (found[0].tolist(), linear.tolist()))
+    return (Fact("far_from_linear_mode", quantities=names, lowest=lowest, linear=mode),)
 
 
 def linear_damping_note(fit: JointFit, model: Structure) -> tuple[Fact, ...]:

@@ -131,9 +131,9 @@ def _unsettled(seen: CheckedStates, states: TestStates, base: Judged) -> Iterato
     typical = float(np.median(damping)) / 2
     before = np.full(len(states.level), -1)
     for k in range(states.n_levels):
-        mine = np.flatnonzero(states.level == k)
-        mine = mine[np.argsort(seen.order[mine], kind="stable")]
-        before[mine[1:]] = mine[:-1]
+        of_level = np.flatnonzero(states.level == k)
+        of_level = of_level[np.argsort(seen.order[of_level], kind="stable")]
+        before[of_level[1:]] = of_level[:-1]
     first = before < 0
     tried = []
     for share in (0.2, 0.45, 0.7, 0.85):  # of a transient that are left at the end of a step

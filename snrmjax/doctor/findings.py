@@ -44,7 +44,7 @@ _MEANINGS = {
 }
 
 
-class Repair(NamedTuple):
+class ImportCorrection(NamedTuple):
     """How a table is read again, relative to how it was read: what options of an import say."""
 
     response: float = 1.0  # factor of the velocities
@@ -67,9 +67,9 @@ class Finding(NamedTuple):
     severity: Severity
     where: str  # file, level, rows or channel
     evidence: Fact | str
-    mend: Fact | str  # the line or option that mends it
+    advice: Fact | str  # the line or option that mends it
     rows: tuple[int, ...] = ()
-    repairs: tuple[Repair, ...] = ()  # that an import can do, the likeliest first
+    corrections: tuple[ImportCorrection, ...] = ()  # that an import can do, the likeliest first
     title: Fact | None = None  # where the kind is wider than what was found
 
     @property
@@ -79,7 +79,8 @@ class Finding(NamedTuple):
 
     def as_dict(self) -> dict[str, str]:
         """What `check.json` has of it."""
-        return {name: str(getattr(self, name)) for name in _MEANINGS}
+        columns = (self.kind, self.severity, self.where, str(self.evidence), str(self.advice))
+        return dict(zip(_MEANINGS, columns, strict=True))
 
 
 class Checkup(AbstractResult):

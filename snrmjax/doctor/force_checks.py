@@ -17,13 +17,13 @@ from snrmjax.numerics.facts import Fact
 def dropout_findings(seen: CheckedStates, where: str) -> list[Finding]:
     """Levels whose force falls where the response is largest, though the response is not held."""
     states, dropped = seen.test, []
-    for mine, drop, nominal in _falls(states):
-        force, mobility = states.force[mine], seen.mobility[mine]
+    for of_level, drop, nominal in _falls(states):
+        force, mobility = states.force[of_level], seen.mobility[of_level]
         size = np.log(force * mobility)
         # A controlled amplitude wanders by chance; a weak shaker's still peaks at resonance.
         peaked = np.ptp(size) > HELD and np.corrcoef(size, np.log(mobility))[0, 1] > TOGETHER
         if peaked and drop > FORCE_FALLS:
-            dropped.append((drop, mine[force < nominal * (1 - 0.8 * drop)]))
+            dropped.append((drop, of_level[force < nominal * (1 - 0.8 * drop)]))
     if not dropped:
         return []
     worst, at = max(dropped, key=lambda one: one[0])
@@ -31,16 +31,16 @@ def dropout_findings(seen: CheckedStates, where: str) -> list[Finding]:
     evidence = Fact(
         "force_falls", fall=worst, n_levels=len(dropped), of_levels=states.n_levels, rows=rows
     )
-    return [Finding("force_dropout", "warning", where, evidence, Fact("mend_force_falls"), rows)]
+    return [Finding("force_dropout", "warning", where, evidence, Fact("advice_force_falls"), rows)]
 
 
 def _falls(states: TestStates) -> Iterator[tuple[Int[np.ndarray, " state"], float, float]]:
     """Of each level of some states these, and what `fall` says of them."""
     for k in range(states.n_levels):
-        mine, fewest = np.flatnonzero(states.level == k), 5
-        if len(mine) >= fewest:
-            force = states.force[mine]
-            yield mine, *fall(force, np.abs(states.velocity[mine]) / force)
+        of_level, fewest = np.flatnonzero(states.level == k), 5
+        if len(of_level) >= fewest:
+            force = states.force[of_level]
+            yield of_level, *fall(force, np.abs(states.velocity[of_level]) / force)
 
 
 def fall(force: np.ndarray, mobility: np.ndarray) -> tuple[float, float]:
@@ -90,7 +90,7 @@ def harmonic_findings(
     if not found:
         return []
     evidence = Fact("response_harmonics_of_force", harmonics=tuple(found))
-    return [Finding(FORCE_HARMONICS, "warning", where, evidence, Fact("mend_harmonics"))]
+    return [Finding(FORCE_HARMONICS, "warning", where, evidence, Fact("advice_harmonics"))]
 
 
 def _of_force(
@@ -106,14 +106,14 @@ def _of_force(
     states = seen.test
     w = order * states.frequency[good]
     if model is None:
-        own, rate, constant = float(np.median(fit.stiffness)), 0.0, 1.0
+        natural_square, rate, constant = float(np.median(fit.stiffness)), 0.0, 1.0
     else:
         modes = model.modes
         one = modes.mode_of_interest
-        own = float(modes.natural_frequency[one]) ** 2
-        rate = 2 * float(modes.damping_ratio[one]) * own**0.5
+        natural_square = float(modes.natural_frequency[one]) ** 2
+        rate = 2 * float(modes.damping_ratio[one]) * natural_square**0.5
         constant = states.constant
-    mobility = 1j * w * constant / (own - w**2 + 1j * rate * w)
+    mobility = 1j * w * constant / (natural_square - w**2 + 1j * rate * w)
     size = np.abs(seen.recorded[good])
     turn = np.exp(1j * order * np.angle(seen.recorded[good]))
     force = states.force[good]

@@ -124,8 +124,8 @@ class Judged(NamedTuple):
         another of nearly these amplitudes on.
         """
         if start is not None and start is not self:
-            own, other = self.states.amplitude, start.states.amplitude
-            if not (start.damped and np.allclose(own, other, rtol=1.0)):
+            amplitude, other = self.states.amplitude, start.states.amplitude
+            if not (start.damped and np.allclose(amplitude, other, rtol=1.0)):
                 return self
         jacobian = self.evidence - self.posterior.log_evidence
         fit = judge(self.states, jacobian, 16, start, discrepancy=discrepancy)
@@ -262,8 +262,8 @@ def checked_states(
                 :, sensor
             ]
         gain, phase, frequency, damping = model.level_stds
-        own, ratio = float(modes.natural_frequency[one]), float(modes.damping_ratio[one])
-        stds = (gain, phase, 2 * frequency / own, damping / max(ratio, 1e-6))
+        natural, ratio = float(modes.natural_frequency[one]), float(modes.damping_ratio[one])
+        stds = (gain, phase, 2 * frequency / natural, damping / max(ratio, 1e-6))
     sign = -1.0 if constant < 0 else 1.0
     errors, stated = state_errors(np.asarray(relative_errors(some))[:, sensor])
     noise = float(np.median(errors[:, 1:])) if stated else np.nan

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
-from snrmjax.doctor.findings import Finding, Kind, Repair
+from snrmjax.doctor.findings import Finding, ImportCorrection, Kind
 from snrmjax.doctor.judgement import CheckedStates, Judged, Scale, any_mass, judge
 from snrmjax.doctor.priors import CLEARLY, MODAL_MASS, OTHER_SCALE, SCATTER
 from snrmjax.identify.test_model.states import TestStates
@@ -23,7 +23,7 @@ class Meaning(NamedTuple):
     name: str
     change: Callable[[Phasors, Float[np.ndarray, " state"]], Phasors]  # of V and Ω
     kind: Kind | None  # None as recorded
-    repair: Repair | None = None
+    correction: ImportCorrection | None = None
     log_jacobian: float = 0.0  # of a recorded phasor's logarithm to the one that is read
 
 
@@ -33,21 +33,27 @@ _PHASE: Kind = "conjugated_response"
 _UNIT: Kind = "degrees_for_radians"
 AS_RECORDED = Meaning("as_recorded", lambda v, _: v, None)
 OPPOSITE = Meaning("opposite", lambda v, _: -v, "shape_not_mass_normalised")
-CONJUGATED = Meaning("conjugated", lambda v, _: v.conj(), _PHASE, Repair(conjugate=True))
+CONJUGATED = Meaning("conjugated", lambda v, _: v.conj(), _PHASE, ImportCorrection(conjugate=True))
 OTHERS = (
     OPPOSITE,
     CONJUGATED,
     Meaning("conjugated_opposite", lambda v, _: -v.conj(), _PHASE),
     Meaning(
-        "acceleration", lambda v, w: v / (1j * w), _ACCELERATION, Repair(quantity="acceleration")
+        "acceleration",
+        lambda v, w: v / (1j * w),
+        _ACCELERATION,
+        ImportCorrection(quantity="acceleration"),
     ),
     Meaning(
-        "displacement", lambda v, w: v * 1j * w, _DISPLACEMENT, Repair(quantity="displacement")
+        "displacement",
+        lambda v, w: v * 1j * w,
+        _DISPLACEMENT,
+        ImportCorrection(quantity="displacement"),
     ),
     Meaning(
         "radians_as_degrees",
         lambda v, _: np.abs(v) * np.exp(1j * _DEGREES * np.angle(v)),
-        *(_UNIT, Repair(phase_unit="rad"), float(np.log(_DEGREES))),
+        *(_UNIT, ImportCorrection(phase_unit="rad"), float(np.log(_DEGREES))),
     ),
 )
 OF_SIZES = (
@@ -58,7 +64,7 @@ OF_SIZES = (
 IN_DEGREES = Meaning(
     "degrees_as_radians",
     lambda v, _: v,
-    *(_UNIT, Repair(phase_unit="deg"), -float(np.log(_DEGREES))),
+    *(_UNIT, ImportCorrection(phase_unit="deg"), -float(np.log(_DEGREES))),
 )
 
 
@@ -178,9 +184,9 @@ def misread(recorded: Judged, best: Reading, where: str) -> Finding:
         misfit=best.judged.misfit,
         misfit_as_recorded=recorded.misfit if recorded.damped else None,
     )
-    repairs = () if meaning.repair is None else (meaning.repair,)
-    mend = Fact("mend_reading", reading=meaning.name)
-    return Finding(meaning.kind, "error", where, evidence, mend, repairs=repairs)
+    corrections = () if meaning.correction is None else (meaning.correction,)
+    advice = Fact("advice_reading", reading=meaning.name)
+    return Finding(meaning.kind, "error", where, evidence, advice, corrections=corrections)
 
 
 def _in_degrees(seen: CheckedStates, known_mass: bool) -> list[Reading]:
@@ -221,18 +227,18 @@ def _phases_of_amplitudes(seen: CheckedStates) -> list[Float[np.ndarray, " state
     states, mobility = seen.test, seen.mobility
     size, top, turns = np.zeros(len(mobility)), np.zeros(len(mobility)), np.zeros(len(mobility))
     for k in range(states.n_levels):
-        mine = np.flatnonzero(states.level == k)
-        if len(mine) < 3:
+        of_level = np.flatnonzero(states.level == k)
+        if len(of_level) < 3:
             return []
-        peak = mine[np.argmax(mobility[mine])]
-        size[mine] = np.arccos(np.minimum(mobility[mine] / (1.02 * mobility[peak]), 1.0))
-        top[mine] = np.sign(states.frequency[peak] - states.frequency[mine])
-        mine = mine[np.argsort(mobility[mine])]
-        omega = states.frequency[mine]
+        peak = of_level[np.argmax(mobility[of_level])]
+        size[of_level] = np.arccos(np.minimum(mobility[of_level] / (1.02 * mobility[peak]), 1.0))
+        top[of_level] = np.sign(states.frequency[peak] - states.frequency[of_level])
+        of_level = of_level[np.argsort(mobility[of_level])]
+        omega = states.frequency[of_level]
         beside = np.interp(
-            np.arange(len(mine)) + 0.5,
-            np.arange(len(mine) - 1) + 0.5,
+            np.arange(len(of_level)) + 0.5,
+            np.arange(len(of_level) - 1) + 0.5,
             0.5 * (omega[1:] + omega[:-1]),
         )
-        turns[mine] = np.sign(beside - omega)
+        turns[of_level] = np.sign(beside - omega)
     return [top * size, size, -size, turns * size]

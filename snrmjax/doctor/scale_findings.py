@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from snrmjax.doctor.findings import Finding, Repair, Severity
+from snrmjax.doctor.findings import Finding, ImportCorrection, Severity
 from snrmjax.doctor.judgement import Judged, Scale, judge
 from snrmjax.doctor.priors import BAND, CERTAIN, MODAL_MASS, MORE_DAMPING, OTHER_SCALE
 from snrmjax.identify.test_model.states import TestStates
@@ -42,9 +42,13 @@ def scale_findings(
     off, near = float(np.log(kappa)), float(np.hypot(MODAL_MASS, 3 * scale.std))
     if abs(abs(off) - 0.5 * np.log(2)) < near:
         column = "response" if off > 0 else "force"
-        evidence, mend = Fact("rms", scale=size, column=column), Fact("mend_rms", column=column)
-        repair = Repair(response=2**0.5) if off > 0 else Repair(force=2**0.5)
-        return [Finding("rms_for_peak", "error", where, evidence, mend, repairs=(repair,))]
+        evidence, advice = Fact("rms", scale=size, column=column), Fact("advice_rms", column=column)
+        correction = (
+            ImportCorrection(response=2**0.5) if off > 0 else ImportCorrection(force=2**0.5)
+        )
+        return [
+            Finding("rms_for_peak", "error", where, evidence, advice, corrections=(correction,))
+        ]
     bend = _bend(scale.judged.states, scale.judged.stiffness, model)
     agrees = bend is not None and abs(np.log(bend)) < OTHER_SCALE * 3
     units = [one for one in _mixed_units() if abs(off - np.log(one.mass)) < near]
@@ -55,17 +59,19 @@ def scale_findings(
         severity, size = "warning", Fact("if_units_are_right")
         names = tuple(one[:3] for one in units)
         evidence = Fact("mixed_units", **asked, factor=units[0].mass, units=names)
-        repairs = tuple(one.repair for one in units)
-        mend = Fact("mend_units", units=names)
-        found.append(Finding("wrong_unit", "error", where, evidence, mend, repairs=repairs))
+        corrections = tuple(one.correction for one in units)
+        advice = Fact("advice_units", units=names)
+        found.append(
+            Finding("wrong_unit", "error", where, evidence, advice, corrections=corrections)
+        )
     of_force, of_shape = _signs(scale.judged, model, bend, agrees=agrees)
     if of_force >= of_shape:
         evidence = Fact("voltage_for_force", scale=size, gain=kappa)
-        volts = Finding("volts_as_force", severity, where, evidence, Fact("mend_voltage"))
-        found.append(volts._replace(repairs=(Repair(force_unit="V"),)))
+        volts = Finding("volts_as_force", severity, where, evidence, Fact("advice_voltage"))
+        found.append(volts._replace(corrections=(ImportCorrection(force_unit="V"),)))
     if of_shape >= of_force:
-        evidence, mend = Fact("shape_scale", scale=size), Fact("mend_shape", factor=kappa**0.5)
-        found.append(Finding("shape_not_mass_normalised", severity, where, evidence, mend))
+        evidence, advice = Fact("shape_scale", scale=size), Fact("advice_shape", factor=kappa**0.5)
+        found.append(Finding("shape_not_mass_normalised", severity, where, evidence, advice))
     return found
 
 
@@ -78,13 +84,13 @@ class _MixedUnit(NamedTuple):
     mass: float  # over the model's
 
     @property
-    def repair(self) -> Repair:
+    def correction(self) -> ImportCorrection:
         """Reading with the right unit."""
         written = {"m/s²": "m/s2", "µm": "um", "inches": "in", "pounds": "lbf"}
         unit = written.get(self.unit, self.unit)
         if self.column == "force":
-            return Repair(force=1 / self.mass, force_unit=unit)
-        return Repair(response=self.mass, unit=unit)
+            return ImportCorrection(force=1 / self.mass, force_unit=unit)
+        return ImportCorrection(response=self.mass, unit=unit)
 
 
 def _mixed_units() -> Iterator[_MixedUnit]:
@@ -92,14 +98,14 @@ def _mixed_units() -> Iterator[_MixedUnit]:
 
     The likely one first: a number of the small unit read as one of the large, then the reverse.
     """
-    every = (
+    pairs = (
         *(("response", "g", "m/s²", 9.80665), ("response", "mm", "m", 1e-3)),
         *(("response", "µm", "m", 1e-6), ("response", "inches", "m", 0.0254)),
         *(("force", "mN", "N", 1e3), ("force", "kN", "N", 1e-3)),
         ("force", "pounds", "N", 1 / 4.4482216),
     )
-    yield from (_MixedUnit(*one) for one in every)
-    yield from (_MixedUnit(of, other, unit, 1 / mass) for of, unit, other, mass in every)
+    yield from (_MixedUnit(*one) for one in pairs)
+    yield from (_MixedUnit(of, other, unit, 1 / mass) for of, unit, other, mass in pairs)
 
 
 def _signs(fit: Judged, model: Structure, bend: float | None, *, agrees: bool) -> tuple[int, int]:
@@ -131,9 +137,9 @@ def _bend(states: TestStates, stiffness: np.ndarray, model: Structure) -> float 
     beta = 2 * np.pi * (np.arange(64) + 0.5) / 64
     x = q[:, None] * np.cos(beta)
     force = sum(degree * c * x ** (degree - 1) for degree, c in terms)
-    own = float(modes.natural_frequency[one]) ** 2
-    predicted = 2 * np.mean(force * np.cos(beta), axis=1) / q / own
-    measured = stiffness / own - 1
+    natural_square = float(modes.natural_frequency[one]) ** 2
+    predicted = 2 * np.mean(force * np.cos(beta), axis=1) / q / natural_square
+    measured = stiffness / natural_square - 1
     if np.ptp(measured) < 0.01 or np.ptp(predicted) < 1e-6:
         return None
     slope = float(np.polyfit(predicted, measured, 1)[0])
@@ -149,17 +155,17 @@ def shaker_damping(fit: Judged, model: Structure, where: str) -> list[Finding]:
     """
     modes = model.modes
     one = modes.mode_of_interest
-    own, ratio = float(modes.natural_frequency[one]), float(modes.damping_ratio[one])
+    natural, ratio = float(modes.natural_frequency[one]), float(modes.damping_ratio[one])
     std = float(modes.damping_ratio_std[one])
     amplitude = fit.states.amplitude
     if not std > 0 or not ratio > 0 or np.ptp(np.log(amplitude)) < 1.0:
         return []
-    times = fit.damping / (2 * own * ratio)
+    times = fit.damping / (2 * natural * ratio)
     excess = float(times.min()) - 1
-    away = float(np.sqrt(max(fit.stiffness[np.argmin(amplitude)], 0.0))) / own - 1
+    away = float(np.sqrt(max(fit.stiffness[np.argmin(amplitude)], 0.0))) / natural - 1
     certain = CERTAIN * times.min() * std / ratio
     if excess < max(MORE_DAMPING, certain) or np.ptp(times) > 0.5 * excess or abs(away) > ratio:
         return []
     evidence = Fact("shaker_damping", ratio=float(times.min()), frequency_off=abs(away))
-    volts = Finding("volts_as_force", "warning", where, evidence, Fact("mend_shaker_damping"))
-    return [volts._replace(repairs=(Repair(force_unit="V"),))]
+    volts = Finding("volts_as_force", "warning", where, evidence, Fact("advice_shaker_damping"))
+    return [volts._replace(corrections=(ImportCorrection(force_unit="V"),))]

@@ -1,7 +1,7 @@
 """The force of a low-level test that is known in volts only, from the linear response."""
 
 import dataclasses
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -170,6 +170,56 @@ def _fit_levels(
     return masked(best), masked(std), covariance, jnp.where(good, misfit, jnp.nan), status
 
 
+class _Level(NamedTuple):
+    """The states of one level, and their velocities' deviations from those of the model."""
+
+    modes: LinearModes
+    data: SteadyStates
+    used: Bool[Array, "state sensor"]
+    measured: Complex[Array, "state sensor"]  # m/s, zero where not used
+    along: Float[Array, "state sensor"]  # m/s, 1σ along the measured velocity
+    across: Float[Array, "state sensor"]  # m/s, and across it
+    phase_is_free: bool
+
+    def weighted(self, velocity: Complex[Array, "state sensor"]) -> Float[Array, " number"]:
+        """Velocities in 1σ, along and across those that were measured."""
+        direction = jnp.where(jnp.abs(self.measured) > 0, self.measured, 1.0)
+        turned = jnp.where(self.used, velocity / (direction / jnp.abs(direction)), 0.0)
+        parts = (turned.real / self.along, turned.imag / self.across)
+        return jnp.concatenate([part.ravel() for part in parts])
+
+    def unit_response(self, mode: Float[Array, " 2"]) -> Complex[Array, "state sensor"]:
+        """Velocities under 1 N with another ω_j and ζ_j."""
+        j, frequency = self.modes.mode_of_interest, self.data.frequency
+        adapted = dataclasses.replace(
+            self.modes,
+            natural_frequency=self.modes.natural_frequency.at[j].set(mode[0]),
+            damping_ratio=self.modes.damping_ratio.at[j].set(mode[1]),
+        )
+        return linear_response(adapted, frequency, jnp.ones_like(frequency))
+
+    def deviation(self, unknown: Float[Array, " 4"]) -> Float[Array, " number"]:
+        """In 1σ, of F, ω_j, ζ_j and ψ."""
+        force = unknown[0] * jnp.exp(1j * unknown[3])
+        return self.weighted(force * self.unit_response(unknown[1:3]) - self.measured)
+
+    def eliminated(
+        self, mode: Float[Array, " 2"]
+    ) -> tuple[Float[Array, " 4"], Float[Array, " number"]]:
+        """The unknowns and deviations with the best F and ψ, as F e^{iψ} = a + ib."""
+        unit, target = self.unit_response(mode), self.weighted(self.measured)
+        real = self.weighted(unit)
+        if not self.phase_is_free:
+            a = real @ target / (real @ real)
+            return jnp.stack([a, *mode, 0.0]), a * real - target
+        imag = self.weighted(1j * unit)
+        across_real = imag - (real @ imag / (real @ real)) * real
+        b = across_real @ target / (across_real @ imag)
+        a = real @ (target - b * imag) / (real @ real)
+        best = jnp.stack([jnp.hypot(a, b), *mode, jnp.arctan2(b, a)])
+        return best, a * real + b * imag - target
+
+
 def _fit_level(
     modes: LinearModes,
     data: SteadyStates,
@@ -178,100 +228,82 @@ def _fit_level(
     adjusted: tuple[bool, bool, bool],
 ) -> tuple[Array, Array, Array, Array, Array]:
     """The unknowns are (F, ω_j, ζ_j, ψ); F and ψ are linear, so that only ω_j and ζ_j iterate."""
-    j = modes.mode_of_interest
-    natural, damping = modes.natural_frequency[j], modes.damping_ratio[j]
     used = member[:, None] & data.measured
     n_used = jnp.sum(used)
     measured = jnp.where(used, data.velocity, 0.0)
     size = jnp.sqrt(jnp.sum(jnp.abs(measured) ** 2) / jnp.maximum(n_used, 1))
     size = jnp.where(size > 0, size, 1.0)
-    direction = jnp.where(jnp.abs(measured) > 0, measured, 1.0)
-    direction = direction / jnp.abs(direction)
     weigh = used & use_stated
     along = jnp.where(weigh, data.velocity_std, size)
     across = jnp.where(weigh, data.phase_std * jnp.abs(measured), size)
-
-    def weighted(velocity: Complex[Array, "state sensor"]) -> Float[Array, " number"]:
-        turned = jnp.where(used, velocity / direction, 0.0)
-        return jnp.concatenate([(turned.real / along).ravel(), (turned.imag / across).ravel()])
-
-    def unit_response(mode: Float[Array, " 2"]) -> Complex[Array, "state sensor"]:
-        adapted = dataclasses.replace(
-            modes,
-            natural_frequency=modes.natural_frequency.at[j].set(mode[0]),
-            damping_ratio=modes.damping_ratio.at[j].set(mode[1]),
-        )
-        return linear_response(adapted, data.frequency, jnp.ones_like(data.frequency))
-
-    def deviation(unknown: Float[Array, " 4"]) -> Float[Array, " number"]:
-        force = unknown[0] * jnp.exp(1j * unknown[3])
-        return weighted(force * unit_response(unknown[1:3]) - measured)
-
-    target = weighted(measured)
-
-    def eliminated(mode: Float[Array, " 2"]) -> tuple[Float[Array, " 4"], Float[Array, " number"]]:
-        """The unknowns and deviations with the best F and ψ, as F e^{iψ} = a + ib."""
-        unit = unit_response(mode)
-        real = weighted(unit)
-        if not adjusted[2]:
-            a = real @ target / (real @ real)
-            return jnp.stack([a, *mode, 0.0]), a * real - target
-        imag = weighted(1j * unit)
-        across_real = imag - (real @ imag / (real @ real)) * real
-        b = across_real @ target / (across_real @ imag)
-        a = real @ (target - b * imag) / (real @ real)
-        best = jnp.stack([jnp.hypot(a, b), *mode, jnp.arctan2(b, a)])
-        return best, a * real + b * imag - target
-
-    frequencies, ratios = natural[None], damping[None]
+    level = _Level(modes, data, used, measured, along, across, adjusted[2])
     lowest = jnp.min(jnp.where(member, data.frequency, jnp.inf))
     highest = jnp.max(jnp.where(member, data.frequency, -jnp.inf))
+    mode, solved = _best_mode(level, lowest, highest, adjusted)
+    best, remaining = level.eliminated(mode)
+    freedom = 2 * n_used - (1 + sum(adjusted))
+    squares = jnp.sum(remaining**2)
+    misfit = jnp.where(freedom > 0, jnp.sqrt(squares / jnp.maximum(freedom, 1)), jnp.nan)
+    # Stated errors that do not explain the misfit are too small for the model: enlarge them.
+    at_least_one = jnp.maximum(1.0, jnp.nan_to_num(misfit, nan=1.0))
+    std, shared, determined = _errors(
+        level, best, jnp.where(use_stated, at_least_one, misfit), adjusted
+    )
+    solved &= (mode[0] > 0.5 * lowest) & (mode[0] < 2 * highest) & jnp.all(jnp.isfinite(best))
+    status = jnp.where(best[0] > 0, int(ForceStatus.SUCCESSFUL), int(ForceStatus.NEGATIVE))
+    status = jnp.where(solved & determined, status, int(ForceStatus.NOT_CONVERGED))
+    status = jnp.where(freedom >= 0, status, int(ForceStatus.TOO_FEW))
+    return best, std, shared, misfit * jnp.where(use_stated, 1.0, size), status
+
+
+def _best_mode(
+    level: _Level, lowest: Array, highest: Array, adjusted: tuple[bool, bool, bool]
+) -> tuple[Float[Array, " 2"], Bool[Array, ""]]:
+    """ω_j and ζ_j of the least deviations, by a scan and steps from its best point, if found."""
+    j = level.modes.mode_of_interest
+    natural, damping = level.modes.natural_frequency[j], level.modes.damping_ratio[j]
+    frequencies, ratios = natural[None], damping[None]
     if adjusted[0]:
         frequencies = jnp.append(jnp.linspace(lowest, highest, 128), natural)
     if adjusted[1]:
         ratios = jnp.maximum(damping, 1e-4) * 2.0 ** jnp.arange(-3.0, 4.0)
     grid = jnp.stack(jnp.meshgrid(frequencies, ratios), axis=-1).reshape(-1, 2)
-    misfits = jax.lax.map(lambda mode: jnp.sum(eliminated(mode)[1] ** 2), grid)
+    misfits = jax.lax.map(lambda mode: jnp.sum(level.eliminated(mode)[1] ** 2), grid)
     start = grid[jnp.nanargmin(misfits)]
     iterated = np.flatnonzero(adjusted[:2])
+    finite = jnp.all(jnp.isfinite(level.measured))
+    if not iterated.size:
+        return start, finite
 
     def mode_of(step: Float[Array, " iterated"]) -> Float[Array, " 2"]:
         full = jnp.zeros(2).at[iterated].set(step)
         return start * jnp.stack([1 + start[1] * full[0], jnp.exp(full[1])])
 
-    mode, solved = start, jnp.all(jnp.isfinite(measured))
-    if iterated.size:
-        solution: optx.Solution = optx.least_squares(
-            lambda step, _: eliminated(mode_of(step))[1],
-            optx.LevenbergMarquardt(rtol=1e-6, atol=1e-7),
-            jnp.zeros(iterated.size),
-            max_steps=128,
-            throw=False,
-        )
-        mode = mode_of(solution.value)
-        solved &= jnp.asarray(solution.result == optx.RESULTS.successful)
-    best, remaining = eliminated(mode)
+    solution: optx.Solution = optx.least_squares(
+        lambda step, _: level.eliminated(mode_of(step))[1],
+        optx.LevenbergMarquardt(rtol=1e-6, atol=1e-7),
+        jnp.zeros(iterated.size),
+        max_steps=128,
+        throw=False,
+    )
+    found = jnp.asarray(solution.result == optx.RESULTS.successful)
+    return mode_of(solution.value), finite & found
+
+
+def _errors(
+    level: _Level, best: Float[Array, " 4"], enlarged: Array, adjusted: tuple[bool, bool, bool]
+) -> tuple[Float[Array, " 4"], Float[Array, " 2"], Bool[Array, ""]]:
+    """1σ of the unknowns, what stated errors of a held ω_j and ζ_j do to F, and if all is told."""
     scale = jnp.where(best == 0, 1.0, best).at[3].set(1.0)
-    sensitivity = jax.jacfwd(deviation)(best) * scale
+    sensitivity = jax.jacfwd(level.deviation)(best) * scale
     free = np.array([True, *adjusted])
     orthogonal, upper = jnp.linalg.qr(sensitivity[:, free])
     singular = jnp.linalg.svd(upper, compute_uv=False)
     inverse = jax.scipy.linalg.solve_triangular(upper, jnp.eye(upper.shape[0]))
-    freedom = 2 * n_used - upper.shape[0]
-    squares = jnp.sum(remaining**2)
-    misfit = jnp.where(freedom > 0, jnp.sqrt(squares / jnp.maximum(freedom, 1)), jnp.nan)
-    # Stated errors that do not explain the misfit are too small for the model: enlarge them.
-    at_least_one = jnp.maximum(1.0, jnp.nan_to_num(misfit, nan=1.0))
-    enlarged = jnp.where(use_stated, at_least_one, misfit)
     spread = jnp.linalg.norm(inverse, axis=1) * enlarged
     std = jnp.zeros(4).at[free].set(jnp.abs(scale[free]) * spread)
-    # What the stated errors of ω_j and ζ_j, where they are held, do to the force of every level.
+    modes, j = level.modes, level.modes.mode_of_interest
     held = jnp.stack([modes.natural_frequency_std[j], modes.damping_ratio_std[j]])
     held = jnp.where(jnp.asarray(adjusted[:2]), 0.0, held) / scale[1:3]
     shared = -scale[0] * (inverse @ (orthogonal.T @ sensitivity[:, 1:3]))[0] * held
-    solved &= (mode[0] > 0.5 * lowest) & (mode[0] < 2 * highest) & jnp.all(jnp.isfinite(best))
-    status = jnp.where(best[0] > 0, int(ForceStatus.SUCCESSFUL), int(ForceStatus.NEGATIVE))
-    determined = singular[-1] > 1e-9 * singular[0]
-    status = jnp.where(solved & determined, status, int(ForceStatus.NOT_CONVERGED))
-    status = jnp.where(freedom >= 0, status, int(ForceStatus.TOO_FEW))
-    return best, std, shared, misfit * jnp.where(use_stated, 1.0, size), status
+    return std, shared, singular[-1] > 1e-9 * singular[0]

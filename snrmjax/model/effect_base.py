@@ -166,7 +166,7 @@ class AbstractMemoryless(AbstractForce):
         """The force f(q, q̇) on the left of the modal equation, in kg^1/2 m/s²."""
 
     def cycle_force(self, displacement: Samples, velocity: Samples) -> Samples:
-        """See `AbstractForce.cycle_force`; valid for any samples, of one period or not."""
+        """The force at any samples, of one period or not."""
         return jax.vmap(self.force)(displacement, velocity)
 
 
@@ -184,11 +184,11 @@ class AbstractKinked(AbstractMemoryless):
         """The force with its kinks rounded over ±`width` (kg^1/2 m) of displacement."""
 
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
-        """See `AbstractMemoryless.force`."""
+        """The force with sharp kinks."""
         return self.rounded_force(displacement, velocity, jnp.zeros(()))
 
     def cycle_force(self, displacement: Samples, velocity: Samples) -> Samples:
-        """See `AbstractForce.cycle_force`; the kinks are rounded with the cycle's own range."""
+        """The force with kinks rounded by the cycle's own range of q."""
         width = 0.5 * KINK_WIDTH * (jnp.max(displacement) - jnp.min(displacement))
         return jax.vmap(lambda q, v: self.rounded_force(q, v, width))(displacement, velocity)
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from snrmjax.doctor.check import check_test
-from snrmjax.doctor.findings import Checkup, Finding, Repair
+from snrmjax.doctor.findings import Checkup, Finding, ImportCorrection
 from snrmjax.io.exchange.import_map import ImportMap, read_import_map
 from snrmjax.io.files import FilePath
 from snrmjax.io.laboratory.checkups import read_recordings
@@ -68,31 +68,32 @@ def with_imports(checkup: Checkup, read: FilesRead | None) -> Checkup:
     certain = [finding for finding in checkup.findings if is_certain(finding)]
     told = []
     for finding in checkup.findings:
-        lines = [line for repair in finding.repairs if (line := _command(repair, read))]
-        mend = str(finding.mend)
-        mend = f"{mend.rstrip('.')}: {', or '.join(lines)}." if lines else mend
+        lines = [line for correction in finding.corrections if (line := _command(correction, read))]
+        advice = str(finding.advice)
+        advice = f"{advice.rstrip('.')}: {', or '.join(lines)}." if lines else advice
         if (
             len(certain) > 1
             and finding is certain[0]
             and (line := _command(_joined(certain), read))
         ):
-            mend = f"{' and '.join(each.name for each in certain)} at once: {line}. Alone, {mend}"
-        told.append(finding._replace(mend=mend))
+            names = " and ".join(each.name for each in certain)
+            advice = f"{names} at once: {line}. Alone, {advice}"
+        told.append(finding._replace(advice=advice))
     return Checkup(tuple(told), checkup.notes)
 
 
 def is_certain(one: Finding) -> bool:
     """Whether a finding leaves no choice of what all numbers are, and an import can say it."""
-    if one.severity != "error" or len(one.repairs) != 1:
+    if one.severity != "error" or len(one.corrections) != 1:
         return False
-    (repair,) = one.repairs
-    return bool(_options_of_own(repair)) and repair.force_unit != "V"
+    (correction,) = one.corrections
+    return bool(_options_of_own(correction)) and correction.force_unit != "V"
 
 
-def _joined(findings: Sequence[Finding]) -> Repair:
-    """Several findings' repairs as one; each was found with the others' errors mended."""
-    every = [finding.repairs[0] for finding in findings]
-    return Repair(
+def _joined(findings: Sequence[Finding]) -> ImportCorrection:
+    """Several findings' corrections as one; each was found with the others' errors mended."""
+    every = [finding.corrections[0] for finding in findings]
+    return ImportCorrection(
         response=math.prod(one.response for one in every),
         force=math.prod(one.force for one in every),
         unit="".join(one.unit for one in every),
@@ -102,10 +103,10 @@ def _joined(findings: Sequence[Finding]) -> Repair:
     )
 
 
-def _command(repair: Repair, read: FilesRead) -> str:
-    """The import that does a repair; empty where no options of it can."""
+def _command(correction: ImportCorrection, read: FilesRead) -> str:
+    """The import that does a correction; empty where no options of it can."""
     own = read.map_file is None
-    options = _options_of_own(repair) if own else _options_of_laboratory(repair, read.told)
+    options = _options_of_own(correction) if own else _options_of_laboratory(correction, read.told)
     if not options:
         return ""
     told = () if own else ("--map", str(read.map_file))
@@ -116,32 +117,35 @@ def _command(repair: Repair, read: FilesRead) -> str:
     return f"`{' '.join(quoted)}`"
 
 
-def _options_of_own(repair: Repair) -> list[str]:
+def _options_of_own(correction: ImportCorrection) -> list[str]:
     """Options that read our own table as what it is; none where it does not hold enough."""
-    if repair.force_unit == "V":
+    if correction.force_unit == "V":
         return ["--force-unit", "V"]
     words = []
-    if repair.quantity or repair.response != 1:
-        size = f"{repair.response:.8g} " if repair.response != 1 else ""
-        words += ["--unit", f"{size}{_SI[repair.quantity]}"]
-    if repair.force != 1:
-        words += ["--force-unit", f"{repair.force:.8g} N"]
-    return [*words, *(["--phase-sign", "lag"] if repair.conjugate else [])]
+    if correction.quantity or correction.response != 1:
+        size = f"{correction.response:.8g} " if correction.response != 1 else ""
+        words += ["--unit", f"{size}{_SI[correction.quantity]}"]
+    if correction.force != 1:
+        words += ["--force-unit", f"{correction.force:.8g} N"]
+    return [*words, *(["--phase-sign", "lag"] if correction.conjugate else [])]
 
 
-def _options_of_laboratory(repair: Repair, told: ImportMap) -> list[str]:
+def _options_of_laboratory(correction: ImportCorrection, told: ImportMap) -> list[str]:
     """Likewise of a laboratory's files by a map: where the units that a finding names are all."""
     kinds = {response.quantity for response in told.responses}
-    named = (repair.response == 1 or repair.unit) and (repair.force == 1 or repair.force_unit)
-    if repair.quantity or not named or len(kinds) != 1 or (repair.conjugate and told.record):
+    named = correction.response == 1 or correction.unit
+    named = named and (correction.force == 1 or correction.force_unit)
+    if correction.quantity or not named or len(kinds) != 1:
+        return []
+    if correction.conjugate and told.record:
         return []
     words = []
-    if repair.unit:
+    if correction.unit:
         (kind,) = kinds
-        if (repair.unit in ("g", "m/s2")) != (kind == "acceleration"):
+        if (correction.unit in ("g", "m/s2")) != (kind == "acceleration"):
             return []
-        words += ["--unit", f"{repair.unit}{_PER_SECOND.get(kind, '')}"]
-    words += ["--force-unit", repair.force_unit] if repair.force_unit else []
-    words += ["--phase-unit", repair.phase_unit] if repair.phase_unit else []
+        words += ["--unit", f"{correction.unit}{_PER_SECOND.get(kind, '')}"]
+    words += ["--force-unit", correction.force_unit] if correction.force_unit else []
+    words += ["--phase-unit", correction.phase_unit] if correction.phase_unit else []
     sign = "lead" if told.phase_sign == "lag" else "lag"
-    return [*words, *(["--phase-sign", sign] if repair.conjugate else [])]
+    return [*words, *(["--phase-sign", sign] if correction.conjugate else [])]

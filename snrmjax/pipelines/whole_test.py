@@ -274,12 +274,12 @@ def _stop_at_errors(checkup: Checkup) -> None:
     first, *others = errors
     more = "".join(
         f" {'Besides,' if is_certain(first) and is_certain(other) else 'Or'} {other.evidence} "
-        f"{other.mend}"
+        f"{other.advice}"
         for other in others
     )
     raise ValueError(
         f"is this meant? {first.name} in {first.where}: {first.evidence} To mend "
-        f"it: {first.mend}{more} To go on nevertheless: `--go-on`."
+        f"it: {first.advice}{more} To go on nevertheless: `--go-on`."
     )
 
 

@@ -12,11 +12,7 @@ from .solutions.forced_response import (
 from .solutions.isolated_responses import IsolatedSearch, isolated_responses
 from .solutions.mode_at_velocities import normal_mode_at_velocities
 from .solutions.normal_modes import nonlinear_normal_mode
-from .solutions.periodic_motion import (
-    motions_at_velocities,
-    periodic_motion,
-    response_at_velocities,
-)
+from .solutions.periodic_motion import periodic_motion
 from .solutions.time_integration import (
     IntegrationAccuracy,
     MotionStatus,
@@ -65,7 +61,6 @@ __all__ = [
     "forced_response",
     "forced_response_batch",
     "isolated_responses",
-    "motions_at_velocities",
     "multisine_test",
     "nonlinear_normal_mode",
     "normal_mode_at_velocities",
@@ -74,7 +69,6 @@ __all__ = [
     "phase_controlled_test",
     "phase_resonance_test",
     "phase_sweep",
-    "response_at_velocities",
     "response_controlled",
     "run_test",
     "s_curve",

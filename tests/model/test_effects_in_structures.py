@@ -68,10 +68,3 @@ def test_effects_and_families_print_as_tables():
     families = repr(sj.identify.FAMILIES)
     assert [line.split()[0] for line in families.splitlines()] == list(sj.identify.FAMILIES)
     assert "class" not in families
-
-
-@pytest.mark.parametrize("name", ["MeasurementErrors", "Recording", "SweepSimulation"])
-def test_settings_of_a_virtual_test_state_every_field_and_its_unit(name):
-    settings = getattr(sj.simulate, name)
-    assert all(f"`{field}`" in settings.__doc__ for field in settings._fields)
-    assert any(unit in settings.__doc__ for unit in ("rad", "m/s", "cycles"))

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 import snrmjax as sj
 from snrmjax.cli import app
-from snrmjax.doctor.findings import Checkup, Finding, Repair
+from snrmjax.doctor.findings import Checkup, Finding, ImportCorrection
 from snrmjax.io.exchange.import_map import ImportMap, ResponseMap
 from snrmjax.pipelines import check as mends
 
@@ -142,26 +142,26 @@ def test_two_errors_of_which_one_needs_the_other_are_mended_at_once(folder):
 
 
 @pytest.mark.parametrize(
-    ("repair", "options"),
+    ("correction", "options"),
     [
-        (Repair(response=9.80665, unit="g"), "--unit g"),
-        (Repair(force=4.4482216, force_unit="lbf"), "--force-unit lbf"),
-        (Repair(force_unit="V"), "--force-unit V"),
-        (Repair(conjugate=True), "--phase-sign lag"),
-        (Repair(phase_unit="rad"), "--phase-unit rad"),
-        (Repair(response=1e-3, unit="mm"), ""),  # no unit of an acceleration
-        (Repair(response=2**0.5), ""),  # nor one by name
-        (Repair(quantity="displacement"), ""),  # which its columns state
+        (ImportCorrection(response=9.80665, unit="g"), "--unit g"),
+        (ImportCorrection(force=4.4482216, force_unit="lbf"), "--force-unit lbf"),
+        (ImportCorrection(force_unit="V"), "--force-unit V"),
+        (ImportCorrection(conjugate=True), "--phase-sign lag"),
+        (ImportCorrection(phase_unit="rad"), "--phase-unit rad"),
+        (ImportCorrection(response=1e-3, unit="mm"), ""),  # no unit of an acceleration
+        (ImportCorrection(response=2**0.5), ""),  # nor one by name
+        (ImportCorrection(quantity="displacement"), ""),  # which its columns state
     ],
 )
-def test_options_of_a_laboratorys_files_are_those_of_their_map(repair, options):
+def test_options_of_a_laboratorys_files_are_those_of_their_map(correction, options):
     read = mends.FilesRead(
         (Path("raw/a.csv"),), Path("raw/map.toml"), ImportMap((ResponseMap("a", "acceleration"),))
     )
-    finding = Finding("wrong_unit", "error", "", "", "Again.", (), (repair,))
+    finding = Finding("wrong_unit", "error", "", "", "Again.", (), (correction,))
     (told,) = mends.with_imports(Checkup((finding,)), read).findings
     line = f"snrmjax import raw/a.csv --map raw/map.toml {options} --out raw/mended"
-    assert told.mend == (f"Again: `{line}`." if options else "Again.")
+    assert told.advice == (f"Again: `{line}`." if options else "Again.")
 
 
 @pytest.mark.long

@@ -2,6 +2,8 @@
 
 import dataclasses
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
@@ -94,9 +96,14 @@ def test_results_say_themselves_and_are_drawn(name):
 
 
 def test_motions_say_what_was_not_found(curve):
-    heights = np.array([0.2, 30.0]) * np.abs(curve.velocity[:, 1, 0]).max()
-    starts = (curve.coefficients[[40, 40]], curve.frequency[[40, 40]])
-    found = sj.simulate.motions_at_velocities(oscillator(), FORCE, starts, heights)
+    heights = jnp.array([0.2, 30.0]) * np.abs(curve.velocity[:, 1, 0]).max()
+
+    def motion_at(height):
+        return sj.simulate.periodic_motion(
+            oscillator(), FORCE, curve.point(40), condition="velocity", value=height
+        )
+
+    found = jax.vmap(motion_at)(heights)
     assert repr(found).startswith("PeriodicMotion: 2 motions")
     data = found.to_xarray()
     assert data["converged"].values.tolist() == [True, False]

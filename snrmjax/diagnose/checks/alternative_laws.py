@@ -188,13 +188,13 @@ def even_share(misfit: WeightedMisfit, fit: EffectFit, kind: str) -> tuple[float
     states, modes = misfit.predictions.chosen.states, misfit.predictions.model.modes
     j, sensors = modes.mode_of_interest, misfit.predictions.chosen.sensors
     shape = float(modes.mode_shape[sensors[0], j])
-    own, ratio = float(modes.natural_frequency[j]), float(modes.damping_ratio[j])
+    natural, ratio = float(modes.natural_frequency[j]), float(modes.damping_ratio[j])
     omega = np.asarray(states.frequency)
     measured = np.asarray(states.velocity)[:, 0]
     velocity = measured / shape
     force = _second_harmonic(kind, fit.of_kind(kind), np.abs(velocity))
     force = force * (velocity / np.abs(velocity)) ** 2
-    answer = -force / (own**2 - 4 * omega**2 + 4j * ratio * own * omega)
+    answer = -force / (natural**2 - 4 * omega**2 + 4j * ratio * natural * omega)
     column = 2j * omega * shape * answer / np.abs(measured)
     columns = np.zeros((1, *misfit.noise.known.shape))
     place = 2 * (len(sensors) + misfit.predictions.chosen.orders.index(2))

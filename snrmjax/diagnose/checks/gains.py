@@ -12,7 +12,7 @@ from snrmjax.diagnose import priors
 from snrmjax.diagnose.checks.alternative_laws import Doubt
 from snrmjax.diagnose.misfit.candidates import parameter_labels
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
-from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
+from snrmjax.diagnose.misfit.noise_model import chi_square_p_value, unit_columns
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
 from snrmjax.diagnose.search.model_search import FoundEffects
 from snrmjax.identify.checks.instruments import (
@@ -98,8 +98,7 @@ def _beside(
 
     def square(places: tuple[int, ...]) -> float:
         columns = np.concatenate([by_parameter, arms[:, list(places)]], axis=1)
-        size = np.linalg.norm(columns, axis=0)
-        scaled = columns / np.where(size > 0, size, 1.0)
+        scaled, _ = unit_columns(columns)
         steps = np.linalg.lstsq(scaled, left, rcond=1e-10)[0]
         return float(np.sum((left - scaled @ steps) ** 2))
 

@@ -10,7 +10,11 @@ from scipy.special import fdtrc, ndtr
 from snrmjax.diagnose import priors
 from snrmjax.diagnose.checks.alternative_laws import Doubt
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
-from snrmjax.diagnose.misfit.noise_model import chi_square_p_value, shared_covariance
+from snrmjax.diagnose.misfit.noise_model import (
+    chi_square_p_value,
+    shared_covariance,
+    unit_columns,
+)
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
 from snrmjax.diagnose.search.locating import hat_functions
 from snrmjax.diagnose.search.model_search import FoundEffects
@@ -125,9 +129,7 @@ def _refitted(
     Returns the change of the parameters, all rows after it, and the root of its covariance: what
     independent unit errors of the change add to all rows.
     """
-    size = np.linalg.norm(fit.slopes, axis=0)
-    size = np.where(size > 0, size, 1.0)
-    scaled = fit.slopes / size
+    scaled, size = unit_columns(fit.slopes)
     both = misfit.noise.decorrelated(np.column_stack([scaled, fit.rows]).T, kept)
     arms, left = both[:-1].T, both[-1]
     matrix = arms.T @ arms
@@ -294,8 +296,8 @@ def along(
     level = np.asarray(chosen.states.level)
     phase = np.angle(np.asarray(chosen.states.velocity)[:, 0])
     for column in range(2):
-        mine = noise.column == column
-        values, states = rows[mine], noise.state[mine]
+        of_column = noise.column == column
+        values, states = rows[of_column], noise.state[of_column]
         for number in range(chosen.n_levels):
             some: Int[np.ndarray, " state"] = np.flatnonzero(level[states] == number)
             keys: Sequence[float] = chosen.rows[states[some]] if of_test else phase[states[some]]
@@ -304,11 +306,9 @@ def along(
 
 def _basis(columns: Float[np.ndarray, "row column"]) -> Float[np.ndarray, "row any"]:
     """Orthonormal columns with the same span."""
-    size = np.linalg.norm(columns, axis=0)
-    scaled = columns / np.where(size > 0, size, 1.0)
     if not columns.shape[1]:
-        return scaled
-    left, values, _ = np.linalg.svd(scaled, full_matrices=False)
+        return columns
+    left, values, _ = np.linalg.svd(unit_columns(columns)[0], full_matrices=False)
     return np.asarray(left[:, values > 1e-6 * values[0]])
 
 
@@ -326,9 +326,9 @@ def neighbour_noise(misfit: WeightedMisfit, fit: EffectFit) -> float:
         if not parts:
             return 1.0
         squares = [(some[:-2] - 2 * some[1:-1] + some[2:]) ** 2 / 6 for some in parts]
-        every = np.concatenate(squares)
+        differences = np.concatenate(squares)
         # Jumps and kinks are not noise: beyond four times the median's 1σ they are cut off.
-        found.append(float(np.mean(np.minimum(every, 16 * np.median(every) / 0.4549))))
+        found.append(float(np.mean(np.minimum(differences, 16 * np.median(differences) / 0.4549))))
     return min(found)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
 from snrmjax.diagnose.misfit.effect_fit import EffectFit, with_errors_passed_on
-from snrmjax.diagnose.misfit.noise_model import SharedCovariance, shared_covariance
+from snrmjax.diagnose.misfit.noise_model import SharedCovariance, shared_covariance, unit_columns
 from snrmjax.diagnose.misfit.predictions import Predicted, Predictions, predictions_of
 from snrmjax.diagnose.misfit.programs import COMPARED
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit, weighted_misfit
@@ -33,8 +33,8 @@ class PredictedTest(NamedTuple):
     def with_floor(self, floor: float) -> "PredictedTest":
         """The same test with another noise of harmonics."""
         chosen = self.misfit.predictions.chosen
-        own = chosen.states.own_std * (floor / self.floor)
-        chosen = chosen._replace(states=chosen.states._replace(own_std=own))
+        std = chosen.states.own_std * (floor / self.floor)
+        chosen = chosen._replace(states=chosen.states._replace(own_std=std))
         return self._replace(misfit=self.misfit.with_states(chosen), floor=floor)
 
 
@@ -133,9 +133,9 @@ def _needed(
 ) -> tuple[Complex[np.ndarray, " state"], Complex[np.ndarray, "state harmonic"]]:
     """The force that motions need under a fit, for one newton recorded, and their harmonics."""
     predictions = predictions_of(misfit.model, data)
-    own = misfit.baseline_parameters(fit.rows)
-    values = np.append(list(own.values()), fit.values)
-    columns = predictions.of(predictions.group.at((*own, *fit.labels), values)[None]).columns[0]
+    given = misfit.baseline_parameters(fit.rows)
+    values = np.append(list(given.values()), fit.values)
+    columns = predictions.of(predictions.group.at((*given, *fit.labels), values)[None]).columns[0]
     parts = columns[:, 0::2] + 1j * columns[:, 1::2]
     first = len(predictions.chosen.sensors)  # the reference sensor's harmonics come first
     higher = parts[:, first : first + len(COMPARED)]
@@ -181,8 +181,8 @@ def shared_by_both(
     parts = old.noise.shared, new.noise.shared[kept]
     n = old.predictions.n_baseline_errors
     common, apart = [part[:, :n] for part in parts], [part[:, n:] for part in parts]
-    own = [part.shape[1] for part in apart]
-    blank = np.zeros((len(parts[0]), own[1])), np.zeros((len(parts[1]), own[0]))
+    widths = [part.shape[1] for part in apart]
+    blank = np.zeros((len(parts[0]), widths[1])), np.zeros((len(parts[1]), widths[0]))
     return np.concatenate(
         [
             np.concatenate([common[0], apart[0], blank[0]], axis=1),
@@ -193,9 +193,8 @@ def shared_by_both(
 
 def refitted_chi_square(rows: Rows, covariance: SharedCovariance) -> float:
     """χ² when a fit's parameters have moved to where all rows put them, to first order."""
-    size = np.linalg.norm(rows.slopes, axis=0)
-    arms = rows.slopes / np.where(size > 0, size, 1.0)
-    arms, left = covariance.decorrelated(arms.T).T, covariance.decorrelated(rows.left)
+    arms, left = unit_columns(rows.slopes)[0], covariance.decorrelated(rows.left)
+    arms = covariance.decorrelated(arms.T).T
     along, values, _ = np.linalg.svd(arms, full_matrices=False)
     # Directions that no state determines stay open.
     along = along[:, values > 1e-12 * max(values.max(initial=0.0), 1.0)]

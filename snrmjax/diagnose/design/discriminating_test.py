@@ -99,23 +99,23 @@ def discriminating_test(found: FoundEffects, places: tuple[int, ...]) -> Discrim
     # Without any, that of harmonics which are measured without special care.
     ordinary = floor if floor is not None else 3e-3 * float(speed.max())
     groups = [list(_rivals(found, place)) for place in places]
-    every = [rival for group in groups for rival in group]
-    tried = [(found.fit, every)]
+    all_rivals = [rival for group in groups for rival in group]
+    tried = [(found.fit, all_rivals)]
     tried += [(truth, [found.fit, *group]) for group in groups for truth in group]
     hypotheses = []
     for truth, rivals in tried:
         differ = [set(truth.kinds) ^ set(fit.kinds) for fit in rivals]
         # Some answers differ only by what a calibration separates.
-        told = [
+        distinct = [
             fit
-            for fit, own in zip(rivals, differ, strict=True)
-            if own and not only_by_calibration(own)
+            for fit, kinds in zip(rivals, differ, strict=True)
+            if kinds and not only_by_calibration(kinds)
         ]
-        hypotheses.append(_Hypothesis(misfit, truth, told, ordinary))
+        hypotheses.append(_Hypothesis(misfit, truth, distinct, ordinary))
     best: DiscriminatingTest | None = None
     for option in _options(ordinary, float(speed.max()), measured=floor is not None):
         worst: DiscriminatingTest | None = None
-        for hypothesis in hypotheses if every else []:
+        for hypothesis in hypotheses if all_rivals else []:
             test = hypothesis.expected(option)
             if test is not None and (worst is None or _share(test) < _share(worst)):
                 worst = test
@@ -136,9 +136,9 @@ def _floor(misfit: WeightedMisfit) -> float | None:
     """Noise of harmonics, m/s; None where none were measured."""
     chosen = misfit.predictions.chosen
     first = 2 * len(chosen.sensors)
-    own = np.asarray(chosen.states.own_std)[:, first:] * np.sqrt(2)
-    own = own * np.abs(np.asarray(chosen.states.velocity)[:, :1])
-    return float(np.median(own[own > 0])) if np.any(own > 0) else None
+    noise = np.asarray(chosen.states.own_std)[:, first:] * np.sqrt(2)
+    noise = noise * np.abs(np.asarray(chosen.states.velocity)[:, :1])
+    return float(np.median(noise[noise > 0])) if np.any(noise > 0) else None
 
 
 def _design_points(misfit: WeightedMisfit) -> tuple[DesignPoints, ...]:
@@ -185,8 +185,8 @@ def _rivals(found: FoundEffects, place: int) -> Iterator[EffectFit]:
         kinds = {name if k == place else kind for k, kind in enumerate(found.fit.kinds)}
         # One effect with more parameters may stand for two.
         tables = (row.parameters for step in found.table[::-1] for row in step)
-        own = [({label.partition(".")[0] for label in one}, one) for one in tables]
-        last = [one for wanted in (kinds, {name}) for has, one in own if has == wanted][:1]
+        by_kinds = [({label.partition(".")[0] for label in one}, one) for one in tables]
+        last = [one for wanted in (kinds, {name}) for has, one in by_kinds if has == wanted][:1]
         if not last:
             continue
         values, nothing = np.array(list(last[0].values())), np.zeros(0)
@@ -241,13 +241,13 @@ class _Hypothesis:
         exact, *others = self._predicted
         if exact is None or not kept.any():
             return None
-        own = ModelRows(*self._measured[0], in_noise_units(test.misfit, exact))
+        true_rows = ModelRows(*self._measured[0], in_noise_units(test.misfit, exact))
         found = []
         for fit, before, its in zip(self.rivals, self._measured[1:], others, strict=True):
             if its is None:
                 continue
             rival = ModelRows(*before, in_noise_units(test.misfit, its))
-            gain = separation(self.misfit, test.misfit, own, rival, kept)
+            gain = separation(self.misfit, test.misfit, true_rows, rival, kept)
             # A gain G of χ² scatters by 2√G.
             ahead = fit.criterion - self.truth.criterion
             least = max(priors.AS_GOOD_BY_CRITERION - ahead, 0.0)
@@ -297,13 +297,13 @@ class _Hypothesis:
 
 def _rows(test: PredictedTest, option: _Option) -> Bool[np.ndarray, " row"]:
     noise = test.misfit.noise
-    mine = test.members[option.place][noise.state]
+    chosen = test.members[option.place][noise.state]
     first = 2 * len(test.misfit.predictions.chosen.sensors)
     wanted = [noise.column < 2] if option.of_force else []
     for order in option.orders:
         at = first + 2 * COMPARED.index(order)
         wanted.append((noise.column == at) | (noise.column == at + 1))
-    return mine & np.logical_or.reduce(wanted)
+    return chosen & np.logical_or.reduce(wanted)
 
 
 def _difference(
@@ -326,11 +326,13 @@ def _difference(
     at = rows[np.argmin(np.abs(np.angle(velocity[rows])))]
     if option.floor is not None:
         places = [COMPARED.index(h) for h in option.orders]
-        own = np.asarray(states.harmonics)[at, 0, places] / np.abs(velocity[at])
-        its = own + apart[at, [len(test.misfit.predictions.chosen.sensors) + k for k in places]]
-        most = int(np.argmax(np.abs(own - its)))
-        sizes = np.abs([own[most], its[most]])
-        turned = abs(np.degrees(np.angle(its[most] / own[most]))) if sizes.min() > 0 else 0.0
+        first = np.asarray(states.harmonics)[at, 0, places] / np.abs(velocity[at])
+        second = (
+            first + apart[at, [len(test.misfit.predictions.chosen.sensors) + k for k in places]]
+        )
+        most = int(np.argmax(np.abs(first - second)))
+        sizes = np.abs([first[most], second[most]])
+        turned = abs(np.degrees(np.angle(second[most] / first[most]))) if sizes.min() > 0 else 0.0
         seen = sizes.min() > 0.1 * sizes.max() and turned > 1.0
         harmonic = {"harmonic": option.orders[most], "shares": tuple(sizes.tolist())}
         turn = {"turned_deg": float(turned) if seen else None}
@@ -360,8 +362,8 @@ def recommended_test(found: FoundEffects) -> DiscriminatingTest | None:
     static = [only_by_calibration(group) for group in found.classes]
     places = tuple(
         k
-        for k, (group, own) in enumerate(zip(found.classes, static, strict=True))
-        if len(group) > 1 and set(group) - own
+        for k, (group, alike) in enumerate(zip(found.classes, static, strict=True))
+        if len(group) > 1 and set(group) - alike
     )
     test = discriminating_test(found, places) if places else None
     if test is not None:

@@ -82,8 +82,8 @@ def law_columns(
     drawn = _Drawn(*(jnp.asarray(a) for a in (secants, *knots, *slopes)))
 
     def answered(*rows: Any) -> tuple:
-        own = (names, p.compared, drawn, values, CalibrationStates(*rows[:-2]))
-        return _law_columns(p.model, *own, *rows[-2:])
+        shared = (names, p.compared, drawn, values, CalibrationStates(*rows[:-2]))
+        return _law_columns(p.model, *shared, *rows[-2:])
 
     near = [np.asarray(part)[:n] for part in p.motions[1:]]
     if start is not None:
@@ -166,10 +166,10 @@ class _DrawnBalance(HarmonicBalance):
 
     def residual(self, point: Float[Array, " unknown"]) -> Float[Array, " equation"]:
         """See `HarmonicBalance.residual`."""
-        own = super().residual(point)
+        balance = super().residual(point)
         if self.drawn is None:
-            return own
-        return own + self._on_mode(self.drawn.force(*self._motion(point)))
+            return balance
+        return balance + self._on_mode(self.drawn.force(*self._motion(point)))
 
     def _motion(self, point: Array) -> tuple[Array, Array]:
         """q and q̇ of the mode of interest at time samples."""
@@ -183,8 +183,8 @@ class _DrawnBalance(HarmonicBalance):
         basis = harmonic_basis((self.n_coefficients - 1) // 2, _SAMPLES)
         unit = self.frequency_scale**2 * self.displacement_scale
         added = jnp.tensordot(jnp.asarray(basis.analysis), force, axes=1) / unit
-        every = jnp.tensordot(added, jnp.asarray(self.model.own_mode), axes=0)
-        return jnp.moveaxis(every, -1, 1).reshape(-1, *force.shape[1:])
+        of_modes = jnp.tensordot(added, jnp.asarray(self.model.own_mode), axes=0)
+        return jnp.moveaxis(of_modes, -1, 1).reshape(-1, *force.shape[1:])
 
 
 @compiled
@@ -202,19 +202,19 @@ def _law_columns(
 
     def one(measured: CalibrationStates, near: Array, inverse: Array) -> tuple:
         def motion(changed: tuple[Array, Array]) -> tuple[StateWithErrors, PrescribedMotion]:
-            own = with_parameters(model, names, changed[0])
+            structure = with_parameters(model, names, changed[0])
             erring = StateWithErrors(measured, 1.0, changed[1])
-            found = erring.motion(own, sensors[0], order)
+            found = erring.motion(structure, sensors[0], order)
             parts = {f.name: getattr(found.balance, f.name) for f in fields(found.balance)}
             return erring, replace(found, balance=_DrawnBalance(**parts, drawn=drawn))
 
         def both(point: Array, changed: tuple[Array, Array]) -> tuple[Array, Array]:
-            erring, own = motion(changed)
-            return own.equations(point), residual_columns(erring, own, point, sensors, orders)
+            erring, held = motion(changed)
+            return held.equations(point), residual_columns(erring, held, point, sensors, orders)
 
         here = values, jnp.zeros_like(measured.error)
-        own, none = motion(here)[1], jnp.zeros(())
-        point = own.solved_by_secants(inverse, start_of(near), none + 1e-8, none).point
+        held, none = motion(here)[1], jnp.zeros(())
+        point = held.solved_by_secants(inverse, start_of(near), none + 1e-8, none).point
         jacobian, of_point = jax.jacfwd(both)(point, here)
         exact = jnp.linalg.inv(jacobian)
         of_point = of_point @ exact
@@ -222,8 +222,8 @@ def _law_columns(
         slopes = [
             b - jnp.tensordot(of_point, a, axes=1) for a, b in zip(moved, direct, strict=True)
         ]
-        balance: Any = own.balance
-        at = jnp.append(point[:-2], own.frequency / balance.frequency_scale)
+        balance: Any = held.balance
+        at = jnp.append(point[:-2], held.frequency / balance.frequency_scale)
         of_secant = balance.by_secant(at)
         by_secant = -jnp.tensordot(of_point[:, : of_secant.shape[0]], of_secant, axes=1)
         by_secant = by_secant.reshape(measured.known.shape[0], -1)

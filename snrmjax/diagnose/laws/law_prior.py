@@ -135,8 +135,8 @@ def posterior(problem: LawProblem, parts: Sequence[str]) -> LawPosterior:
         )
         mean += centre - best.mean
         covariance += spread / total - best.covariance
-    own = [np.full(len(problem.place[part]), PARTS[part].not_negative) for part in parts]
-    bounded = np.concatenate(own)
+    signs = [np.full(len(problem.place[part]), PARTS[part].not_negative) for part in parts]
+    bounded = np.concatenate(signs)
     if bounded.any():
         mean, covariance = _not_negative(mean, covariance, bounded)
     return LawPosterior(tuple(parts), tuple(found), cost, best.freedom, mean, covariance)
@@ -159,10 +159,10 @@ class _Gaussian(NamedTuple):
 
 def _gaussian(problem: LawProblem, parts: Sequence[str], processes: Sequence[Process]) -> _Gaussian:
     """The posterior for given processes, of secants that may have either sign."""
-    root, own = law_prior(problem, parts, processes), problem.of(parts)
-    matrix = np.eye(len(own)) + root.T @ problem.gram[np.ix_(own, own)] @ root
+    root, places = law_prior(problem, parts, processes), problem.of(parts)
+    matrix = np.eye(len(places)) + root.T @ problem.gram[np.ix_(places, places)] @ root
     lower = np.linalg.cholesky(matrix)
-    pull = root.T @ problem.pull[own]
+    pull = root.T @ problem.pull[places]
     inverse = cho_solve((lower, True), np.eye(len(matrix)))
     best = inverse @ pull
     cost = 2 * float(np.sum(np.log(np.diag(lower)))) - float(pull @ best)
@@ -176,14 +176,14 @@ def _beside(
     """A part's problem, with other parts as a further noise; what these cost."""
     others = [part for number, part in enumerate(parts) if number != k]
     rest = [one for number, one in enumerate(processes) if number != k]
-    own, theirs = problem.of([parts[k]]), problem.of(others)
-    gram, pull = problem.gram[np.ix_(own, own)], problem.pull[own]
+    places, theirs = problem.of([parts[k]]), problem.of(others)
+    gram, pull = problem.gram[np.ix_(places, places)], problem.pull[places]
     if not others:
         return gram, pull, 0.0
     root = law_prior(problem, others, rest)
     arms = root.T @ problem.gram[np.ix_(theirs, theirs)] @ root
     lower = np.linalg.cholesky(np.eye(len(root)) + arms)
-    both = np.column_stack([problem.gram[np.ix_(theirs, own)], problem.pull[theirs]])
+    both = np.column_stack([problem.gram[np.ix_(theirs, places)], problem.pull[theirs]])
     both = solve_triangular(lower, root.T @ both, lower=True)
     across, along = both[:, :-1], both[:, -1]
     cost = 2 * float(np.sum(np.log(np.diag(lower)))) - float(along @ along)
@@ -277,6 +277,6 @@ def _not_negative(
             across = walls[wall] / size[wall]
             speed = speed - 2 * (speed @ across) * across
         drawn.append(z)
-    every = (np.array(drawn[30:]) @ root.T + mean / scale) * scale
-    every[:, bounded] = np.maximum(every[:, bounded], 0.0)
-    return every.mean(axis=0), np.cov(every.T)
+    samples = (np.array(drawn[30:]) @ root.T + mean / scale) * scale
+    samples[:, bounded] = np.maximum(samples[:, bounded], 0.0)
+    return samples.mean(axis=0), np.cov(samples.T)

@@ -57,13 +57,13 @@ class LawFit(NamedTuple):
     @property
     def share(self) -> float:
         """The probability of its class among laws of one quantity, all as likely before."""
-        own = self.posterior.cost
+        least = self.posterior.cost
         alone: dict[str, float] = {}
         for name, part in PARTS.items():
             cost = best_processes(self.problem, (name,))[1]
             alone[part.law] = min(cost, alone.get(part.law, np.inf))
         alone.pop(PARTS[self.posterior.parts[0]].law)
-        return 1 / (1 + float(np.sum(np.exp(-0.5 * (np.array(list(alone.values())) - own)))))
+        return 1 / (1 + float(np.sum(np.exp(-0.5 * (np.array(list(alone.values())) - least)))))
 
     @property
     def secants(self) -> Float[np.ndarray, "table knot"]:
@@ -171,11 +171,11 @@ def secants_of(
     units: dict[str, Float[np.ndarray, " knot"]],
 ) -> Float[np.ndarray, "*entry table knot"]:
     """Tables of secants from those of some parts, in units plainly seen."""
-    own = values.reshape(*values.shape[:-1], len(parts), -1)
-    found = np.zeros((*values.shape[:-1], TABLES, own.shape[-1]))
+    by_part = values.reshape(*values.shape[:-1], len(parts), -1)
+    found = np.zeros((*values.shape[:-1], TABLES, by_part.shape[-1]))
     for k, name in enumerate(parts):
         for table, sign in zip(PARTS[name].tables, PARTS[name].signs, strict=True):
-            found[..., table, :] += sign * units[name] * own[..., k, :]
+            found[..., table, :] += sign * units[name] * by_part[..., k, :]
     return found
 
 
@@ -187,18 +187,20 @@ def _parts(problem: LawProblem, most: int) -> tuple[tuple[str, ...], tuple[str, 
     cost = alone[order[0]]
     rivals = tuple(part for part in order[1:] if alone[part] < cost + priors.AS_GOOD_BY_CRITERION)
     for first in order[:2]:
-        own: tuple[str, ...] = (first,)
-        own_cost = alone[first]
-        while len(own) < most:
+        parts: tuple[str, ...] = (first,)
+        its_cost = alone[first]
+        while len(parts) < most:
             costs = {
-                part: best_processes(problem, (*own, part))[1] for part in PARTS if part not in own
+                part: best_processes(problem, (*parts, part))[1]
+                for part in PARTS
+                if part not in parts
             }
             added = min(costs, key=lambda part: costs[part])
-            if costs[added] > own_cost - priors.DETECTED:
+            if costs[added] > its_cost - priors.DETECTED:
                 break
-            own, own_cost = (*own, added), costs[added]
-        if own_cost < cost - (priors.DETECTED if len(own) > len(best) else 0.0):
-            best, cost = own, own_cost
+            parts, its_cost = (*parts, added), costs[added]
+        if its_cost < cost - (priors.DETECTED if len(parts) > len(best) else 0.0):
+            best, cost = parts, its_cost
     return best, rivals if len(best) == 1 else ()
 
 

@@ -114,8 +114,8 @@ def fit_effect(
     labels = (*parameter_labels(candidate.kind), *before.labels)
     law = coordinates(labels, scales_of(misfit.predictions).amplitude)
     n, m = len(candidate.unit), len(before.values)
-    own = np.where(before.values, np.abs(before.values), 1)
-    unit = law.inward(np.concatenate([candidate.unit, own]))
+    size = np.where(before.values, np.abs(before.values), 1)
+    unit = law.inward(np.concatenate([candidate.unit, size]))
     # Of what the coordinates scale, bounds are zero and infinity.
     lower = np.concatenate([candidate.lower, before.lower])
     upper = np.concatenate([candidate.upper, before.upper])
@@ -123,18 +123,18 @@ def fit_effect(
     def evaluated(values: np.ndarray) -> list[_Evaluated]:
         found = []
         together = misfit.evaluated(labels, values)
-        for own, rows, slopes in zip(values, *together, strict=True):
-            by = law.slopes(own, slopes) * unit
+        for parameters, rows, slopes in zip(values, *together, strict=True):
+            by = law.slopes(parameters, slopes) * unit
             left, arms = misfit.noise.decorrelated(rows), misfit.noise.decorrelated(by.T).T
-            found.append(_Evaluated(own, rows, slopes, by, left, arms))
+            found.append(_Evaluated(parameters, rows, slopes, by, left, arms))
         return found
 
     def linearised(points: np.ndarray) -> list[_Evaluated]:
         return evaluated(law.outward(points * unit))
 
     starts = np.array(candidate.starts)
-    every = np.concatenate([starts, np.tile(before.values, (len(starts), 1))], axis=1)
-    points, at_points = law.inward(every) / unit, evaluated(every)
+    all_starts = np.concatenate([starts, np.tile(before.values, (len(starts), 1))], axis=1)
+    points, at_points = law.inward(all_starts) / unit, evaluated(all_starts)
     for _ in range(3):
         lost = [t for t, one in enumerate(at_points) if not np.all(np.isfinite(one.residuals))]
         if not lost:
@@ -180,8 +180,8 @@ def with_errors_passed_on(misfit: WeightedMisfit, fit: EffectFit) -> WeightedMis
     if not fit.kinds:
         return misfit.reweighted(known)
     slopes = by_baseline(predictions, values).slopes[0]
-    own = ErrorPropagation(*predictions.by_error(values), slopes)
-    changes = (np.where(np.isfinite(a - b), a - b, 0.0) for a, b in zip(own, known, strict=True))
+    there = ErrorPropagation(*predictions.by_error(values), slopes)
+    changes = (np.where(np.isfinite(a - b), a - b, 0.0) for a, b in zip(there, known, strict=True))
     return misfit.reweighted(
         ErrorPropagation(*(a + b for a, b in zip(known, changes, strict=True)))
     )
@@ -224,9 +224,9 @@ def at_reference(old: Predictions, data: SteadyStates) -> Predictions:
     found, error = reference.posterior, np.asarray(old.chosen.states.error)
     n_sensors = (error.shape[1] - 1) // 2
     added, level = np.zeros_like(error), found.states.level
-    own = found.corrections[:, 1:] - found.level_errors[level][:, :2]
-    added[reference.rows, 1 : n_sensors + 1] = own[:, [0]]
-    added[reference.rows, n_sensors + 1 :] = own[:, [1]]
+    errors = found.corrections[:, 1:] - found.level_errors[level][:, :2]
+    added[reference.rows, 1 : n_sensors + 1] = errors[:, [0]]
+    added[reference.rows, n_sensors + 1 :] = errors[:, [1]]
     return old.of_records(data, added)
 
 

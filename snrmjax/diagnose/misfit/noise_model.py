@@ -154,6 +154,15 @@ class NoiseModel(NamedTuple):
         return float(np.sqrt(max(covariance[at, at], 0.0))) / size[at]
 
 
+def unit_columns(
+    columns: Float[np.ndarray, "row column"],
+) -> tuple[Float[np.ndarray, "row column"], Float[np.ndarray, " column"]]:
+    """Columns of unit length, and what they were divided by: one where a column is zero."""
+    size = np.linalg.norm(columns, axis=0)
+    size = np.where(size > 0, size, 1.0)
+    return columns / size, size
+
+
 def chi_square_p_value(chi_square: float, freedom: int) -> float:
     """Probability of at least this χ² by chance, for so many degrees of freedom."""
     # Rounding may have made a sum of squares negative.

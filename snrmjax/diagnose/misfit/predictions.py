@@ -55,9 +55,9 @@ class Group(NamedTuple):
         self, names: Sequence[str], values: Float[np.ndarray, "*trial name"]
     ) -> Float[np.ndarray, "*trial parameter"]:
         """All parameters, of which some have other values."""
-        every = np.tile(self.values, (*values.shape[:-1], 1))
-        every[..., self.places(names)] = values
-        return every
+        whole = np.tile(self.values, (*values.shape[:-1], 1))
+        whole[..., self.places(names)] = values
+        return whole
 
 
 class _Steps(NamedTuple):
@@ -79,7 +79,6 @@ class Predicted(NamedTuple):
     columns: Float[np.ndarray, "trial state column"]
     slopes: Float[np.ndarray, "trial state column direction"]
     phasors: Complex[np.ndarray, "trial state part"]
-    force_slopes: Complex[np.ndarray, "trial state direction"]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -129,8 +128,8 @@ class Predictions:
         """
         order = self.compared.harmonic_order if harmonics is None else harmonics
         corrected = with_corrected_records(data, self.chosen.rows, self.chosen.sensors, added)
-        own = _records(self.given, corrected, order, self.error_scale)
-        return dataclasses.replace(self, **own, added=added)
+        records = _records(self.given, corrected, order, self.error_scale)
+        return dataclasses.replace(self, **records, added=added)
 
     def with_errors_scaled(self, factor: float) -> "Predictions":
         """The same with all errors of force, velocities and phases so many times larger."""
@@ -156,8 +155,8 @@ class Predictions:
         """
         chosen = self.chosen
         if self.sizes.alone.any():
-            own = self.sizes.own_std(np.asarray(chosen.states.own_std), phasors)
-            chosen = chosen._replace(states=chosen.states._replace(own_std=jnp.asarray(own)))
+            std = self.sizes.own_std(np.asarray(chosen.states.own_std), phasors)
+            chosen = chosen._replace(states=chosen.states._replace(own_std=jnp.asarray(std)))
         parts = [padded(np.asarray(part), _ROOM) for part in (*chosen.states, by_error)]
         *columns, errors = jax.device_put(parts)
         found = state_whitener(CalibrationStates(*columns), errors, jnp.zeros(()))
@@ -174,16 +173,15 @@ class Predictions:
         # unit of a shape may be a guess: its own size counts, unless that is zero.
         size = np.abs(values)
         length = np.maximum(group.unit, np.where(group.is_strength, size, 0.0))
-        own = np.clip(size, 1e-6 * group.unit, group.unit)
-        length = np.where(group.is_shape & (size > 0), own, length)[:, places]
+        shape_length = np.clip(size, 1e-6 * group.unit, group.unit)
+        length = np.where(group.is_shape & (size > 0), shape_length, length)[:, places]
         steps = _Steps(places, length, np.zeros((self.states.error.shape[1], len(places))))
         columns, slopes = self._in_turn(values, steps)
         slopes = slopes / length[:, None, None]
-        force_slopes = slopes[:, :, 0] + 1j * slopes[:, :, 1]
         if self.offset is not None:
             columns = columns + self.offset
         compared = self.sizes.compared(columns, slopes)
-        return Predicted(*compared, self.sizes.phasors(columns), force_slopes)
+        return Predicted(*compared, self.sizes.phasors(columns))
 
     def by_error(
         self, values: Float[np.ndarray, " parameter"]
@@ -226,8 +224,8 @@ class Predictions:
         for begin in range(0, max(wanted, 1), _DIRECTIONS):
             some = [a[..., begin : begin + _DIRECTIONS] for a in steps]
             room = [(0, _DIRECTIONS - some[0].size)]
-            own = _Steps(*(np.pad(a, [(0, 0)] * (a.ndim - 1) + room) for a in some))
-            parts.append(self._answers(values, own, min(wanted - begin, _DIRECTIONS)))
+            filled = _Steps(*(np.pad(a, [(0, 0)] * (a.ndim - 1) + room) for a in some))
+            parts.append(self._answers(values, filled, min(wanted - begin, _DIRECTIONS)))
         return parts[0][0], np.concatenate([slope for _, slope in parts], axis=3)[..., :wanted]
 
     def _answers(
@@ -250,8 +248,8 @@ class Predictions:
                 ours = [padded(a[near], _BLOCK) for a in (values, steps.length)]
                 asked: list[Any] = [*ours, steps.place, steps.by_error, active, np.array(wanted)]
                 asked += [state[at], trial[at] - first]
-                own = programs.Settings(group.names, self.compared, len(self.model.effects), quick)
-                found = programs.missed(group.model, own, self.motions, programs.Asked(*asked))
+                how = programs.Settings(group.names, self.compared, len(self.model.effects), quick)
+                found = programs.missed(group.model, how, self.motions, programs.Asked(*asked))
                 return [np.asarray(a)[: len(some), self.own_columns] for a in found]
 
             blocks = np.split(rows, range(_BLOCK, len(rows), _BLOCK))
@@ -367,8 +365,8 @@ def _all_effects(baseline: Structure, scales: MotionScales) -> Group:
 def with_idle_effects(model: Structure, kinds: Sequence[str]) -> Structure:
     """The model with further effects that have no strength: the same physics."""
     modes, j = model.modes, model.modes.mode_of_interest
-    own = float(modes.natural_frequency[j]), float(modes.damping_ratio[j])
-    added = tuple(EFFECTS[kind].without_strength(*own) for kind in kinds)
+    mode = float(modes.natural_frequency[j]), float(modes.damping_ratio[j])
+    added = tuple(EFFECTS[kind].without_strength(*mode) for kind in kinds)
     return dataclasses.replace(model, effects=(*model.effects, *added))
 
 
@@ -396,8 +394,8 @@ def _widened(chosen: ComparedColumns) -> tuple[list[np.ndarray], tuple[int, ...]
     # Of a phasor whose size alone counts the programs give both parts.
     known = np.asarray(chosen.states.known)[:, ::2]
     wide[:, :, columns] = chosen.states.own_std, np.repeat(known, 2, axis=1)
-    own = {"harmonics": harmonics, "own_std": wide[0], "known": wide[1] > 0}
-    parts = [np.asarray(a) for a in (chosen.states._asdict() | own).values()]
+    widened = {"harmonics": harmonics, "own_std": wide[0], "known": wide[1] > 0}
+    parts = [np.asarray(a) for a in (chosen.states._asdict() | widened).values()]
     return parts, orders, columns
 
 
@@ -413,7 +411,7 @@ def with_corrected_records(
     added: Float[np.ndarray, "state input"],
 ) -> SteadyStates:
     """The data with errors of velocities and phases taken away, of the states in `rows`."""
-    told: Any = jax.tree.map(np.asarray, data)
+    plain: Any = jax.tree.map(np.asarray, data)
     n = len(sensors)
     size, turn = np.ones((data.n_states, n)), np.zeros((data.n_states, n))
     size[rows], turn[rows] = np.exp(added[:, 1 : n + 1]), added[:, n + 1 :]
@@ -421,10 +419,10 @@ def with_corrected_records(
     size, turn = size[:, back], turn[:, back]
     orders = np.array(data.harmonic_order, dtype=int)
     found: SteadyStates = dataclasses.replace(
-        told,
-        velocity=told.velocity * (size * np.exp(1j * turn)),
-        velocity_std=told.velocity_std * size,
-        harmonics=told.harmonics * size[:, :, None] * np.exp(1j * turn[:, :, None] * orders),
-        harmonic_std=told.harmonic_std * size,
+        plain,
+        velocity=plain.velocity * (size * np.exp(1j * turn)),
+        velocity_std=plain.velocity_std * size,
+        harmonics=plain.harmonics * size[:, :, None] * np.exp(1j * turn[:, :, None] * orders),
+        harmonic_std=plain.harmonic_std * size,
     )
     return found

@@ -96,7 +96,7 @@ class Settings(NamedTuple):
 
     names: tuple[str, ...]  # of all parameters of the structure
     compared: ComparedMotion
-    own: int  # how many effects are the baseline's: the first ones
+    n_given: int  # how many effects are the baseline's: the first ones
     quick: bool  # whether friction is taken by formulas for cycles that turn only twice
 
 
@@ -113,7 +113,7 @@ def missed(
     Slopes are differences between motions a small step apart: the second is a step or two from
     the first, and the equations are compiled only once.
     """
-    names, compared, own, quick = settings
+    names, compared, n_given, quick = settings
     n_directions, n_wanted = len(asked.place), asked.n_directions
     close = jnp.where(n_wanted > 0, 1e-8, 1e-5)  # the last step of a motion's solution
 
@@ -125,13 +125,13 @@ def missed(
             number: Array, start: Secants, columns: Float[Array, "column direction"]
         ) -> tuple[Secants, Float[Array, "column direction"]]:
             along = jnp.where(jnp.arange(n_directions) == number - 1, _STEP, 0.0)
-            mine = asked.place[number - 1] == jnp.arange(len(names))
-            changed = with_parameters(model, names, values + (length @ along) * mine)
-            added = changed.effects[own:]
+            is_parameter = asked.place[number - 1] == jnp.arange(len(names))
+            changed = with_parameters(model, names, values + (length @ along) * is_parameter)
+            added = changed.effects[n_given:]
             order = compared.harmonic_order
             forces = [_quick(added[k], order, quick=quick) for k in forces_of(added)]
             rest = [e for k, e in enumerate(added) if k not in forces_of(added)]
-            changed = dataclasses.replace(changed, effects=(*changed.effects[:own], *rest))
+            changed = dataclasses.replace(changed, effects=(*changed.effects[:n_given], *rest))
             erring = StateWithErrors(measured, 1.0, asked.by_error @ along)
             motion = erring.motion(changed, compared.sensors[0], compared.harmonic_order)
             parts = {f.name: getattr(motion.balance, f.name) for f in fields(motion.balance)}
@@ -177,22 +177,22 @@ class _ForcedBalance(HarmonicBalance):
         x, omega = self.coefficients(point)[:, j], point[-1] * self.frequency_scale
         added = jnp.zeros_like(x)
         for n_samples in sorted({_samples(force) for force in self.forces}):
-            mine = [k for k, force in enumerate(self.forces) if _samples(force) == n_samples]
-            some = jnp.any(self.active[jnp.array(mine)])
-            added = added + _where(some, partial(self._harmonics, mine, n_samples), x, omega)
+            members = [k for k, force in enumerate(self.forces) if _samples(force) == n_samples]
+            some = jnp.any(self.active[jnp.array(members)])
+            added = added + _where(some, partial(self._harmonics, members, n_samples), x, omega)
         unit = self.frequency_scale**2 * self.displacement_scale
-        own = jnp.asarray(self.model.own_mode)
-        return super().residual(point) + jnp.outer(added / unit, own).reshape(-1)
+        own_mode = jnp.asarray(self.model.own_mode)
+        return super().residual(point) + jnp.outer(added / unit, own_mode).reshape(-1)
 
     def _harmonics(
-        self, mine: list[int], n_samples: int, x: Float[Array, " coefficient"], omega: Array
+        self, members: list[int], n_samples: int, x: Float[Array, " coefficient"], omega: Array
     ) -> Float[Array, " coefficient"]:
         """Coefficients of some of the forces over the cycle of a mode's coefficients."""
         basis = harmonic_basis((self.n_coefficients - 1) // 2, n_samples)
         q = jnp.asarray(basis.synthesis) @ x
         v = omega * (jnp.asarray(basis.synthesis @ basis.derivative) @ x)
         force = jnp.zeros_like(q)
-        for k in mine:
+        for k in members:
             force = force + _where(self.active[k], self.forces[k].cycle_force, q, v)
         return jnp.asarray(basis.analysis) @ force
 
@@ -248,9 +248,9 @@ class _Resonance(AbstractForce):
         slope = jnp.asarray(basis.synthesis @ basis.derivative) @ (jnp.asarray(basis.analysis) @ q)
         omega = jnp.sqrt(jnp.sum(velocity**2) / jnp.sum(slope**2))
         load = displacement_phasors((jnp.asarray(basis.analysis) @ q**n)[:, None])[:, 0]
-        own = 2 * jnp.pi * jnp.asarray(mode.frequency_hz)
+        natural = 2 * jnp.pi * jnp.asarray(mode.frequency_hz)
         rate = jnp.arange(self.harmonics + 1) * omega
-        stiffness = own**2 - rate**2 + 2j * mode.damping_ratio * own * rate
+        stiffness = natural**2 - rate**2 + 2j * mode.damping_ratio * natural * rate
         answer = -mode.coefficient * load / stiffness
         parts = jnp.stack([answer.real, -answer.imag], axis=1).reshape(-1)
         parts = jnp.concatenate([parts[:1], parts[2:]])  # the mean has no sine

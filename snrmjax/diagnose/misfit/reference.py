@@ -50,9 +50,9 @@ def reference_of(predictions: Predictions) -> Reference | None:
     found = fit_test(states)
     # What errors move belongs to the motion that was there: the records without any of them.
     levels = found.level_errors[states.level]
-    own = found.corrections[:, 1] - (0.0 if states.force_is_free else levels[:, 0])
+    errors = found.corrections[:, 1] - (0.0 if states.force_is_free else levels[:, 0])
     turn = found.corrections[:, 2] - levels[:, 1] - found.instrument_phase
-    velocity = states.velocity * np.exp(own + 1j * turn)
+    velocity = states.velocity * np.exp(errors + 1j * turn)
     omega = states.frequency
     curves = found.curves(np.abs(velocity) / omega)
     slope = found.modal_mass[0] * (curves.slopes[:, 0] + 1j * omega * curves.slopes[:, 1])
@@ -78,7 +78,7 @@ def test_states_of(predictions: Predictions, rows: np.ndarray) -> TestStates:
     if not chosen.noise_stated:
         errors = np.tile([errors[0, 0] / errors[0, 1], 1.0, 1.0], (len(rows), 1))
     gain, phase, frequency, damping = predictions.given.level_stds
-    own = float(modes.natural_frequency[j])
+    natural = float(modes.natural_frequency[j])
     ratio = float(modes.damping_ratio[j])
     mass_std = 0.0 if modes.modal_mass_std is None else float(modes.modal_mass_std[j])
     return TestStates(
@@ -90,7 +90,7 @@ def test_states_of(predictions: Predictions, rows: np.ndarray) -> TestStates:
         errors=errors,
         stated=chosen.noise_stated,
         constant=abs(constant),
-        level_std=(gain, phase, 2 * frequency / own, damping / ratio if ratio > 0 else 0.0),
+        level_std=(gain, phase, 2 * frequency / natural, damping / ratio if ratio > 0 else 0.0),
         mass_std=float(np.hypot(mass_std or 0.05, predictions.force_gain_std)),
         force_is_free=predictions.force_gain_std > 0,
         # What all levels share is a hypothesis of its own: it must not pass for levels that differ.
@@ -144,7 +144,7 @@ def _with_levels(predictions: Predictions, sizes: Sequence[float]) -> Prediction
         not stated > 0 and size > 0 for stated, size in zip(model.level_stds, sizes, strict=True)
     )
     new: dict[str, Any] = {
-        name: jnp.asarray(fields[name]) for name, own in zip(fields, free, strict=True) if own
+        name: jnp.asarray(fields[name]) for name, on in zip(fields, free, strict=True) if on
     }
     return dataclasses.replace(
         predictions,

@@ -20,7 +20,6 @@ class BaselinePrediction(NamedTuple):
 
     columns: Float[np.ndarray, "state column"]
     force: Complex[np.ndarray, " state"]  # over the measured one
-    force_by_linear: Complex[np.ndarray, "state two"]  # by natural frequency and damping ratio
 
 
 class ErrorPropagation(NamedTuple):
@@ -142,9 +141,9 @@ class WeightedMisfit:
         by_error[lost] = self.passed_on.by_error[lost]
         predictions = plain.carried_back(by_error)
         baseline, slopes = _baseline_of(predictions)
-        own = np.where(np.isfinite(there.slopes[0]), there.slopes[0], slopes)
+        slopes_there = np.where(np.isfinite(there.slopes[0]), there.slopes[0], slopes)
         errors = self.errors._replace(slopes=slopes)
-        passed_on = ErrorPropagation(by_error, phasors, own)
+        passed_on = ErrorPropagation(by_error, phasors, slopes_there)
         return _weighted(predictions, baseline, errors, passed_on, {})
 
     def with_states(self, chosen: ComparedColumns) -> "WeightedMisfit":
@@ -174,10 +173,7 @@ def _baseline_of(
     predictions: Predictions,
 ) -> tuple[BaselinePrediction, Float[np.ndarray, "state column direction"]]:
     found = by_baseline(predictions, predictions.group.values)
-    baseline = BaselinePrediction(
-        found.columns[0], found.phasors[0, :, 0], found.force_slopes[0, :, -2:]
-    )
-    return baseline, found.slopes[0]
+    return BaselinePrediction(found.columns[0], found.phasors[0, :, 0]), found.slopes[0]
 
 
 def by_baseline(predictions: Predictions, values: Float[np.ndarray, " parameter"]) -> Predicted:
@@ -190,10 +186,9 @@ def by_baseline(predictions: Predictions, values: Float[np.ndarray, " parameter"
     two = (f"mode_{j + 1}.natural_frequency", f"mode_{j + 1}.damping_ratio")
     found = predictions.of(values[None], (*stated, *two))
     share = float(modes.damping_ratio[j]) / float(modes.natural_frequency[j])
-    for slopes in (found.slopes, found.force_slopes):
-        slopes[..., -2] -= share * slopes[..., -1]
+    found.slopes[..., -2] -= share * found.slopes[..., -1]
     std = np.array([*(std for _, std in stated.values()), 1.0, 1.0])
-    return found._replace(slopes=found.slopes * std, force_slopes=found.force_slopes * std)
+    return found._replace(slopes=found.slopes * std)
 
 
 def _of_missing_force(
@@ -246,11 +241,15 @@ def _noise(predictions: Predictions, passed_on: ErrorPropagation) -> NoiseModel:
     """The noise of states with errors of the baseline model and of whole levels."""
     states, n_levels = predictions.chosen.states, predictions.chosen.n_levels
     level, n = np.asarray(states.level), np.asarray(states.velocity).shape[1]
-    own, by_linear = passed_on.slopes[:, :, :-2], passed_on.slopes[:, :, -2:]
+    base, by_linear = passed_on.slopes[:, :, :-2], passed_on.slopes[:, :, -2:]
     by_error, force = passed_on.by_error, passed_on.by_error[:, :, :1]
     gain = predictions.force_gain_std * force
     free = level[:, None, None] == np.array(predictions.free_level_forces, dtype=int)
-    shared = [own, *([gain] if np.any(gain) else []), priors.FREE_LEVEL_FORCE_STD * force * free]
+    shared = [
+        base,
+        *([gain] if np.any(gain) else []),
+        priors.FREE_LEVEL_FORCE_STD * force * free,
+    ]
     of_no_level = sum(part.shape[2] for part in shared)
     member = (level[:, None] == np.arange(n_levels)).astype(float)
     inputs = (by_error[:, :, 1 : n + 1].sum(axis=2), by_error[:, :, n + 1 :].sum(axis=2))

@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from snrmjax.diagnose import priors
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
-from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
+from snrmjax.diagnose.misfit.noise_model import chi_square_p_value, unit_columns
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
 
 _FREE = priors.FREE_CURVE
@@ -63,8 +63,8 @@ def locate_misfit(misfit: WeightedMisfit, base: EffectFit) -> tuple[Located, ...
         rows = (noise.column == first) | (noise.column == first + 1)
         if order not in (2, 3) or not rows.any():
             continue
-        own = noise.covariance.of_rows(rows).decorrelated(base.rows[rows])
-        p_value = chi_square_p_value(float(own @ own), int(rows.sum()))
+        of_order = noise.covariance.of_rows(rows).decorrelated(base.rows[rows])
+        p_value = chi_square_p_value(float(of_order @ of_order), int(rows.sum()))
         if p_value < priors.REJECTED:
             large = noise.state[rows][np.abs(base.rows[rows]) > 2.5]
             ends = _range(speed, np.isin(np.arange(len(speed)), large))
@@ -95,9 +95,7 @@ def _fitted(
     left: Float[np.ndarray, " row"], arms: Float[np.ndarray, "row column"]
 ) -> tuple[float, np.ndarray, np.ndarray]:
     """χ², the most likely values of some columns, and their covariance."""
-    size = np.linalg.norm(arms, axis=0)
-    size = np.where(size > 0, size, 1.0)
-    scaled = arms / size
+    scaled, size = unit_columns(arms)
     inverse = np.linalg.pinv(scaled.T @ scaled, rcond=1e-10, hermitian=True)
     values = -inverse @ (scaled.T @ left)
     left = left + scaled @ values

@@ -66,29 +66,29 @@ def find_effects(
     is not searched for, but an answer that it could have caused is compared with it.
     `further_starts` are parameters, by kind, from which fits begin too.
     """
-    every = {kind: candidate(kind, scales) for kind in kinds}
+    candidates = {kind: candidate(kind, scales) for kind in kinds}
     for kind, start in (further_starts or {}).items():
-        if kind in every and len(start) == len(every[kind].unit):
-            every[kind] = every[kind]._replace(starts=(*every[kind].starts, start))
-    alternatives = [every.pop(kind) for kind in kinds if not EFFECTS[kind].searched]
-    found = _searched(misfit, every)
+        if kind in candidates and len(start) == len(candidates[kind].unit):
+            candidates[kind] = candidates[kind]._replace(starts=(*candidates[kind].starts, start))
+    alternatives = [candidates.pop(kind) for kind in kinds if not EFFECTS[kind].searched]
+    found = _searched(misfit, candidates)
     for one in alternatives:
-        found = _compared_with(found, one, every)
+        found = _compared_with(found, one, candidates)
     return found
 
 
-def _searched(misfit: WeightedMisfit, every: dict[str, EffectCandidate]) -> FoundEffects:
-    misfit, singles, rows = _tried(misfit, every)
+def _searched(misfit: WeightedMisfit, candidates: dict[str, EffectCandidate]) -> FoundEffects:
+    misfit, singles, rows = _tried(misfit, candidates)
     nothing, table = baseline_fit(misfit), [rows]
     best = _best([nothing, *singles])
     considered = [nothing, *singles]
     if not _gains(nothing, best):
         return FoundEffects(misfit, nothing, nothing, tuple(table), tuple(considered))
-    jobs = [(c, best) for c in _promising(misfit, every, best)]
+    jobs = [(c, best) for c in _promising(misfit, candidates, best)]
     unexplained = best.p_value < 0.05
     # Two simple effects may do what one with many parameters does.
     if unexplained or len(best.values) > priors.SIMPLE:
-        jobs += _pairs(misfit, every, best, unexplained=unexplained)
+        jobs += _pairs(misfit, candidates, best, unexplained=unexplained)
     pairs = fit_effects(misfit, jobs, _hopeless(best))
     pair = _best([best, *pairs])
     considered += pairs
@@ -99,22 +99,22 @@ def _searched(misfit: WeightedMisfit, every: dict[str, EffectCandidate]) -> Foun
     nothing = baseline_fit(misfit)
     alone = []
     for kind in pair.kinds:
-        starts = (*every[kind].starts, pair.of_kind(kind))
-        alone.append(fit_effect(misfit, every[kind]._replace(starts=starts)))
+        starts = (*candidates[kind].starts, pair.of_kind(kind))
+        alone.append(fit_effect(misfit, candidates[kind]._replace(starts=starts)))
     others = [fit for fit in singles if fit.kinds[0] not in pair.kinds]
-    one, two = (_where(every, pair, kind) for kind in pair.kinds)
+    one, two = (_where(candidates, pair, kind) for kind in pair.kinds)
     together = fit_effect(misfit, two, started(one))
     considered = [nothing, *alone, together]
-    again = [(_where(every, fit, fit.kinds[0]), nothing) for fit in others]
+    again = [(_where(candidates, fit, fit.kinds[0]), nothing) for fit in others]
     considered += fit_effects(misfit, again, _hopeless(together))
     for kind, other in zip(pair.kinds, reversed(alone), strict=True):
-        rivals = [c for c in _promising(misfit, every, other) if c.kind != kind]
+        rivals = [c for c in _promising(misfit, candidates, other) if c.kind != kind]
         fits = fit_effects(misfit, [(c, other) for c in rivals], _hopeless(together))
         table.append(_table(other, [*fits, together]))
         considered += fits
     best = _best(considered)
     if best.p_value < priors.REJECTED and len(best.kinds) < priors.MOST_EFFECTS:
-        thirds = fit_effects(misfit, [(c, best) for c in _promising(misfit, every, best)])
+        thirds = fit_effects(misfit, [(c, best) for c in _promising(misfit, candidates, best)])
         table.append(_table(best, thirds))
         considered += thirds
         third = _best([best, *thirds])
@@ -140,7 +140,7 @@ def refitted(misfit: WeightedMisfit, scales: MotionScales, fit: EffectFit) -> Ef
 
 
 def _compared_with(
-    found: FoundEffects, close: EffectCandidate, every: dict[str, EffectCandidate]
+    found: FoundEffects, close: EffectCandidate, candidates: dict[str, EffectCandidate]
 ) -> FoundEffects:
     """The answer beside others with a close mode.
 
@@ -159,7 +159,7 @@ def _compared_with(
     if alike and others:
         only = found.baseline
         for kind in others:
-            only = fit_effect(misfit, _where(every, fit, kind), only)
+            only = fit_effect(misfit, _where(candidates, fit, kind), only)
         jobs.append((close, only))
     if refuted and len(fit.kinds) < priors.MOST_EFFECTS:
         jobs.append((close, fit))
@@ -173,14 +173,18 @@ def _compared_with(
 
 
 def _pairs(
-    misfit: WeightedMisfit, every: dict[str, EffectCandidate], best: EffectFit, *, unexplained: bool
+    misfit: WeightedMisfit,
+    candidates: dict[str, EffectCandidate],
+    best: EffectFit,
+    *,
+    unexplained: bool,
 ) -> list[tuple[EffectCandidate, EffectFit]]:
     """Fits, to be done, of the pairs with the largest expected gain, from their own starts.
 
     Those with no more parameters than the best effect alone; and, where that leaves something
     `unexplained`, those with any number.
     """
-    pairs = [(one, two) for _, one, two in screened_pairs(misfit, list(every.values()))]
+    pairs = [(one, two) for _, one, two in screened_pairs(misfit, list(candidates.values()))]
     most = len(best.values)
     simple = [(one, two) for one, two in pairs if len(one.unit) + len(two.unit) <= most]
     chosen = simple[: priors.PAIRS] if most > priors.SIMPLE else []
@@ -194,13 +198,13 @@ def _hopeless(best: EffectFit) -> float:
 
 
 def _promising(
-    misfit: WeightedMisfit, every: dict[str, EffectCandidate], before: EffectFit
+    misfit: WeightedMisfit, candidates: dict[str, EffectCandidate], before: EffectFit
 ) -> list[EffectCandidate]:
     """The candidates of which one start, scaled, is expected to explain most of what is left.
 
     Starts are coarse: a candidate with a quarter of the largest expected gain may still win.
     """
-    others = [c for kind, c in every.items() if kind not in before.kinds]
+    others = [c for kind, c in candidates.items() if kind not in before.kinds]
     over_cores(misfit.start_changes, others)  # many short programs
     changes = [screened(misfit, c, before) for c in others]
     changes.sort(key=lambda pair: -pair[0])
@@ -213,14 +217,14 @@ def _promising(
 
 
 def _tried(
-    misfit: WeightedMisfit, every: dict[str, EffectCandidate]
+    misfit: WeightedMisfit, candidates: dict[str, EffectCandidate]
 ) -> tuple[WeightedMisfit, list[EffectFit], tuple[TriedEffect, ...]]:
     """Fits of candidates, those near the best again with errors passed on as the best one does.
 
     Returns the misfit so weighted, these fits, and all first fits as rows of the table.
     """
     nothing = baseline_fit(misfit)
-    fits = fit_effects(misfit, [(c, nothing) for c in _promising(misfit, every, nothing)])
+    fits = fit_effects(misfit, [(c, nothing) for c in _promising(misfit, candidates, nothing)])
     rows = _table(nothing, fits)
     fits = [fit for fit in fits if np.isfinite(fit.chi_square)]
     best = min(fits, key=lambda fit: fit.criterion, default=nothing)
@@ -229,13 +233,13 @@ def _tried(
     again = with_errors_passed_on(misfit, best)
     reach = best.criterion + max(40.0, 0.5 * best.chi_square)
     near = [fit for fit in fits if fit.criterion < reach]
-    jobs = [(_where(every, fit, fit.kinds[0]), baseline_fit(again)) for fit in near]
+    jobs = [(_where(candidates, fit, fit.kinds[0]), baseline_fit(again)) for fit in near]
     return again, fit_effects(again, jobs), rows
 
 
-def _where(every: dict[str, EffectCandidate], fit: EffectFit, kind: str) -> EffectCandidate:
+def _where(candidates: dict[str, EffectCandidate], fit: EffectFit, kind: str) -> EffectCandidate:
     """A candidate that begins where a fit of it, or of it beside others, ended."""
-    return every[kind]._replace(starts=(fit.of_kind(kind),))
+    return candidates[kind]._replace(starts=(fit.of_kind(kind),))
 
 
 def _gains(before: EffectFit, after: EffectFit) -> bool:
@@ -326,8 +330,8 @@ def screened_pairs(
         seen.add(kinds)
         times[list(kinds)] += 1
         one, two = (
-            mine._replace(starts=(_scaled(mine, int(which[k]), float(factor[k, other])),))
-            for mine, k, other in ((candidates[kinds[0]], i, j), (candidates[kinds[1]], j, i))
+            effect._replace(starts=(_scaled(effect, int(which[k]), float(factor[k, other])),))
+            for effect, k, other in ((candidates[kinds[0]], i, j), (candidates[kinds[1]], j, i))
         )
         found.append((float(gain[i, j]), one, two))
     return found

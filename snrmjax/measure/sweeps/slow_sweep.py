@@ -246,7 +246,7 @@ def _result(
         reasons = "; ".join(
             f"{count} because {kind.message}"
             for kind, count in zip(SweepStatus, left_out, strict=True)
-            if count
+            if count and kind is not SweepStatus.FOUND
         )
         nothing = "none passes the wanted frequencies, or samples are missing there"
         raise ValueError(f"no state can be told from the sweeps: {reasons or nothing}.")

@@ -16,5 +16,5 @@ def headline(found: Checkup) -> list[str]:
     lines = []
     for finding in found.findings:
         lines.append(f"{finding.severity}: {finding.kind} in {finding.where}: {finding.evidence}")
-        lines.append(f"  mend: {finding.mend}")
+        lines.append(f"  mend: {finding.advice}")
     return lines or ["nothing found"]

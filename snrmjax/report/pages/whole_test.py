@@ -137,7 +137,7 @@ def _files(found: WholeTest) -> Section:
 def _check_section(checkup: Checkup) -> Section:
     header = ("severity", "what", "where", "evidence", "what mends it")
     rows = [
-        (finding.severity, finding.name, finding.where, str(finding.evidence), str(finding.mend))
+        (finding.severity, finding.name, finding.where, str(finding.evidence), str(finding.advice))
         for finding in checkup.findings
     ]
     text = [f"{_check(checkup).capitalize()}.", *map(str, checkup.notes)]

@@ -19,7 +19,7 @@ _RESPONSES = {
     "sizes_of_acceleration": "amplitudes of accelerations (m/s²) with the phases of velocities",
     "sizes_of_displacement": "amplitudes of displacements (m) with the phases of velocities",
 }
-_MEND_OF_RESPONSES = {
+_ADVICE_ON_RESPONSES = {
     "opposite": "negate this sensor's entry of `shape` in the model, or both velocity columns.",
     "conjugated": _SIGN,
     "conjugated_opposite": "negate `velocity_re_m_s`; or import again with the other phase sign, "
@@ -98,7 +98,7 @@ def _level_gains(*, gains: Sequence[tuple[int, int | None, float]]) -> str:
     return f"{' and '.join(named)} what the other levels ask for"
 
 
-def _mend_level_gains(*, gains: Sequence[tuple[int, int | None, float]]) -> str:
+def _advice_on_level_gains(*, gains: Sequence[tuple[int, int | None, float]]) -> str:
     numbers = [f"level {level} by {gain:.3g}" for level, _, gain in gains]
     return (
         "if the column is a voltage, measure the force; else another range or calibration was set "
@@ -137,24 +137,24 @@ SENTENCES: dict[str, Wording] = {
     "record_without_steps": "{record}: no step of four cycles was recognised.",
     # Columns that mean something else, and a modal mass that is none.
     "misread": _misread,
-    "mend_reading": lambda *, reading: _MEND_OF_RESPONSES[reading],
+    "advice_reading": lambda *, reading: _ADVICE_ON_RESPONSES[reading],
     "other_scale": _scale,
     "rms": _rms,
-    "mend_rms": lambda *, column: (
+    "advice_rms": lambda *, column: (
         f"multiply the {'velocity columns' if column == 'response' else '`force_n`'} by √2 = "
         "1.41421."
     ),
     "mixed_units": _units,
-    "mend_units": _import_units,
+    "advice_units": _import_units,
     "if_units_are_right": "if the units are right",
     "voltage_for_force": (
         "{scale}: the force column may be a drive voltage of {gain:.3g} V per N."
     ),
-    "mend_voltage": (
+    "advice_voltage": (
         "if it is a voltage, call the column `drive_v` and leave its gain to the identification."
     ),
     "shape_scale": "{scale}: the shape of the model may not be mass-normalised.",
-    "mend_shape": (
+    "advice_shape": (
         "if so, divide `shape` and `participation` of the model by {factor:.4g} each, or find the "
         "modes anew, scaled by the sensor at the force."
     ),
@@ -163,7 +163,7 @@ SENTENCES: dict[str, Wording] = {
         f"natural frequency within {_percent(frequency_off)}: a shaker damps so where its drive is "
         "taken for the force."
     ),
-    "mend_shaker_damping": (
+    "advice_shaker_damping": (
         "measure the force at the structure, or call a voltage `drive_v`; if it is that force, "
         "repeat the linear test on this assembly."
     ),
@@ -174,7 +174,7 @@ SENTENCES: dict[str, Wording] = {
             f"{100 * change:.3g} %"
         )
     ),
-    "mend_drift": (
+    "advice_drift": (
         "repeat a level at the end of the test, let the temperature settle, or correct along "
         "`order`."
     ),
@@ -184,7 +184,7 @@ SENTENCES: dict[str, Wording] = {
             f"{'file 1' if n_files == 2 else 'the others'}'s"
         )
     ),
-    "mend_structures": (
+    "advice_structures": (
         "identify them apart: one call and one model for each structure or assembly."
     ),
     "force_gains_differ": _read_so(
@@ -193,9 +193,9 @@ SENTENCES: dict[str, Wording] = {
             f"{', '.join(f'{gain:.3g}' for gain in gains)} at levels 2 and on"
         )
     ),
-    "mend_force_gains": "measure the force, or calibrate the drive at each level.",
+    "advice_force_gains": "measure the force, or calibrate the drive at each level.",
     "level_gains": _read_so(_level_gains),
-    "mend_level_gains": _mend_level_gains,
+    "advice_level_gains": _advice_on_level_gains,
     "levels_on_another_scale": lambda *, levels: (
         f"force on another scale at level {enumerated(levels)}"
     ),
@@ -203,18 +203,18 @@ SENTENCES: dict[str, Wording] = {
         f"at resonance the force falls by {_percent(fall)} into the noise of its cell, about "
         f"{floor:.2g} N, {_percent(floor / smallest)} of the smallest."
     ),
-    "mend_force_in_noise": (
+    "advice_force_in_noise": (
         "drive harder at resonance, average longer or use a more sensitive cell."
     ),
     "states_unsettled": _read_so(
         lambda *, share: f"about {_percent(share)} of a change is left at the end of a step"
     ),
-    "mend_unsettled": (
+    "advice_unsettled": (
         "dwell longer, 5/(ζω) a step; or import the time record, whose unsettled steps are left "
         "out."
     ),
     "states_clipped": _read_so(_clipped_states),
-    "mend_clipped_states": (
+    "advice_clipped_states": (
         "lower the channel's gain or range and measure these states again; leave them out until "
         "then."
     ),
@@ -222,7 +222,7 @@ SENTENCES: dict[str, Wording] = {
         f"at resonance the force falls by up to {_percent(fall)} of what it is beside it, on "
         f"{n_levels} of {of_levels} levels ({_rows(rows)}): the structure moves the shaker."
     ),
-    "mend_force_falls": (
+    "advice_force_falls": (
         "use the measured force of every state (`force_n`), never the nominal one; or control the "
         "force."
     ),
@@ -234,7 +234,7 @@ SENTENCES: dict[str, Wording] = {
         )
         + " of its fundamental: that part of the response's harmonics keeps its phase to the force."
     ),
-    "mend_harmonics": (
+    "advice_harmonics": (
         "control the harmonics of the force, or put their sizes into the model as an effect on "
         "the force's spectrum."
     ),
@@ -251,11 +251,11 @@ SENTENCES: dict[str, Wording] = {
         "{share:%.3g} of a mean cycle lies within 3 % of its extremes, of a sine 16 %: the channel "
         "is at the end of its range."
     ),
-    "mend_range": "widen the channel's range (or lower the gain) and record again.",
+    "advice_range": "widen the channel's range (or lower the gain) and record again.",
     "record_force_harmonic": lambda *, order, ratio: (
         f"harmonic {order} of the force is {_percent(ratio)} of its fundamental."
     ),
-    "mend_amplifier": (
+    "advice_amplifier": (
         "lower the amplifier's distortion or control the harmonics; else put them into the model "
         "as an effect on the force's spectrum."
     ),
@@ -266,7 +266,7 @@ SENTENCES: dict[str, Wording] = {
     "record_force_falls": lambda *, force, fall: (
         f"the force falls from {force:.4g} N by {_percent(fall)} where the response is strongest."
     ),
-    "mend_record_force": "use the measured force of every step, or control the force.",
+    "advice_record_force": "use the measured force of every step, or control the force.",
     "line_folded": lambda *, frequency_hz, ratio, rate_hz, order: (
         f"a line at {frequency_hz:.5g} Hz, {100 * ratio:.2g} % of the fundamental, is "
         + (
@@ -277,12 +277,12 @@ SENTENCES: dict[str, Wording] = {
             f"{rate_hz - frequency_hz:.6g} Hz or more at a rate of {rate_hz:.6g} Hz."
         )
     ),
-    "mend_folded": (
+    "advice_folded": (
         "switch on the recorder's anti-alias filter, or sample faster and filter before thinning."
     ),
     # Of what was identified.
-    "column_misread": lambda *, evidence, mend, importable: (
-        f"{evidence} To mend it: {str(mend).rstrip('.')}"
+    "column_misread": lambda *, evidence, advice, importable: (
+        f"{evidence} To mend it: {str(advice).rstrip('.')}"
         + ("; `snrmjax check` writes the import." if importable else ".")
     ),
     "far_from_linear_mode": _far,

@@ -1,6 +1,6 @@
 """Single periodic motions as differentiable functions of the model and the force."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import ClassVar, Literal, get_args
 
 import jax
@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Complex, Float
 
 from snrmjax.model.structures import Structure, simulated_structure
-from snrmjax.numerics.blocks import mapped
 from snrmjax.numerics.compiled import jitted
 from snrmjax.numerics.result import AbstractResult, Variable
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, harmonic_balance
@@ -17,7 +16,6 @@ from snrmjax.simulate.balance.harmonics import velocity_phasors
 from snrmjax.simulate.balance.labelled import HERTZ, batch_variables
 from snrmjax.simulate.continuation.continuation import Linearised, Point
 from snrmjax.simulate.continuation.events import velocities_along
-from snrmjax.simulate.continuation.response_curve import ResponseCurve
 
 Condition = Literal["frequency", "velocity", "fold", "peak", "phase_resonance"]
 
@@ -126,62 +124,6 @@ def _periodic_motion(
         velocity=jnp.where(converged, velocity, jnp.nan),
         converged=converged,
     )
-
-
-def response_at_velocities(
-    model: Structure,
-    curve: ResponseCurve,
-    velocities: float | Sequence[float] | Float[ArrayLike, " value"],
-) -> tuple[PeriodicMotion, np.ndarray]:
-    """Every place where a response curve has a given velocity amplitude, differentiable.
-
-    Arguments: `curve` of the model (at the numbers it has now), `velocities` |V₁| at the first
-    sensor in m/s.
-    Returns the motions, stacked in order along the curve, and for each the index of its velocity.
-    Their frequencies are differentiable functions of the model: the whole curve at fixed
-    amplitudes. Call it once; then `motions_at_velocities` with other models.
-    """
-    asked = np.atleast_1d(np.asarray(velocities, dtype=np.float64))
-    starts, passed, which = _crossings(curve, asked)
-    return motions_at_velocities(model, curve.force, starts, passed), which
-
-
-def motions_at_velocities(
-    model: Structure,
-    force: float | Float[ArrayLike, ""],
-    starts: tuple[Float[ArrayLike, "motion coefficient mode"], Float[ArrayLike, " motion"]],
-    velocities: float | Float[ArrayLike, " motion"],
-) -> PeriodicMotion:
-    """The motions near `starts` with given velocity amplitudes, differentiable.
-
-    Arguments: `force` in N; `starts` as coefficients (kg^1/2 m) and frequencies (rad/s);
-    `velocities` |V₁| at the first sensor in m/s, of each motion or one of all. Returns the
-    motions, stacked; those that were not found are NaN with derivatives of zero, the others
-    differentiable as `periodic_motion` is.
-    """
-
-    def motion_near(coefficients: Array, frequency: Array, value: Array) -> PeriodicMotion:
-        start = (coefficients, frequency)
-        return periodic_motion(model, force, start, condition="velocity", value=value)
-
-    coefficients, frequency = (jnp.asarray(part, dtype=jnp.float64) for part in starts)
-    values = jnp.broadcast_to(jnp.asarray(velocities, dtype=jnp.float64), frequency.shape)
-    return mapped(motion_near, coefficients, frequency, values)
-
-
-def _crossings(
-    curve: ResponseCurve, velocities: np.ndarray
-) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray, np.ndarray]:
-    """Interpolated starts where |V₁| passes each value, in order along the curve."""
-    height = np.abs(curve.velocity[:, 1, 0])
-    above = height[:, None] > velocities
-    where, which = np.nonzero(above[1:] != above[:-1])
-    share = (velocities[which] - height[where]) / (height[where + 1] - height[where])
-    x = curve.coefficients
-    coefficients = x[where] + share[:, None, None] * (x[where + 1] - x[where])
-    omega = curve.frequency[where]
-    omega = omega + share * (curve.frequency[where + 1] - omega)
-    return (coefficients, omega), velocities[which], which
 
 
 def _solved(

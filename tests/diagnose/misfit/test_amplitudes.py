@@ -52,8 +52,7 @@ def at_starts(predictions, kind):
     labels = parameter_labels(kind)
     values = predictions.group.at(labels, np.array(one.starts[0]))
     found = predictions.of(values[None], labels[:1])
-    slopes = (one.unit[0] * found.slopes, one.unit[0] * found.force_slopes)
-    return found._replace(slopes=slopes[0], force_slopes=slopes[1])
+    return found._replace(slopes=one.unit[0] * found.slopes)
 
 
 def test_every_effect_has_the_same_sizes_whatever_the_phases():
@@ -68,7 +67,7 @@ def test_every_effect_has_the_same_sizes_whatever_the_phases():
             np.abs(unknown.phasors), np.abs(known.phasors), rtol=0, atol=2e-4, err_msg=kind
         )
         force = known.phasors[:, :, 0]
-        size, change = np.abs(force), known.force_slopes[..., 0]
+        size, change = np.abs(force), known.slopes[:, :, 0, 0] + 1j * known.slopes[:, :, 1, 0]
         np.testing.assert_allclose(
             unknown.columns[:, :, 0], size - 1, rtol=0, atol=2e-4, err_msg=kind
         )

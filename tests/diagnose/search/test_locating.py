@@ -85,9 +85,6 @@ def test_quadratic_softening_has_the_power_of_its_own_motion():
     misfit = SimpleNamespace(
         noise=noise_of(np.tile(np.eye(2) / 1e-3, (n, 1, 1))),
         by_linear=by_linear,
-        baseline=SimpleNamespace(
-            force=np.ones(n, dtype=complex), force_by_linear=np.zeros((n, 2), dtype=complex)
-        ),
         predictions=SimpleNamespace(
             states=SimpleNamespace(velocity=size[:, None]),
             sizes=SimpleNamespace(alone=np.zeros((n, 1), dtype=bool)),

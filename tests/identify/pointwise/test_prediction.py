@@ -293,10 +293,13 @@ class TestResponse:
 
     def test_number_and_range_of_points(self):
         (curve,) = predict(DUFFING, MODES, force_for(DUFFING, 0.7))
-        assert curve.frequency.size == 2 * POINTS
-        np.testing.assert_allclose(curve.amplitude.min(), 0.02 * curve.amplitude.max(), rtol=1e-9)
+        # Small amplitudes far below resonance ask for a frequency below zero: they are left out.
+        assert 2 * POINTS - 10 < curve.frequency.size <= 2 * POINTS
         amplitudes = curve.amplitude
-        np.testing.assert_allclose(amplitudes, amplitudes[::-1], rtol=1e-12)  # up, then down
+        np.testing.assert_allclose(amplitudes.min(), 0.02 * amplitudes.max(), rtol=1e-9)
+        top = int(np.argmax(amplitudes))
+        assert np.all(np.diff(amplitudes[: top + 1]) > 0)
+        assert np.all(np.diff(amplitudes[top + 1 :]) < 0)
 
     def test_units(self):
         force = force_for(DUFFING, 0.7)

@@ -12,9 +12,7 @@ from snrmjax.model.potential import polynomial_potential
 from snrmjax.model.structures import structure
 from snrmjax.simulate.solutions.forced_response import forced_response
 from snrmjax.simulate.solutions.periodic_motion import (
-    motions_at_velocities,
     periodic_motion,
-    response_at_velocities,
 )
 
 CONDITIONS = ("frequency", "velocity", "fold", "peak", "phase_resonance")
@@ -243,30 +241,6 @@ def test_vmap_agrees_with_one_by_one_and_traces_once(curve):
         assert float(amplitude[k]) == pytest.approx(float(alone.amplitude), rel=1e-11)
     chord = (amplitude[2] - amplitude[0]) / (forces[2] - forces[0])
     assert min(slope) < chord < max(slope)
-
-
-def test_motions_at_velocities_lie_on_the_curve_and_have_gradients(curve):
-    model = oscillator()
-    heights = np.array([0.2, 0.7, 1.0]) * np.abs(curve.velocity[:, 1, 0]).max()
-    heights[2] *= 2  # never reached
-    found, which = response_at_velocities(model, curve, heights)
-    assert which.tolist() == [0, 1, 1, 0]  # up one flank and down the other
-    assert np.all(found.converged)
-    np.testing.assert_allclose(found.amplitude, heights[which], rtol=1e-12)
-    starts = (found.coefficients, found.frequency)
-    n = sum(values.size for values in numbers(model))
-
-    @jax.jit
-    def frequencies(shifts):
-        now = changed(model, shifts)
-        return motions_at_velocities(now, FORCE, starts, heights[which]).frequency
-
-    zero = np.zeros(n)
-    np.testing.assert_allclose(frequencies(zero), found.frequency, rtol=1e-12)
-    slope = by_differences(frequencies, zero, 1e-4)
-    scale = np.abs(slope).max()
-    reverse = jax.jit(jax.jacrev(frequencies))(zero)
-    np.testing.assert_allclose(reverse, slope, rtol=0, atol=1e-6 * scale)
 
 
 # --------------------------------------------------------------------------------- failing well
