@@ -52,7 +52,7 @@ class Search(NamedTuple):
 
     def among(self, answered: Answered, n: int) -> "Search":
         """A search among the effects of the `n` best answers so far."""
-        return self._among(one.kinds for one in answered.weights.answers[:n])
+        return self._among(answer.kinds for answer in answered.weights.answers[:n])
 
     def near(self, found: FoundEffects) -> "Search":
         """A search among the effects of the answers that fit best so far."""

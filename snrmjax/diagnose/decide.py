@@ -66,9 +66,9 @@ def most_probable(found: FoundEffects, weights: Weights) -> FoundEffects:
     """
     best = weights.answers[0]
     rivals = [
-        one
-        for one in weights.answers[1:]
-        if one.log_weight > best.log_weight + np.log(priors.AS_GOOD) and one.kinds
+        answer
+        for answer in weights.answers[1:]
+        if answer.log_weight > best.log_weight + np.log(priors.AS_GOOD) and answer.kinds
     ]
     classes = [[kind] for kind in best.fit.kinds]
     for one in rivals if classes else ():
@@ -126,14 +126,16 @@ def decide(
         return Judgement(Verdict.NOTHING_MISSING, (), (), probabilities)
     objections = imitations_of(found, located)
     objections += doubts_on_gains(misfit, fit, errors)
-    objections += missed_levels(levels, found, doubted=any(not one.identical for one in objections))
+    objections += missed_levels(
+        levels, found, doubted=any(not objection.identical for objection in objections)
+    )
     if rival is not None:
         objections.append(rival.doubt)
     if not objections and outside > priors.NO_DOUBT:
         why = Fact("unknown_law", probability=outside, left=left_curve(misfit, fit))
         objections.append(Doubt(why, WIDER, identical=True))
-    doubted = tuple(one.reason for one in objections)
-    if any(one.refutes for one in objections):
+    doubted = tuple(objection.reason for objection in objections)
+    if any(objection.refutes for objection in objections):
         kept = {
             name: p if name in (NONE, NOISE_REJECTED) else priors.OPEN * p
             for name, p in probabilities.items()

@@ -65,7 +65,7 @@ class Weights(NamedTuple):
 
     def probabilities(self) -> dict[str, float]:
         """Of every answer by its name, the largest first; they add up to one."""
-        logs = {answer_name(one.kinds): one.log_weight for one in self.answers}
+        logs = {answer_name(answer.kinds): answer.log_weight for answer in self.answers}
         logs |= {UNKNOWN: self.unknown, NOISE_REJECTED: self.noise_rejected}
         logs = {name: value for name, value in logs.items() if np.isfinite(value)}
         total = logsumexp(list(logs.values()))

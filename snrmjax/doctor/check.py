@@ -67,8 +67,8 @@ def check_test(
             notes.append(Fact("no_model"))
     else:
         notes.append(Fact("no_table"))
-    for one in recordings:
-        of_record, unseen = record_findings(one)
+    for recording in recordings:
+        of_record, unseen = record_findings(recording)
         found += of_record
         notes += unseen
     return Checkup(gravest_first(found), tuple(dict.fromkeys(notes)))
@@ -139,9 +139,9 @@ def _likeliest(seen: CheckedStates, base: Judged) -> TestCorrection | None:
     if base.misfit > NO_MODE:
         return None
     mattering = (
-        one
-        for one in corrections(seen, base.states, base)
-        if _matters(one, base) and one.judged.leaves_less(base)
+        correction
+        for correction in corrections(seen, base.states, base)
+        if _matters(correction, base) and correction.judged.leaves_less(base)
     )
     return max(mattering, key=lambda one: one.judged.evidence, default=None)
 

@@ -99,13 +99,13 @@ class Checkup(AbstractResult):
         n, line = len(self.findings), "{severity}: {kind} in {where}: {evidence} Mend: {mend}"
         return (
             f"Checkup: {n} finding{'s' if n != 1 else ''}" if n else "Checkup: nothing found",
-            *(line.format(**one.as_dict()) for one in self.findings),
+            *(line.format(**finding.as_dict()) for finding in self.findings),
             *(f"note: {note}" for note in self.notes),
         )
 
     def variables(self) -> dict[str, Variable]:
         """See `AbstractResult`; a row a finding."""
-        at, said = ("finding",), [one.as_dict() for one in self.findings]
+        at, said = ("finding",), [finding.as_dict() for finding in self.findings]
         number = Variable(at, np.arange(len(said)), "1", "number")
         return {"finding": number} | {
             name: Variable(at, np.array([one[name] for one in said], dtype=str), "", meaning)
@@ -115,7 +115,7 @@ class Checkup(AbstractResult):
     @property
     def kinds(self) -> tuple[str, ...]:
         """The kinds of the findings."""
-        return tuple(one.kind for one in self.findings)
+        return tuple(finding.kind for finding in self.findings)
 
 
 def gravest_first(findings: Sequence[Finding]) -> tuple[Finding, ...]:

@@ -119,7 +119,9 @@ def best_reading(seen: CheckedStates, known_mass: bool) -> tuple[Reading, Readin
     # Conjugates of a held response pass for curves as steep as their noise asks for.
     well = recorded.judged.damped and recorded.judged.misfit < enough
     others = (CONJUGATED,) if well else OTHERS
-    meant = [(one, seen.read(one.change(seen.recorded, seen.test.frequency))) for one in others]
+    meant = [
+        (other, seen.read(other.change(seen.recorded, seen.test.frequency))) for other in others
+    ]
     # A motion that mostly gains energy from its force has no odds.
     tried = [
         _judged(one, states, known_mass) for one, states in meant if _possible(seen, one, states)

@@ -152,7 +152,7 @@ def _demodulated(x: np.ndarray, rows: slice, frequency: float, rate: float) -> n
 
 def _flat_cycles(x: np.ndarray, steps: list[Step], rate: float, where: str) -> Finding | None:
     """A mean cycle whose tops are flat, where noise hides the single samples' limit."""
-    sizes = [float(np.std(x[_middle(one)])) for one in steps]
+    sizes = [float(np.std(x[_middle(step)])) for step in steps]
     best = None
     for k in np.argsort(sizes)[-3:]:
         one = steps[int(k)]
@@ -175,7 +175,7 @@ def _flat_cycles(x: np.ndarray, steps: list[Step], rate: float, where: str) -> F
 
 def _harmonics(x: np.ndarray, steps: list[Step], rate: float, where: str) -> list[Finding]:
     """The largest harmonic of the force."""
-    spectra = [_lines(x, _middle(one), one.frequency, rate) for one in steps]
+    spectra = [_lines(x, _middle(step), step.frequency, rate) for step in steps]
     worst = np.max([lines[1:] / max(lines[0], 1e-300) for lines in spectra], axis=0)
     order = int(np.argmax(worst))
     if not worst[order] > FORCE_HARMONIC:
@@ -246,7 +246,7 @@ def _dropped(force: np.ndarray, x: np.ndarray, steps: list[Step], where: str) ->
     """
     if len(steps) < 5:
         return []
-    f, v = (np.array([np.std(c[_middle(one)]) for one in steps]) * 2**0.5 for c in (force, x))
+    f, v = (np.array([np.std(c[_middle(step)]) for step in steps]) * 2**0.5 for c in (force, x))
     drop, nominal = fall(f, v / f)
     least = int(np.argmin(f))
     beside = min(f[:least].max(initial=0.0), f[least + 1 :].max(initial=0.0))

@@ -51,15 +51,15 @@ def scale_findings(
         ]
     bend = _bend(scale.judged.states, scale.judged.stiffness, model)
     agrees = bend is not None and abs(np.log(bend)) < OTHER_SCALE * 3
-    units = [one for one in _mixed_units() if abs(off - np.log(one.mass)) < near]
-    units = [one for one in units if not (agrees and one.column == "response")]
+    units = [unit for unit in _mixed_units() if abs(off - np.log(unit.mass)) < near]
+    units = [unit for unit in units if not (agrees and unit.column == "response")]
     found = []
     severity: Severity = "error"
     if units:
         severity, size = "warning", Fact("if_units_are_right")
-        names = tuple(one[:3] for one in units)
+        names = tuple(unit[:3] for unit in units)
         evidence = Fact("mixed_units", **asked, factor=units[0].mass, units=names)
-        corrections = tuple(one.correction for one in units)
+        corrections = tuple(unit.correction for unit in units)
         advice = Fact("advice_units", units=names)
         found.append(
             Finding("wrong_unit", "error", where, evidence, advice, corrections=corrections)
@@ -104,7 +104,7 @@ def _mixed_units() -> Iterator[_MixedUnit]:
         *(("force", "mN", "N", 1e3), ("force", "kN", "N", 1e-3)),
         ("force", "pounds", "N", 1 / 4.4482216),
     )
-    yield from (_MixedUnit(*one) for one in pairs)
+    yield from (_MixedUnit(*pair) for pair in pairs)
     yield from (_MixedUnit(of, other, unit, 1 / mass) for of, unit, other, mass in pairs)
 
 

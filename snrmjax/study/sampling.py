@@ -67,14 +67,14 @@ def number_of_members(variations: Sequence[AbstractVariation], sampling: Samplin
 
 def _counted_by_values(variations: Sequence[AbstractVariation], sampling: Sampling) -> int:
     sizes = {}
-    for one in variations:
-        values = one.grid()
+    for variation in variations:
+        values = variation.grid()
         if values is None:
             raise ValueError(
-                f"a {sampling.method} goes through values, but {', '.join(one.names)} has a "
+                f"a {sampling.method} goes through values, but {', '.join(variation.names)} has a "
                 "distribution: give `values`, or a `range` with `points`, or another method."
             )
-        sizes[one.names[0]] = len(values)
+        sizes[variation.names[0]] = len(values)
     if not sizes:
         raise ValueError(f"a {sampling.method} needs at least one quantity that varies.")
     if sampling.method == "grid":
@@ -96,17 +96,17 @@ def drawn_members(
     """
     n = number_of_members(variations, sampling)
     if sampling.method in ("grid", "list"):
-        values = [np.asarray(one.grid()) for one in variations]
+        values = [np.asarray(variation.grid()) for variation in variations]
         if sampling.method == "list":
             return np.stack(values, axis=1)
         return np.stack([a.ravel() for a in np.meshgrid(*values, indexing="ij")], axis=1)
     if not variations:
         return np.zeros((n, 0))
-    unit = _unit_cube(sampling.method, n, [len(one.names) for one in variations], seed)
+    unit = _unit_cube(sampling.method, n, [len(variation.names) for variation in variations], seed)
     columns, begin = [], 0
-    for one in variations:
-        end = begin + len(one.names)
-        columns.append(one.quantiles(unit[:, begin:end]))
+    for variation in variations:
+        end = begin + len(variation.names)
+        columns.append(variation.quantiles(unit[:, begin:end]))
         begin = end
     return np.concatenate(columns, axis=1)
 

@@ -177,7 +177,7 @@ def _write_store(
     axes = study.computation.axes()
     sizes = {MEMBER: len(ensemble.table), **{name: len(axis.values) for name, axis in axes.items()}}
     outputs = study.computation.outputs()
-    ragged = {one.dimensions[0] for one in outputs.values()} - {MEMBER}
+    ragged = {output.dimensions[0] for output in outputs.values()} - {MEMBER}
     for dimension in ragged:
         text = f"first row of the member along `{dimension}`; n_{dimension}s is how many"
         counted = outputs[f"n_{dimension}s"].dimensions

@@ -55,7 +55,7 @@ class Study(eqx.Module):
     @property
     def names(self) -> tuple[str, ...]:
         """The varied quantities."""
-        return tuple(name for one in self.variations for name in one.names)
+        return tuple(name for variation in self.variations for name in variation.names)
 
     @property
     def n_members(self) -> int:

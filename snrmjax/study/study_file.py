@@ -67,7 +67,7 @@ def read_study(path: FilePath) -> Study:
     path_of_model = folder / top.text("model")
     beam = read_beam_models(path_of_model) if is_beam_file(path_of_model) else None
     model = read_model(path_of_model) if beam is None else beam({})
-    variations = tuple(_variation(one) for one in top.tables("vary", file))
+    variations = tuple(_variation(table) for table in top.tables("vary", file))
     study = Study(
         name=top.text("name", Path(path).stem),
         model=model,
@@ -88,7 +88,7 @@ def read_study(path: FilePath) -> Study:
 def _sampling(top: TomlTable, file: str, variations: tuple[AbstractVariation, ...]) -> Sampling:
     table = top.table("sample", f"[sample] of {file}")
     table.check_keys((), ("method", "members"))
-    valued = all(one.grid() is not None for one in variations) and bool(variations)
+    valued = all(variation.grid() is not None for variation in variations) and bool(variations)
     method = table.choice("method", _METHODS, "grid" if valued else "random")
     members = table.whole("members", 1) if "members" in table.entries else None
     return Sampling(method, members)  # type: ignore[arg-type]
@@ -182,7 +182,7 @@ def _computation(
         levels = np.zeros(0) if forces is None else forces
         per_level = top.whole("points_per_level", 1, 5)
         return VirtualTests(within, levels, _errors(top), per_level)
-    varied = any(FORCE in one.names for one in variations)
+    varied = any(FORCE in variation.names for variation in variations)
     if forces is None and not varied:
         raise ValueError(f"{top.place} lacks the key `forces_n`, and {FORCE} does not vary.")
     if kind == "curves":

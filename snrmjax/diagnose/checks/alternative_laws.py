@@ -59,8 +59,12 @@ def doubts(
     if drags:
         record = Fact("record_second_harmonic", closer=2 in orders)
         found.append(Doubt(Fact("one_direction_alike", effect=drags[0]), record, identical=True))
-    imitations = [one for kind in effects for one in EFFECTS[kind].imitations]
-    found += [_doubt(one) for one in imitations if one.unless_harmonic not in (None, *orders)]
+    imitations = [imitation for kind in effects for imitation in EFFECTS[kind].imitations]
+    found += [
+        _doubt(imitation)
+        for imitation in imitations
+        if imitation.unless_harmonic not in (None, *orders)
+    ]
     # Nothing passive adds energy: there is a source, whose law may be another one.
     silent = Fact("measure_without_feedback")
     found += [
@@ -71,7 +75,9 @@ def doubts(
     if len(effects) == 1:
         found += _of_exponent(effects[0], located, own_power)
     found += [
-        _doubt(one) for one in imitations if one.unless_harmonic is None and one.near_power is None
+        _doubt(imitation)
+        for imitation in imitations
+        if imitation.unless_harmonic is None and imitation.near_power is None
     ]
     found += [
         Doubt(Fact("wider_than_measured", effect=kind), Fact("step_wider"))
@@ -161,9 +167,9 @@ def _of_exponent(effect: str, located: tuple[Located, ...], own_power: float | N
         reason = Fact("other_power", effect=effect, part=part, **power)
         return [Doubt(reason, WIDER, refutes=True)]
     return [
-        _doubt(one)
-        for one in EFFECTS[effect].imitations
-        if one.near_power is not None and abs(exponent - one.near_power) < 2 * std
+        _doubt(imitation)
+        for imitation in EFFECTS[effect].imitations
+        if imitation.near_power is not None and abs(exponent - imitation.near_power) < 2 * std
     ]
 
 

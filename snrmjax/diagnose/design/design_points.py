@@ -58,7 +58,7 @@ def predicted_test(
         speed.append(one.scale * np.interp(one.phase, phase[order], tip[order]) * np.cos(one.phase))
         omega.append(np.interp(one.phase, phase[order], np.asarray(states.frequency)[mine][order]))
         member.append(np.full(len(one.phase), number))
-    aim = np.concatenate([one.phase for one in points])
+    aim = np.concatenate([point.phase for point in points])
     size, at, whose = (np.concatenate(parts) for parts in (speed, omega, member))
     modes, j = misfit.model.modes, misfit.model.modes.mode_of_interest
     sensor = misfit.predictions.chosen.sensors[0]

@@ -185,7 +185,7 @@ def _rivals(found: FoundEffects, place: int) -> Iterator[EffectFit]:
         kinds = {name if k == place else kind for k, kind in enumerate(found.fit.kinds)}
         # One effect with more parameters may stand for two.
         tables = (row.parameters for step in found.table[::-1] for row in step)
-        by_kinds = [({label.partition(".")[0] for label in one}, one) for one in tables]
+        by_kinds = [({label.partition(".")[0] for label in table}, table) for table in tables]
         last = [one for wanted in (kinds, {name}) for has, one in by_kinds if has == wanted][:1]
         if not last:
             continue
@@ -229,7 +229,7 @@ class _Hypothesis:
     def _measured(self) -> list[tuple[Rows, float]]:
         """Rows of the measured states and χ² after a refit: of the truth, then of the rivals."""
         rows = [Rows(fit.rows, fit.slopes) for fit in (self.truth, *self.rivals)]
-        return [(one, refitted_chi_square(one, self.misfit.noise.covariance)) for one in rows]
+        return [(row, refitted_chi_square(row, self.misfit.noise.covariance)) for row in rows]
 
     def expected(self, option: _Option) -> DiscriminatingTest | None:
         """The expected gain of an option over the rival that it separates least well."""

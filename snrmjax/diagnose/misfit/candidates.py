@@ -45,16 +45,18 @@ def parameter_labels(kind: str) -> tuple[str, ...]:
 
 def only_by_calibration(kinds: Iterable[str]) -> set[str]:
     """Those of some kinds of which another one does the same to every test of one mode."""
-    found = (_confused(one, kinds) for one in _confusions(kinds) if one.by_calibration)
+    found = (
+        _confused(confusion, kinds) for confusion in _confusions(kinds) if confusion.by_calibration
+    )
     return set().union(*(group for group in found if len(group) > 1))
 
 
 def decide_by(kinds: set[str], *, harmonics: bool) -> list[Fact | str]:
     """The measurements that would settle which of several kinds it is, two at most."""
     fitting: list[Fact | str] = [
-        one.separated_by
-        for one in _confusions(kinds)
-        if len(_confused(one, kinds)) > 1 or one.by_itself
+        confusion.separated_by
+        for confusion in _confusions(kinds)
+        if len(_confused(confusion, kinds)) > 1 or confusion.by_itself
     ]
     if fitting:
         return list(dict.fromkeys(fitting))[:2]
@@ -63,7 +65,7 @@ def decide_by(kinds: set[str], *, harmonics: bool) -> list[Fact | str]:
 
 def _confusions(kinds: Iterable[str]) -> list[Confusion]:
     """What some kinds may be confused with: of the library in its order, then of a user."""
-    found = [one for kind in kinds for one in EFFECTS[kind].confusions]
+    found = [confusion for kind in kinds for confusion in EFFECTS[kind].confusions]
     library = [one for one in CONFUSIONS if one in found]
     return library + [one for one in dict.fromkeys(found) if one not in CONFUSIONS]
 

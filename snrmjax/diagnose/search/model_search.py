@@ -72,8 +72,8 @@ def find_effects(
             candidates[kind] = candidates[kind]._replace(starts=(*candidates[kind].starts, start))
     alternatives = [candidates.pop(kind) for kind in kinds if not EFFECTS[kind].searched]
     found = _searched(misfit, candidates)
-    for one in alternatives:
-        found = _compared_with(found, one, candidates)
+    for alternative in alternatives:
+        found = _compared_with(found, alternative, candidates)
     return found
 
 
@@ -164,7 +164,7 @@ def _compared_with(
     if refuted and len(fit.kinds) < priors.MOST_EFFECTS:
         jobs.append((close, fit))
     fits = fit_effects(misfit, jobs, _hopeless(fit))
-    fits = [one for one in fits if np.isfinite(one.chi_square)]
+    fits = [fit for fit in fits if np.isfinite(fit.chi_square)]
     if not fits:
         return found
     best = _best([fit, *fits])

@@ -117,22 +117,25 @@ def fit_free_decay(
 
 def _channels(recordings: Sequence[TimeRecording], names: Sequence[str] | None) -> list[Channel]:
     first = recordings[0]
-    for one in recordings[1:]:
-        if one.channel_names != first.channel_names or one.sampling_rate != first.sampling_rate:
+    for recording in recordings[1:]:
+        if (
+            recording.channel_names != first.channel_names
+            or recording.sampling_rate != first.sampling_rate
+        ):
             raise ValueError(
                 "decays must share their channels and sampling rate, but have "
-                f"{', '.join(one.channel_names)} at {one.sampling_rate:.6g} Hz and "
+                f"{', '.join(recording.channel_names)} at {recording.sampling_rate:.6g} Hz and "
                 f"{', '.join(first.channel_names)} at {first.sampling_rate:.6g} Hz."
             )
     if names is None:
-        motions = [one for one in first.channels if one.quantity in _MOTIONS]
+        motions = [channel for channel in first.channels if channel.quantity in _MOTIONS]
         if not motions:
             raise ValueError(
                 "a decay needs a channel that is a displacement, velocity or acceleration, but "
                 f"there are {', '.join(map(str, first.channels))}."
             )
         return motions
-    by_name = {one.name: one for one in first.channels}
+    by_name = {channel.name: channel for channel in first.channels}
     for name in names:
         if name not in by_name:
             raise ValueError(f"there is no channel {name!r}; there are {', '.join(by_name)}.")

@@ -242,15 +242,15 @@ def averaged(
     points: list[SizedPoint], posterior: Callable[[np.ndarray], Gaussian]
 ) -> tuple[Float[np.ndarray, " hyper"], Gaussian]:
     """The mean of the points, and mean and covariance of what each says of the unknowns."""
-    weight = np.array([one.log_evidence for one in points])
+    weight = np.array([point.log_evidence for point in points])
     weight = np.exp(weight - weight.max())
     weight = weight / weight.sum()
-    each = [posterior(one.point) for one in points]
+    each = [posterior(point.point) for point in points]
     means = np.array([one.mean for one in each])
     mean = weight @ means
     within = np.einsum("k,kij->ij", weight, np.array([one.covariance for one in each]))
     off = means - mean
-    point = weight @ np.array([one.point for one in points])
+    point = weight @ np.array([point.point for point in points])
     effective = float(weight @ np.array([one.told for one in each]))
     return point, Gaussian(mean, within + (off * weight[:, None]).T @ off, effective)
 

@@ -29,7 +29,7 @@ from snrmjax.identify.test_model.linear_gaussian import LinearRows, maximised
 if TYPE_CHECKING:
     from snrmjax.identify.test_model.posterior import TestPosterior
 
-_ROUNDS = 12  # at most
+_ROUNDS = 16  # at most: twice what steep curves need
 _SETTLED = 2  # rounds, until steps are checked and the modal mass is free
 _GUESS = 0.3  # 1σ of the modal mass, from which on it is asked for and not known
 _TRIED = 4  # rounds of each start

@@ -203,7 +203,7 @@ def _summary(found: Comparison) -> dict:
     own = reference is not None and reference.method == "snrm"
     near = {d.method: (d.frequency / HERTZ, d.damping) for d in found.distances() if own}
     return {
-        "records": [str(one) for one in found.records],
+        "records": [str(record) for record in found.records],
         "bands": notes_on_bands(results),
         "methods": {
             result.method: {

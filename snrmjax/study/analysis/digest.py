@@ -60,8 +60,8 @@ class StudyDigest(NamedTuple):
     @property
     def each_effect(self) -> Iterator[tuple[Scalar, Effects]]:
         """Every output and force with its effects."""
-        for one in self.effects:
-            yield from zip(one.outputs, one.effects, strict=True)
+        for effect in self.effects:
+            yield from zip(effect.outputs, effect.effects, strict=True)
 
     @property
     def facts(self) -> tuple[Fact, ...]:
@@ -80,7 +80,7 @@ class StudyDigest(NamedTuple):
         return (*facts, *self.failures.facts)
 
     def _on_shares(self) -> list[Fact]:
-        pairs = [(out, one) for out, effects in self.each_effect for one in effects.values()]
+        pairs = [(out, effect) for out, effects in self.each_effect for effect in effects.values()]
         few = {_named(out) for out, one in pairs if one is None and out.varies}
         unsure = {_named(out) for out, one in pairs if one and one.half_width > _UNSURE}
         facts = []
@@ -147,4 +147,6 @@ def _named(scalar: Scalar) -> tuple[str, float | None]:
 
 def _certain(effects: Effects) -> float:
     """What the shares add up to at least."""
-    return sum(one.share - one.half_width for one in effects.values() if one is not None)
+    return sum(
+        effect.share - effect.half_width for effect in effects.values() if effect is not None
+    )

@@ -127,7 +127,7 @@ class Peaks(AbstractResponses):
         """See `AbstractComputation.rows`."""
         curves, rows = self.traced(members)
         ends = zip(curves, rows["status"].ravel().tolist(), strict=True)
-        rows["status"] = self.forces.shaped(np.array([peak_status(*one) for one in ends]))
+        rows["status"] = self.forces.shaped(np.array([peak_status(*end) for end in ends]))
         if self.grid_points:
             bounds = np.array([velocity_bounds(parts, self._grid) for parts in curves])
             rows["upper_velocity_m_s"] = self.forces.shaped(bounds[:, 1])
@@ -187,11 +187,11 @@ def peak_status(curves: Sequence[ResponseCurve], status: str) -> str:
     """
     if status not in COMPLETE:
         return status
-    speed = [np.abs(one.velocity[:, 1, 0]) for one in curves]
+    speed = [np.abs(curve.velocity[:, 1, 0]) for curve in curves]
     peaks = [v[one.at_events("peak")] for v, one in zip(speed, curves, strict=True)]
     highest = max(np.concatenate(peaks), default=None)
     if highest is None:
-        missed = any("peak" in one.not_located for one in curves)
+        missed = any("peak" in curve.not_located for curve in curves)
         return "peak_not_located" if missed else NO_PEAK
     open_ended = [v for v, c in zip(speed, curves, strict=True) if c.status != CurveStatus.CLOSED]
     at_ends = max((max(v[0], v[-1]) for v in open_ended), default=0.0)
@@ -202,9 +202,9 @@ def velocity_bounds(
     curves: Sequence[ResponseCurve], frequencies: Float[np.ndarray, " frequency"]
 ) -> Float[np.ndarray, "bound frequency"]:
     """Lowest and highest velocity of a response at given frequencies (rad/s), NaN outside it."""
-    x = np.concatenate([one.frequency for one in curves])
-    speed = np.concatenate([np.abs(one.velocity[:, 1, 0]) for one in curves])
-    begins = np.concatenate([np.arange(len(one.frequency)) == 0 for one in curves])
+    x = np.concatenate([curve.frequency for curve in curves])
+    speed = np.concatenate([np.abs(curve.velocity[:, 1, 0]) for curve in curves])
+    begins = np.concatenate([np.arange(len(curve.frequency)) == 0 for curve in curves])
     low, high = bounds_over(np.zeros(len(x), dtype=int), x, speed, frequencies, begins, 1)
     return np.concatenate([low, high])
 

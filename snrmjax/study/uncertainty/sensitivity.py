@@ -109,7 +109,7 @@ def main_effect(
     groups = [table[k::_GROUPS].T @ table[k::_GROUPS] for k in range(_GROUPS)]
     total = np.sum(groups, axis=0)
     coefficients, covariance, share = _fit(total)
-    without = np.array([_fit(total - one)[2] for one in groups])
+    without = np.array([_fit(total - group)[2] for group in groups])
     std = np.sqrt((_GROUPS - 1) / _GROUPS * np.sum((without - without.mean()) ** 2))
     rows = basis(at, knots)
     error = np.sqrt(np.maximum(np.sum((rows @ covariance) * rows, axis=1), 0.0))

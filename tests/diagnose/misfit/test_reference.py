@@ -160,7 +160,7 @@ def test_a_force_without_a_stated_error_has_a_share_of_the_velocitys():
 def test_noise_of_a_steep_set_is_found_however_long_the_way():
     """Softening by 93 bandwidths, levels' frequencies 1 % off; noise as stated (by another code).
 
-    Twelve rounds end anywhere between 0.9 and 12 times of it, as rounding has it.
+    Too few rounds end anywhere between 0.9 and 12 times of it, as rounding has it.
     """
     model, data = files("softening_far", "strong")
     posterior = with_reference(predictions_of(model, data)).reference.posterior
