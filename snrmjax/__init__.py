@@ -4,7 +4,8 @@ The ten verbs to start with are here (`snrmjax.identify_backbone`, …); the res
 `model` what a structure is, `measure` what a test gives, `simulate` what a structure does,
 `condense` models from finite elements, `identify` backbone and damping from a test, `methods` the
 field's other methods, `diagnose` what a model lacks, `doctor` errors of a test, `study` sweeps,
-`io` files, `plot` figures, `pipelines` what the commands do. Arguments run: what the verb works on, data, method, then settings by keyword.
+`io` files, `plot` figures, `pipelines` what the commands do. Arguments run: what the verb works on,
+data, method, then settings by keyword.
 
 Glossary
 
