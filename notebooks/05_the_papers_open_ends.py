@@ -321,7 +321,10 @@ for number, (label, motion, share) in enumerate(SEPARATED):
                 motions[motion], nearest, farthest, missing=share * forces[0], seed=seed
             )
             gain = gains(sj.diagnose_model(model, states))
-            differences.append(gain["force_offset_error"] - gain["coulomb_friction"])
+            # One that is not fitted at all is behind the best of the others.
+            others = max(value for kind, value in gain.items() if kind not in BOTH)
+            offset, slip = (gain.get(kind, others) for kind in (*OFFSET[0], *FRICTION[0]))
+            differences.append(offset - slip)
         axes.plot(
             np.full(3, place + 0.12 * number - 0.06),
             differences,
@@ -405,7 +408,8 @@ headline["the whole intercept makes a drop of 12.7 %"] = (
     abs(missing / (lowest + missing) - 0.127) < 1e-3
 )
 headline["the line's own error does not: 3 % at most"] = own < 0.03
-headline["the test's states would find the offset to 1 % of the lowest force"] = precision < 0.01
+# Errors that whole levels may have are allowed for: they double what noise alone leaves.
+headline["the test's states would find the offset to 2 % of the lowest force"] = precision < 0.02
 
 # %% [markdown]
 # **Conclusion: the printed numbers do not decide it, and they contradict the simplest
@@ -428,7 +432,7 @@ headline["the test's states would find the offset to 1 % of the lowest force"] =
 #   amplitude by definition: it cannot change the damping there.
 #
 # What would decide: the test's own rows (voltage, frequency, velocity, phase) with the model of
-# the linear test. Some thirty states near resonance give the offset to about 1 % of the lowest
+# the linear test. Some thirty states near resonance give the offset to about 2 % of the lowest
 # force; two states of the lowest level on either side of resonance distinguish it from friction.
 
 # %% [markdown]

@@ -10,7 +10,6 @@ import pytest
 NOTEBOOKS = Path(__file__).resolve().parents[1] / "notebooks"
 LONG = (
     "01_backbone_from_near_resonance",
-    "02_forced_responses",
     "03_joint_fit_and_error_bars",
     "04_the_missing_effect",
     "05_the_papers_open_ends",

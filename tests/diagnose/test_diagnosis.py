@@ -115,7 +115,6 @@ def test_where_nothing_is_hidden_nothing_is_found():
     assert all(0 < limit < np.inf for limit in found.detection_limits.values())
 
 
-@pytest.mark.long
 def test_understated_noise_is_refused():
     found, key = blind("blind_01")
     assert found.verdict == "noise_rejected"
@@ -123,7 +122,6 @@ def test_understated_noise_is_refused():
     assert found.notes[0]["ratio"] > 1
 
 
-@pytest.mark.long
 def test_an_effect_that_no_one_knows_is_not_named():
     found, _ = blind("blind_02")
     assert found.verdict == "unknown"

@@ -61,7 +61,8 @@ def test_a_larger_ratio_looks_further(exact_fit):
     assert near.resonances == ()
     assert far.resonances[0].frequency == pytest.approx(speed / x, rel=1e-6)
     assert far.resonances[0].continued
-    assert far.notes[0]["ratio"] == pytest.approx(2.5)
+    # The largest amplitude lies a little beyond phase resonance.
+    assert far.notes[0]["ratio"] == pytest.approx(2.5, rel=1e-3)
 
 
 @pytest.mark.long

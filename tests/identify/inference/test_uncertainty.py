@@ -55,7 +55,6 @@ def test_contributions_near_resonance_of_a_linear_mode_are_known():
         assert shares[other].frequency_share < 0.01 * shares["phase"].frequency_share
 
 
-@pytest.mark.long
 def test_the_bootstrap_knows_the_states_but_not_what_levels_share():
     independent = sj.fit_jointly(noisy(3, per_level=25), modes(), **TRUE)
     drawn = bootstrap(independent, 100)
