@@ -29,10 +29,11 @@ from snrmjax.identify.test_model.linear_gaussian import LinearRows, maximised
 if TYPE_CHECKING:
     from snrmjax.identify.test_model.posterior import TestPosterior
 
-_ROUNDS = 16  # at most: twice what steep curves need
+_ROUNDS = 12  # at most
 _SETTLED = 2  # rounds, until steps are checked and the modal mass is free
 _GUESS = 0.3  # 1σ of the modal mass, from which on it is asked for and not known
 _TRIED = 4  # rounds of each start
+_FURTHER = 4  # where states are not counted as fewer, which moves for ever
 _MANY = 48  # rounds of each, where all still moves
 _LOST = 3.0  # 1σ of stated noise, beyond which a walk is not where the records are explained
 _STILL = 0.05  # standard deviations of all unknowns, below which nothing moves any more
@@ -78,6 +79,8 @@ def likeliest_walk(balance: Balance, rounds: Rounds, *, robust: bool, tempered: 
         for one in walks:
             one.advance(_MANY - one.turn)
         best = max(walks, key=lambda one: one.likelihood_of(share))
+    elif rounds.most == _ROUNDS and not tempered:  # which of two processors is still is chance
+        best.advance(_FURTHER)
     return best
 
 
