@@ -13,6 +13,7 @@ from snrmjax.io.files import FilePath
 from snrmjax.io.laboratory.checkups import read_recordings
 from snrmjax.io.models import read_model
 from snrmjax.io.tables import read_steady_states
+from snrmjax.numerics.facts import Fact
 from snrmjax.pipelines.folder_contents import MAP, TestFiles
 
 _SI = {"": "m/s", "acceleration": "m/s2", "displacement": "m"}
@@ -69,15 +70,16 @@ def with_imports(checkup: Checkup, read: FilesRead | None) -> Checkup:
     told = []
     for finding in checkup.findings:
         lines = [line for correction in finding.corrections if (line := _command(correction, read))]
-        advice = str(finding.advice)
-        advice = f"{advice.rstrip('.')}: {', or '.join(lines)}." if lines else advice
+        advice = finding.advice
+        if lines:
+            advice = Fact("advice_by_import", advice=advice, commands=tuple(lines))
         if (
             len(certain) > 1
             and finding is certain[0]
             and (line := _command(_joined(certain), read))
         ):
-            names = " and ".join(each.name for each in certain)
-            advice = f"{names} at once: {line}. Alone, {advice}"
+            names = tuple(each.name for each in certain)
+            advice = Fact("advice_at_once", names=names, command=line, alone=advice)
         told.append(finding._replace(advice=advice))
     return Checkup(tuple(told), checkup.notes)
 

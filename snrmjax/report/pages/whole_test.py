@@ -40,13 +40,14 @@ def write(folder: Path, found: WholeTest) -> Report:
         row = ("steps of the records", str(found.counts.fact))
         identified = identified._replace(summary=[*identified.summary, row])
     stages.append(_Stage("Backbone", identified))
+    diagnosed = None
     if found.diagnosed is not None:
         (folder / "diagnose").mkdir()
         diagnosed = diagnosis.write(
             folder / "diagnose", found.diagnosed, title="measured", data="measured.csv"
         )
         stages.append(_Stage("Diagnosis", diagnosed))
-    report = _report(found, stages)
+    report = _report(found, stages, _result(found, identified, diagnosed))
     write_report(folder / "report.html", report)
     return report
 
@@ -77,7 +78,7 @@ def _check(checkup: Checkup) -> str:
     return f"check: {', '.join(dict.fromkeys(grave)) or 'nothing found'}"
 
 
-def _report(found: WholeTest, stages: list[_Stage]) -> Report:
+def _report(found: WholeTest, stages: list[_Stage], result: str) -> Report:
     rows = [row for stage in stages for row in stage.report.summary]
     if found.modes is not None:  # which has the linear mode with its errors already
         of_modes = len(stages[0].report.summary)
@@ -103,20 +104,20 @@ def _report(found: WholeTest, stages: list[_Stage]) -> Report:
     return Report(
         title=f"Test: {found.name}",
         done=[("program", f"snrmjax {version('snrmjax')}")],
-        result=_result(found, stages),
+        result=result,
         summary=list(dict.fromkeys(rows)),
         notes=[f"{stage}{note}" for note, stage in notes.items()],
         sections=sections,
     )
 
 
-def _result(found: WholeTest, stages: list[_Stage]) -> str:
+def _result(found: WholeTest, identified: Report, diagnosed: Report | None) -> str:
     """Check, backbone and diagnosis in a sentence each; their numbers are in the summary."""
     said = [f"{_check(found.checkup).capitalize()}."]
-    said += [stage.report.result for stage in stages if stage.name == "Backbone"]
+    said.append(identified.result)
     if found.counts is not None and found.counts.reasons:
         said.append(f"{found.counts.fact}.")
-    said += [stage.report.result for stage in stages if stage.name == "Diagnosis"]
+    said += [] if diagnosed is None else [diagnosed.result]
     if found.left_out:
         said.append("The diagnosis was left out: the first note says why.")
     return " ".join(text for text in said if text)

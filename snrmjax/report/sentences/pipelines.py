@@ -35,7 +35,13 @@ def _load_scale(stated: float, coefficient: str, change: float, chosen: float) -
     )
 
 
+def _by_import(advice: object, commands: tuple[str, ...]) -> str:
+    return f"{str(advice).rstrip('.')}: {', or '.join(commands)}."
+
+
 SENTENCES: dict[str, Wording] = {
+    "advice_by_import": _by_import,
+    "advice_at_once": "{names} at once: {command}. Alone, {alone}",
     "load": _load,
     "level_missed_by_curves": (
         "level {level} has its resonance under {force:.4g} N, measured at {frequency_hz:.5g} Hz, "
