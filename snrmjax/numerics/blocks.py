@@ -86,6 +86,15 @@ def mapped(function: Callable[..., R], *rows: Any) -> R:
     return jax.lax.map(lambda row: function(*row), rows)
 
 
+def cores() -> int:
+    """Threads that work side by side: as many as there are cores, one beside an accelerator."""
+    if on_accelerator():
+        return 1
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 def over_cores(
     function: Callable[[T], R],
     jobs: Sequence[T],
@@ -97,8 +106,7 @@ def over_cores(
     JAX's compiled programs do not hold Python's lock, so they run side by side. `progress` is
     called with the jobs done and all of them, from the calling thread.
     """
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    workers = 1 if on_accelerator() else min(len(jobs), cores or 1)
+    workers = min(len(jobs), cores())
     results = []
     with ThreadPoolExecutor(max(workers, 1)) as pool:
         for done, result in enumerate(

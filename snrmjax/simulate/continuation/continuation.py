@@ -1,7 +1,7 @@
 """Pseudo-arclength continuation of curves of solutions, with steps chosen by curvature."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -9,9 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
+from snrmjax.numerics.blocks import on_accelerator
 from snrmjax.numerics.status import Status
 
 _FARTHEST = 3.0  # steps over the last one, beyond which the cubic is no guess
+_FIRST, _ORDINARY, _TO_END = 0, 1, 2  # what a trial is for
+RUNNING = -1  # the status of a curve that has not ended
+T = TypeVar("T")
 Point = Float[Array, " unknown"]
 Number = float | Array | np.ndarray
 Linearised = Callable[[Point], tuple[Float[Array, " equation"], Float[Array, "equation unknown"]]]
@@ -41,7 +45,7 @@ class StepControl(eqx.Module):
 
     A step is accepted when Newton's method converges to a point near the guess, where the curve
     has turned little; it is halved otherwise. All but the two whole numbers may change without
-    another compilation.
+    another compilation. Raises `ValueError` for fewer than two points.
     """
 
     first: Number = 0.01
@@ -62,6 +66,22 @@ class StepControl(eqx.Module):
     closing: Number = 0.2  # a closed curve passes its first point nearer than this share of a step
     iterations: int = eqx.field(static=True, default=8)  # of Newton's method, at most
     max_points: int = eqx.field(static=True, default=4000)
+
+    def __check_init__(self) -> None:
+        if self.max_points < 2:
+            raise ValueError(f"`max_points` must be 2 or more, but is {self.max_points}.")
+
+    def is_near(self, step: Array, miss: Array, turn: Array) -> Bool[Array, ""]:
+        """Whether a point is so near its guess that it is the next of the curve."""
+        smooth = (miss < self.largest_miss * step) & (turn < self.largest_turn * self.angle)
+        kinked = (step < self.kink) & (turn < 0.5 * jnp.pi) & (miss < self.kink_miss * step)
+        return smooth | kinked
+
+    def growth(self, turn: Array, n_solves: Array, good: Array) -> Float[Array, ""]:
+        """The next step over the last one, after a turn of the tangent (rad)."""
+        factor = jnp.clip(self.angle / jnp.maximum(turn, 1e-3), 0.5, 2.0)
+        factor = jnp.where(n_solves >= 4, jnp.minimum(factor, 0.7), factor)
+        return jnp.where(good, factor, 0.5)
 
 
 class CurveRange(NamedTuple):
@@ -109,13 +129,77 @@ def on_host(curve: Curve) -> TracedCurve:
     return TracedCurve(points, tangents, CurveStatus(int(curve.status)), int(curve.n_solves))
 
 
-class Correction(NamedTuple):
-    """Where Newton's method went."""
+@jax.custom_batching.custom_vmap
+def solved_behind(
+    matrix: Float[Array, "equation column"],
+) -> Float[Array, "equation right"]:
+    """The solutions for the right-hand sides that stand behind a square matrix."""
+    size = matrix.shape[0]
+    # The columns behind the square part come out multiplied by the inverse of L.
+    factors = jax.lax.linalg.lu(matrix)[0]
+    return jax.lax.linalg.triangular_solve(
+        factors[:, :size], factors[:, size:], left_side=True, lower=False
+    )
 
-    point: Point
-    tangent: Point  # of unit length, along the direction asked for
+
+@solved_behind.def_vmap
+def _solved_side_by_side(count: int, batched: list[bool], matrices: Array) -> tuple[Array, bool]:
+    """One after the other on a CPU.
+
+    A factorisation of many matrices at once spreads over the threads of a pool and waits for them:
+    called from as many threads itself, it waits for ever (jaxlib 0.10).
+    """
+    if on_accelerator():
+        return jax.vmap(solved_behind.fun)(matrices), True
+    return jnp.stack([solved_behind(matrices[k]) for k in range(count)]), True
+
+
+class Trial(NamedTuple):
+    """A correction under way: Newton's method in the hyperplane through `start` across `across`."""
+
+    start: Point
+    across: Point
+    point: Point  # the last iterate
+    tangent: Point  # of unit length, along `across`, at the iterate before
     n_solves: Int[Array, ""]
     converged: Bool[Array, ""]
+    finite: Bool[Array, ""]
+
+    @classmethod
+    def at(cls, start: Point, across: Point) -> "Trial":
+        """A correction that is to begin."""
+        yes = jnp.array(True)
+        return cls(start, across, start, across, jnp.array(0), ~yes, yes)
+
+    def goes_on(self, iterations: Number) -> Bool[Array, ""]:
+        """Whether another step of Newton's method is wanted."""
+        return self.finite & ~self.converged & (self.n_solves < iterations)
+
+    def stepped(self, linearised: Linearised, tolerance: Number) -> "Trial":
+        """After one step of Newton's method.
+
+        One LU factorisation of the bordered matrix, with both right-hand sides as further columns,
+        gives the step and the tangent. Converged when the error that is left falls below
+        `tolerance`; it is judged by the last step times what that step left of the residual.
+        """
+        size = self.start.shape[0]
+        residual, jacobian = linearised(self.point)
+        right = jnp.stack([residual, jnp.zeros(size - 1)], axis=1)
+        ahead = self.across @ (self.point - self.start)
+        border = jnp.concatenate([self.across, jnp.stack([ahead, 1.0])])
+        matrix = jnp.concatenate([jnp.concatenate([jacobian, right], axis=1), border[None]])
+        solved = solved_behind(matrix)
+        new, tangent = self.point - solved[:, 0], solved[:, 1]
+        step = jnp.max(jnp.abs(solved[:, 0]))
+        left = jnp.max(jnp.abs(linearised(new)[0])) / jnp.max(jnp.abs(residual))
+        done = (step <= tolerance) | ((step * left <= tolerance) & (step < 0.1))
+        return self._replace(
+            point=new,
+            tangent=tangent / jnp.linalg.norm(tangent),
+            n_solves=self.n_solves + 1,
+            converged=done & jnp.isfinite(step),
+            finite=jnp.isfinite(step),
+        )
 
 
 def correct(
@@ -124,40 +208,166 @@ def correct(
     direction: Point,
     tolerance: Number,
     iterations: Number,
-) -> Correction:
-    """Newton's method in the hyperplane through `start` across `direction`.
+) -> Trial:
+    """Newton's method in the hyperplane through `start` across `direction`, to its end."""
+    return jax.lax.while_loop(
+        lambda trial: trial.goes_on(iterations),
+        lambda trial: trial.stepped(linearised, tolerance),
+        Trial.at(start, direction),
+    )
 
-    One LU factorisation of the bordered matrix, with both right-hand sides as further columns,
-    gives the Newton step and the tangent. Ends when the error that is left falls below
-    `tolerance`; it is judged by the last step times what that step left of the residual. The
-    tangent belongs to the iterate before the last step.
+
+class Walk(NamedTuple):
+    """A curve that is being traced: where it is, where it came from, and the trial under way."""
+
+    here: Point
+    tangent: Point
+    back: Point
+    back_tangent: Point
+    origin: Point
+    origin_tangent: Point
+    pending: Point  # a guess of the curve's last point, where it left the range
+    ahead: Point  # which way to go at first
+    trial: Trial
+    n_points: Int[Array, ""]
+    step: Float[Array, ""]
+    aim: Int[Array, ""]  # what the trial is for
+    status: Int[Array, ""]  # of a `CurveStatus`, or RUNNING
+    n_solves: Int[Array, ""]
+
+
+class Walker(eqx.Module):
+    """How a curve R(x, λ) = 0 is walked along, one trial after the other.
+
+    `linearised` gives R and its Jacobian, `within` says where the curve ends. The next point is
+    guessed by the cubic through the last two points and their tangents. A step is halved when
+    Newton's method fails, when it ends far from the guess, or when the tangent turns by too much
+    (but for a kink, which steps below `control.kink` may pass); otherwise it is chosen so that the
+    next turn comes near `control.angle`.
+    With `groups` = (rows, columns), into which the first unknowns unfold, no column may change by
+    more than `control.largest_change` of its norm in a step: across a light damped resonance the
+    response turns its sign, and on the scale of the peak the two flanks far below it are
+    neighbours.
+    The last point of a curve that left the range lies on its end; that of a closed one is the
+    first again.
     """
-    size = start.shape[0]
 
-    def body(state: tuple) -> tuple:
-        point, _, count, _, _ = state
-        residual, jacobian = linearised(point)
-        right = jnp.stack([residual, jnp.zeros(size - 1)], axis=1)
-        border = jnp.concatenate([direction, jnp.stack([direction @ (point - start), 1.0])])
-        matrix = jnp.concatenate([jnp.concatenate([jacobian, right], axis=1), border[None]])
-        # The columns behind the square part come out multiplied by the inverse of L.
-        factors = jax.lax.linalg.lu(matrix)[0]
-        solved = jax.lax.linalg.triangular_solve(
-            factors[:, :size], factors[:, size:], left_side=True, lower=False
+    linearised: Linearised
+    within: CurveRange
+    control: StepControl
+    groups: tuple[int, int] | None = eqx.field(static=True, default=None)
+
+    def begun(self, start: Point, direction: Point, across: Point | None = None) -> Walk:
+        """Before the first point: `start` is a guess of it, corrected at its own λ or `across`."""
+        unset = jnp.array(0)
+        return Walk(
+            *(start, direction, start, direction, start, direction, start, direction),
+            trial=Trial.at(start, _at_lambda(start) if across is None else across),
+            n_points=unset,
+            step=jnp.minimum(jnp.asarray(self.control.first), self.control.largest),
+            aim=jnp.array(_FIRST),
+            status=jnp.array(RUNNING),
+            n_solves=unset,
         )
-        new = point - solved[:, 0]
-        step = jnp.max(jnp.abs(solved[:, 0]))
-        left = jnp.max(jnp.abs(linearised(new)[0])) / jnp.max(jnp.abs(residual))
-        done = (step <= tolerance) | ((step * left <= tolerance) & (step < 0.1))
-        return new, solved[:, 1], count + 1, done, jnp.isfinite(step)
 
-    def going(state: tuple) -> Array:
-        _, _, count, done, finite = state
-        return finite & ~done & (count < iterations)
+    def patience(self, walk: Walk) -> Int[Array, ""]:
+        """Steps that Newton's method has for the trial under way."""
+        usual = self.control.iterations
+        return jnp.where(walk.aim == _ORDINARY, usual, 5 * usual)
 
-    state = (start, direction, jnp.array(0), jnp.array(False), jnp.array(True))
-    point, tangent, count, done, finite = jax.lax.while_loop(going, body, state)
-    return Correction(point, tangent / jnp.linalg.norm(tangent), count, done & finite)
+    def advanced(self, walk: Walk) -> tuple[Walk, Bool[Array, ""]]:
+        """After one step of Newton's method, and whether `here` is a new point of the curve."""
+        trial = walk.trial.stepped(self.linearised, self.control.tolerance)
+        going = trial.goes_on(self.patience(walk))
+        unjudged = walk._replace(trial=trial), jnp.array(False)
+        return jax.lax.cond(going, lambda: unjudged, lambda: self.judged(unjudged[0]))
+
+    def corrected(self, walk: Walk) -> tuple[Walk, Bool[Array, ""]]:
+        """After the whole trial under way, and whether `here` is a new point of the curve."""
+        patience, tolerance = self.patience(walk), self.control.tolerance
+        trial = jax.lax.while_loop(
+            lambda trial: trial.goes_on(patience),
+            lambda trial: trial.stepped(self.linearised, tolerance),
+            walk.trial,
+        )
+        return self.judged(walk._replace(trial=trial))
+
+    def judged(self, walk: Walk) -> tuple[Walk, Bool[Array, ""]]:
+        """After a trial that has ended, with the next one begun; and whether it gave a point."""
+        control, trial, (lower, upper, _) = self.control, walk.trial, self.within
+        here, tangent, new = walk.here, walk.tangent, trial.point
+        is_first, is_end = walk.aim == _FIRST, walk.aim == _TO_END
+        ahead = jnp.where(is_first, walk.ahead, tangent)
+        new_tangent = trial.tangent * jnp.where(trial.tangent @ ahead < 0, -1.0, 1.0)
+        turn = jnp.arccos(jnp.clip(new_tangent @ tangent, -1.0, 1.0))
+        near = control.is_near(walk.step, jnp.linalg.norm(new - trial.start), turn)
+        near &= _steady(here, new, self.groups, control)
+        good = trial.converged & (is_first | is_end | near)
+
+        outside = (new[-1] > upper) | (new[-1] < lower)
+        leaving = good & outside & ~is_first & ~is_end
+        end = jnp.where(new[-1] > upper, upper, lower)
+        share = (end - here[-1]) / (new[-1] - here[-1])
+        to_end = (here + share * (new - here)).at[-1].set(end)
+        pending = jnp.where(leaving, to_end, walk.pending)
+
+        closed = good & (walk.n_points > 4) & _passes(walk, new, new_tangent, control.closing)
+        new = jnp.where(closed, walk.origin, new)
+        kept = good & ~leaving
+        n_points = walk.n_points + kept
+        longer = jnp.minimum(
+            walk.step * control.growth(turn, trial.n_solves, good), control.largest
+        )
+        step = jnp.where(is_first | leaving, walk.step, longer)
+        status = self._status(
+            walk, new, good=good, kept=kept, closed=closed, n_points=n_points, step=step
+        )
+        onward = walk._replace(
+            here=jnp.where(kept, new, here),
+            tangent=jnp.where(kept, new_tangent, tangent),
+            back=jnp.where(kept, here, walk.back),
+            back_tangent=jnp.where(kept, tangent, walk.back_tangent),
+            origin=jnp.where(is_first, new, walk.origin),
+            origin_tangent=jnp.where(is_first, new_tangent, walk.origin_tangent),
+            pending=pending,
+            n_points=n_points,
+            step=step,
+            aim=jnp.where(leaving, _TO_END, _ORDINARY),
+            status=status,
+            n_solves=walk.n_solves + trial.n_solves,
+        )
+        guess = jnp.where(leaving, pending, _extrapolated(onward))
+        across = jnp.where(leaving, _at_lambda(guess), onward.tangent)
+        return onward._replace(trial=Trial.at(guess, across)), kept
+
+    def _status(
+        self,
+        walk: Walk,
+        new: Point,
+        *,
+        good: Array,
+        kept: Array,
+        closed: Array,
+        n_points: Array,
+        step: Array,
+    ) -> Int[Array, ""]:
+        """Whether and how the curve has ended."""
+        lower, upper, largest_amplitude = self.within
+        is_first, is_end = walk.aim == _FIRST, walk.aim == _TO_END
+        large = jnp.max(jnp.abs(new[:-1])) > largest_amplitude
+        ends = (
+            (is_first & ~good, CurveStatus.NO_START),
+            (is_end & good & (new[-1] >= upper), CurveStatus.UPPER_END),
+            (is_end & good & (new[-1] <= lower), CurveStatus.LOWER_END),
+            (closed & kept, CurveStatus.CLOSED),
+            (kept & ~is_first & large, CurveStatus.AMPLITUDE_LIMIT),
+            (step < self.control.smallest, CurveStatus.STEP_TOO_SMALL),
+            (n_points >= self.control.max_points, CurveStatus.POINT_LIMIT),
+        )
+        status = jnp.array(RUNNING)
+        for happened, what in reversed(ends):
+            status = jnp.where(happened, int(what), status)
+        return status
 
 
 def trace_curve(
@@ -170,133 +380,54 @@ def trace_curve(
     start_across: Point | None = None,
     groups: tuple[int, int] | None = None,
 ) -> Curve:
-    """Trace the curve R(x, λ) = 0 from `start` until λ leaves its range.
+    """Trace the curve R(x, λ) = 0 from `start` until λ leaves its range, as `Walker` says.
 
     Arguments: `linearised` gives R and its Jacobian; `start` is a guess of the first point,
-    corrected at its own λ, or across `start_across`; `direction` says which way to go; `within`
-    says where the curve ends. The next point is guessed by the cubic through the last two points
-    and their tangents. A step is halved when Newton's method fails, when it ends far from the
-    guess, or when the tangent turns by too much (but for a kink, which steps below `control.kink`
-    may pass); otherwise it is chosen so that the next turn comes near `control.angle`.
-    With `groups` = (rows, columns), into which the first unknowns unfold, no column may change by
-    more than `control.largest_change` of its norm in a step: across a light damped resonance the
-    response turns its sign, and on the scale of the peak the two flanks far below it are
-    neighbours.
-    The last point of a curve that left the range lies on its end; that of a closed one is the
-    first again.
-    Raises `ValueError` when `control.max_points` is below 2.
+    corrected at its own λ, or across `start_across`; `direction` says which way to go.
     Reference: Seydel, Practical Bifurcation and Stability Analysis (2010), chapter 4,
     doi:10.1007/978-1-4419-1740-9.
     """
-    max_points, (lower, upper, largest_amplitude) = control.max_points, within
-    if max_points < 2:
-        raise ValueError(f"`max_points` must be 2 or more, but is {max_points}.")
-    size = start.shape[0]
-    at_lambda = jnp.zeros(size).at[-1].set(1.0)
-    across = at_lambda if start_across is None else start_across
-    first, ordinary, to_end = 0, 1, 2  # what the next correction is for
-    running = jnp.array(-1)
+    walker = Walker(linearised, within, control, groups)
 
-    def body(state: _Walk) -> _Walk:
-        n, here, tangent = state.n_points, state.here, state.tangent
-        guess = _extrapolated(state.back, state.back_tangent, here, tangent, state.step, n >= 2)
-        row = tangent
-        is_first, is_end = state.aim == first, state.aim == to_end
-        guess = jnp.where(is_first, start, jnp.where(is_end, state.pending, guess))
-        row = jnp.where(is_first, across, jnp.where(is_end, at_lambda, row))
-        patience = jnp.where(is_first | is_end, 5 * control.iterations, control.iterations)
-        found = correct(linearised, guess, row, control.tolerance, patience)
-        new = found.point
-        ahead = jnp.where(is_first, direction, tangent)
-        new_tangent = found.tangent * jnp.where(found.tangent @ ahead < 0, -1.0, 1.0)
-
-        turn = jnp.arccos(jnp.clip(new_tangent @ tangent, -1.0, 1.0))
-        miss = jnp.linalg.norm(new - guess)
-        smooth = miss < control.largest_miss * state.step
-        smooth &= turn < control.largest_turn * control.angle
-        kinked = (state.step < control.kink) & (turn < 0.5 * jnp.pi)
-        kinked &= miss < control.kink_miss * state.step
-        near = (smooth | kinked) & _steady(here, new, groups, control)
-        good = found.converged & (is_first | is_end | near)
-        beyond_upper, beyond_lower = new[-1] > upper, new[-1] < lower
-        leaving = good & (beyond_upper | beyond_lower) & (state.aim == ordinary)
-        end = jnp.where(beyond_upper, upper, lower)
-        share = (end - here[-1]) / (new[-1] - here[-1])
-        pending = jnp.where(leaving, (here + share * (new - here)).at[-1].set(end), state.pending)
-        origin = state.origin
-        on_the_way = tangent @ (origin - here)
-        closed = good & (n > 4) & (on_the_way > 0) & (on_the_way <= tangent @ (new - here))
-        closed &= jnp.linalg.norm(origin - here) <= 2.0 * on_the_way
-        closed &= new_tangent @ state.origin_tangent > 0.5
-        # A point that only happens to lie on the way has others where the curve passes it.
-        passed = here + on_the_way / jnp.maximum(tangent @ (new - here), 1e-300) * (new - here)
-        gap = jnp.linalg.norm(passed - origin)
-        closed &= gap < control.closing * jnp.linalg.norm(new - here)
-        new = jnp.where(closed, origin, new)
-        keep = good & ~leaving
-        place = jnp.where(is_first, 0, n)
+    def body(state: tuple) -> tuple:
+        walk, points, tangents = state
+        place = walk.n_points
+        walk, kept = walker.corrected(walk)
         # Rows are only written here, never read, so that the loop need not copy them; a row that
         # is not kept is written again later, or is beyond the last.
-        points = state.points.at[place].set(jnp.where(keep, new, jnp.nan))
-        tangents = state.tangents.at[place].set(jnp.where(keep, new_tangent, jnp.nan))
-        n = jnp.where(is_first, 1, n + keep)
-        grow = jnp.clip(control.angle / jnp.maximum(turn, 1e-3), 0.5, 2.0)
-        grow = jnp.where(found.n_solves >= 4, jnp.minimum(grow, 0.7), grow)
-        factor = jnp.where(good, grow, 0.5)
-        longest = jnp.minimum(state.step * factor, control.largest)
-        step = jnp.where(is_first | leaving, state.step, longest)
-        largest_now = jnp.max(jnp.abs(new[:-1]))
-        ends = (
-            (is_first & ~good, CurveStatus.NO_START),
-            (is_end & good & (new[-1] >= upper), CurveStatus.UPPER_END),
-            (is_end & good & (new[-1] <= lower), CurveStatus.LOWER_END),
-            (closed & keep, CurveStatus.CLOSED),
-            (keep & ~is_first & (largest_now > largest_amplitude), CurveStatus.AMPLITUDE_LIMIT),
-            (step < control.smallest, CurveStatus.STEP_TOO_SMALL),
-            (n >= max_points, CurveStatus.POINT_LIMIT),
-        )
-        status = running
-        for happened, what in reversed(ends):
-            status = jnp.where(happened, int(what), status)
-        aim = jnp.where(leaving, to_end, ordinary)
-        return _Walk(
-            points=points,
-            tangents=tangents,
-            here=jnp.where(keep, new, here),
-            tangent=jnp.where(keep, new_tangent, tangent),
-            back=jnp.where(keep, here, state.back),
-            back_tangent=jnp.where(keep, tangent, state.back_tangent),
-            origin=jnp.where(is_first, new, origin),
-            origin_tangent=jnp.where(is_first, new_tangent, state.origin_tangent),
-            pending=pending,
-            n_points=n,
-            step=step,
-            aim=aim,
-            status=status,
-            n_solves=state.n_solves + found.n_solves,
-        )
+        points = points.at[place].set(jnp.where(kept, walk.here, jnp.nan))
+        tangents = tangents.at[place].set(jnp.where(kept, walk.tangent, jnp.nan))
+        return walk, points, tangents
 
-    unset = jnp.full((max_points, size), jnp.nan)
-    walk = _Walk(
-        points=unset,
-        tangents=unset,
-        here=start,
-        tangent=direction,
-        back=start,
-        back_tangent=direction,
-        origin=start,
-        origin_tangent=direction,
-        pending=start,
-        n_points=jnp.array(1),
-        step=jnp.minimum(jnp.asarray(control.first), control.largest),
-        aim=jnp.array(first),
-        status=running,
-        n_solves=jnp.array(0),
+    unset = jnp.full((control.max_points, start.shape[0]), jnp.nan)
+    walk, points, tangents = jax.lax.while_loop(
+        lambda state: state[0].status == RUNNING,
+        body,
+        (walker.begun(start, direction, start_across), unset, unset),
     )
-    walk = jax.lax.while_loop(lambda state: state.status == running, body, walk)
-    started = walk.status != int(CurveStatus.NO_START)
-    n_points = jnp.where(started, walk.n_points, 0)
-    return Curve(walk.points, walk.tangents, n_points, walk.status, walk.n_solves)
+    return Curve(points, tangents, walk.n_points, walk.status, walk.n_solves)
+
+
+def _at_lambda(point: Point) -> Point:
+    """The direction along λ, the last unknown."""
+    return jnp.zeros_like(point).at[-1].set(1.0)
+
+
+def _passes(walk: Walk, new: Point, new_tangent: Point, closing: Number) -> Bool[Array, ""]:
+    """Whether the curve passes its first point between `here` and `new`, in the same direction."""
+    here, tangent, origin = walk.here, walk.tangent, walk.origin
+    to_origin, to_new = tangent @ (origin - here), tangent @ (new - here)
+    passed = (to_origin > 0) & (to_origin <= to_new)
+    passed &= jnp.linalg.norm(origin - here) <= 2.0 * to_origin
+    passed &= new_tangent @ walk.origin_tangent > 0.5
+    # A point that only happens to lie on the way has others where the curve passes it.
+    nearest = here + to_origin / jnp.maximum(to_new, 1e-300) * (new - here)
+    return passed & (jnp.linalg.norm(nearest - origin) < closing * jnp.linalg.norm(new - here))
+
+
+def chosen(yes: Bool[Array, ""], first: T, second: T) -> T:
+    """One of two states of one kind."""
+    return jax.tree.map(lambda a, b: jnp.where(yes, a, b), first, second)
 
 
 def _steady(
@@ -313,35 +444,16 @@ def _steady(
     return jnp.all((norms[2] <= control.largest_change * largest) | (largest <= slight))
 
 
-class _Walk(NamedTuple):
-    """The state of a curve that is being traced."""
-
-    points: Array
-    tangents: Array
-    here: Array
-    tangent: Array
-    back: Array
-    back_tangent: Array
-    origin: Array
-    origin_tangent: Array
-    pending: Array
-    n_points: Array
-    step: Array
-    aim: Array
-    status: Array
-    n_solves: Array
-
-
-def _extrapolated(
-    back: Point, back_tangent: Point, here: Point, tangent: Point, step: Array, known: Array
-) -> Point:
-    """Where the cubic through two points and their tangents is, a step behind the second."""
-    gap = jnp.where(known, jnp.linalg.norm(here - back), 1.0)
+def _extrapolated(walk: Walk) -> Point:
+    """Where the cubic through the last two points and their tangents is, a step farther."""
+    here, tangent, step = walk.here, walk.tangent, walk.step
+    known = walk.n_points >= 2
+    gap = jnp.where(known, jnp.linalg.norm(here - walk.back), 1.0)
     share = jnp.where(known, step / gap, 0.0)
-    chord = (here - back) / gap
+    chord = (here - walk.back) / gap
     # here + step·t + (step²)·a + (step² · (step + gap))·b, from Hermite's divided differences.
     second = (tangent - chord) / gap
-    third = (tangent - 2 * chord + back_tangent) / gap**2
+    third = (tangent - 2 * chord + walk.back_tangent) / gap**2
     bend = step**2 * (second + (step + gap) * third)
     trusted = known & (share < _FARTHEST)
     return here + step * tangent + jnp.where(trusted, bend, 0.0)

@@ -1,16 +1,19 @@
-"""Many response curves of one kind: stacked balances, starts, blocks over the cores."""
+"""Many response curves of one kind: stacked balances, starts, and their walks side by side."""
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from snrmjax.model.structures import Structure
-from snrmjax.numerics.blocks import mapped, over_cores, stacked, taken
+from snrmjax.numerics.blocks import stacked, taken
 from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.lanes import in_lanes, iterated
 from snrmjax.simulate.balance.harmonic_balance import (
     HarmonicBalance,
     linear_coefficients,
@@ -18,16 +21,17 @@ from snrmjax.simulate.balance.harmonic_balance import (
     samples_for,
 )
 from snrmjax.simulate.continuation.continuation import (
-    Curve,
+    RUNNING,
     CurveRange,
     CurveStatus,
     StepControl,
     TracedCurve,
-    on_host,
-    trace_curve,
+    Walk,
+    Walker,
 )
 
-_BLOCK = 8  # curves that one program traces
+_TOGETHER = 64  # steps of Newton's method before lanes that have ended take other curves
+_ALONE = 512  # points of a single curve before the host sees them
 
 
 def response_balances(
@@ -59,33 +63,27 @@ def trace_from_rest(
     index: np.ndarray,
     ends: Float[np.ndarray, " end"],
     steps: StepControl,
+    lanes: int,
     *,
     downward: bool,
     ramp: bool = False,
 ) -> list[TracedCurve]:
-    """The curves of the members `index`, in blocks over the cores.
+    """The curves of the members `index`, so many side by side.
 
     From the linear response at an end of the range (rad/s), or with `ramp` from the response to a
-    force that rises from zero at the lower end.
+    force that rises from zero at the lower end; that leads nowhere where the start is NaN.
     """
-    # A single one of many takes the program of all.
-    size = 1 if np.size(balances.force) == 1 else _BLOCK
-    jobs = [index[b : b + size] for b in range(0, len(index), size)]
-
-    def trace(job: np.ndarray) -> list[TracedCurve]:
-        rows = job[np.minimum(np.arange(size), len(job) - 1)]
-        mine = taken(balances, rows)
-        wanted = np.arange(size) < len(job)
-        if ramp:
-            starts, ready = _ramped(mine, ends, steps)
-            curve = _trace(
-                *(mine, ends, steps, np.array(downward)), wanted=wanted & ready, starts=starts
-            )
-        else:
-            curve = _trace(mine, ends, steps, np.array(downward), wanted)
-        return _trimmed(curve, len(job))
-
-    return [curve for block in over_cores(trace, jobs) for curve in block]
+    if not len(index):
+        return []
+    mine, starts = taken(balances, index), None
+    if ramp:
+        risen = _walked(mine, ends, steps, None, lanes, downward=downward, rising=True)
+        starts = np.full((len(index), balances.size + 1), np.nan)
+        for start, curve in zip(starts, risen, strict=True):
+            if curve.status == CurveStatus.UPPER_END:
+                start[:-1] = curve.points[-1, :-1]
+        starts[:, -1] = ends[0] / np.asarray(mine.frequency_scale)
+    return _walked(mine, ends, steps, starts, lanes, downward=downward)
 
 
 def trace_through(
@@ -94,74 +92,101 @@ def trace_through(
     steps: StepControl,
     *,
     downward: bool,
-    starts: Float[Array, "member unknown"],
+    starts: Float[np.ndarray, "member unknown"],
 ) -> list[TracedCurve]:
     """Curves through given scaled points, towards one end of the range (rad/s)."""
-    wanted = np.ones(len(starts), dtype=bool)
-    curve = _trace(balances, ends, steps, np.array(downward), wanted, starts)
-    return _trimmed(curve, len(starts))
+    return _walked(balances, ends, steps, np.asarray(starts), 1, downward=downward)
 
 
-def _trimmed(curve: Curve, count: int) -> list[TracedCurve]:
-    """The first `count` curves without their unused rows, on the host."""
-    rows = [np.asarray(part) for part in curve]
-    return [on_host(Curve(*(part[k] for part in rows))) for k in range(count)]
-
-
-@compiled
-def _ramped(
-    balances: HarmonicBalance, ends: Array, steps: StepControl
-) -> tuple[Float[Array, "member unknown"], Bool[Array, " member"]]:
-    """Starts from the response at the lower frequency to a force that rises from zero."""
-
-    def ramped(balance: HarmonicBalance) -> tuple[Array, Array]:
-        load = balance.force * balance.load()
-        frequency = ends[0] / balance.frequency_scale
-
-        def rising(point: Array) -> tuple[Array, Array]:
-            now = eqx.tree_at(lambda b: b.force, balance, balance.force * point[-1])
-            residual, jacobian = now.linearised(point.at[-1].set(frequency))
-            return residual, jacobian.at[:, -1].set(-load)
-
-        rest = jnp.zeros(balance.size + 1)
-        curve = trace_curve(
-            rising, rest, rest.at[-1].set(1.0), CurveRange(lower=-1.0, upper=1.0), steps
-        )
-        last = curve.points[jnp.maximum(curve.n_points - 1, 0)]
-        return last.at[-1].set(frequency), curve.status == int(CurveStatus.UPPER_END)
-
-    return mapped(ramped, balances)
-
-
-@compiled
-def _trace(
+def _walked(
     balances: HarmonicBalance,
     ends: Float[Array, " end"],
     steps: StepControl,
-    downward: Bool[Array, ""],
-    wanted: Bool[Array, " member"],
-    starts: Float[Array, "member unknown"] | None = None,
-) -> Curve:
-    """Curves through the frequency range from `starts`, or from the linear response.
+    starts: Float[np.ndarray, "member unknown"] | None,
+    lanes: int,
+    *,
+    downward: bool,
+    rising: bool = False,
+) -> list[TracedCurve]:
+    """Curves from given starts, or from the linear response; or under a rising force."""
+    way = (np.asarray(ends), steps, np.array(downward))
+    length = _ALONE if lanes == 1 else _TOGETHER
 
-    Those not wanted do not start.
-    """
+    def begun(jobs: tuple, wanted: Bool[np.ndarray, " lane"]) -> Walk:
+        return _begun(jobs, wanted, *way, rising=rising)
 
-    def traced(balance: HarmonicBalance, wanted: Array, start: Array | None = None) -> Curve:
-        if start is None:
+    def advanced(jobs: tuple, walks: Walk, idle: int) -> tuple:
+        return _advanced(jobs, walks, *way, np.array(idle), rising=rising, length=length)
+
+    def result(walks: Walk) -> tuple:
+        status = np.asarray(walks.status)
+        return status == RUNNING, status, walks.n_solves
+
+    (status, n_solves), rows = in_lanes(begun, advanced, result, (balances, starts), lanes)
+    nothing = (np.zeros((0, balances.size + 1)),) * 2
+    return [
+        TracedCurve(*(given or nothing), CurveStatus(int(status[k])), int(n_solves[k]))
+        for k, given in enumerate(rows)
+    ]
+
+
+def _walker(balance: HarmonicBalance, ends: Array, steps: StepControl, rising: bool) -> Walker:
+    """Along the response, or along that at the lower end to a force that rises from zero."""
+    lower, upper = ends / balance.frequency_scale
+    if not rising:
+        groups = (balance.n_coefficients, balance.model.n_modes)
+        return Walker(balance.linearised, CurveRange(lower, upper), steps, groups)
+    load = balance.force * balance.load()
+
+    def linearised(point: Array) -> tuple[Array, Array]:
+        """Unknowns x and the share of the force."""
+        now = eqx.tree_at(lambda b: b.force, balance, balance.force * point[-1])
+        residual, jacobian = now.linearised(point.at[-1].set(lower))
+        return residual, jacobian.at[:, -1].set(-load)
+
+    return Walker(linearised, CurveRange(lower=-1.0, upper=1.0), steps)
+
+
+@compiled
+def _begun(
+    jobs: tuple,
+    wanted: Bool[Array, " lane"],
+    ends: Array,
+    steps: StepControl,
+    downward: Array,
+    rising: bool,
+) -> Walk:
+    def begun(job: tuple, wanted: Array) -> Walk:
+        balance, start = job
+        if rising:
+            start = jnp.zeros(balance.size + 1)
+        elif start is None:
             begin = jnp.where(downward, ends[1], ends[0])
             order = balance.harmonic_order
             linear = linear_coefficients(balance.model, balance.force, begin, order)
             start = balance.point(linear, begin)
-        direction = jnp.zeros_like(start).at[-1].set(jnp.where(downward, -1.0, 1.0))
-        lower, upper = ends / balance.frequency_scale
-        return trace_curve(
-            balance.linearised,
-            jnp.where(wanted, start, jnp.nan),
-            direction,
-            CurveRange(lower, upper),
-            steps,
-            groups=(balance.n_coefficients, balance.model.n_modes),
-        )
+        sense = 1.0 if rising else jnp.where(downward, -1.0, 1.0)
+        direction = jnp.zeros_like(start).at[-1].set(sense)
+        walk = _walker(balance, ends, steps, rising).begun(start, direction)
+        return walk._replace(status=jnp.where(wanted, RUNNING, int(CurveStatus.NO_START)))
 
-    return mapped(traced, balances, wanted, *(() if starts is None else (starts,)))
+    return jax.vmap(begun)(jobs, wanted)
+
+
+@partial(compiled, long_loops=True)
+def _advanced(
+    jobs: tuple,
+    walks: Walk,
+    ends: Array,
+    steps: StepControl,
+    downward: Array,
+    idle: Int[Array, ""],
+    rising: bool,
+    length: int,
+) -> tuple[Walk, tuple]:
+    def step(job: tuple, walk: Walk) -> tuple[Walk, tuple]:
+        walker = _walker(job[0], ends, steps, rising)
+        walk, kept = walker.corrected(walk) if length == _ALONE else walker.advanced(walk)
+        return walk, (kept, walk.here, walk.tangent)
+
+    return iterated(step, lambda walks: walks.status == RUNNING, jobs, walks, length, idle)

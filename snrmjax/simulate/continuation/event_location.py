@@ -3,58 +3,86 @@
 from collections.abc import Callable
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from snrmjax.simulate.continuation.continuation import Linearised, Point, StepControl, correct
+from snrmjax.simulate.continuation.continuation import (
+    Linearised,
+    Point,
+    StepControl,
+    Trial,
+    chosen,
+)
 
 _TRIALS = 40  # of the secant method, at most
+_CLOSE = 1e-10  # of the way between the neighbours: the next trial would be as near
 
 
-class LocatedEvent(NamedTuple):
-    """What was found of a sign change between two neighbours."""
-
-    point: Point
-    tangent: Point
-    resolved: Bool[Array, ""]  # the point is there
-    missed: Bool[Array, ""]  # the sign does change, but the point was not found
-
-
-def locate_event(
-    linearised: Linearised,
-    test: Callable[[Point, Point], Float[Array, ""]],
-    here: Point,
-    tangent: Point,
-    there: Point,
-    control: StepControl,
-    wanted: Bool[Array, ""] | bool = True,
-) -> LocatedEvent:
-    """The point between two neighbours where `test(point, tangent)` changes sign.
+class EventSearch(eqx.Module):
+    """The search between two neighbours of a curve for where `test(point, tangent)` changes sign.
 
     Illinois' variant of the secant method in the arclength, each trial corrected across the
-    tangent. It is resolved when the sign change lies between the neighbours, or beside them by
-    less than the tangents of a curve are late; where the corrected neighbours have one sign there
-    is nothing to find. Where it is not `wanted` nothing is computed.
+    tangent at the first neighbour, `here`. The event is resolved when the sign change lies between
+    the neighbours, or beside them by less than the tangents of a curve are late; where the
+    corrected neighbours have one sign there is nothing to find.
     Reference: Dowell & Jarratt, BIT 11 (1971) 168, doi:10.1007/BF01934364.
     """
-    length = tangent @ (there - here)
 
-    def trial(share: Array, guess: Point) -> tuple[_Known, Bool[Array, ""]]:
-        guess = guess + (share * length - tangent @ (guess - here)) * tangent
-        found = correct(
-            linearised, guess, tangent, 1e-3 * control.tolerance, 2 * control.iterations
+    linearised: Linearised
+    test: Callable[[Point, Point], Float[Array, ""]]
+    here: Point
+    tangent: Point
+    there: Point
+    control: StepControl
+
+    def begun(self) -> "Bracket":
+        """Before the first trial, at `here`."""
+        zero, no = jnp.array(0.0), jnp.array(False)
+        nothing = _Known(zero, zero, self.here, self.tangent, self.tangent)
+        return Bracket(
+            trials=jnp.array(0),
+            low=nothing,
+            high=nothing,
+            side=jnp.array(0),
+            share=zero,
+            last=nothing,
+            converged=~no,
+            doubtful=no,
+            ended=no,
+            trial=self._trial(zero, self.here),
         )
-        # With the slope against the share of the way the curve between two trials is a cubic.
-        slope = found.tangent * (length / (tangent @ found.tangent))
-        value = test(found.point, found.tangent)
-        return _Known(share, value, found.point, found.tangent, slope), found.converged
 
-    def body(state: _Bracket) -> _Bracket:
-        low, high, side, share = state.low, state.high, state.side, state.share
+    def advanced(self, state: "Bracket") -> "Bracket":
+        """After one step of Newton's method."""
+        trial = state.trial.stepped(self.linearised, 1e-3 * self.control.tolerance)
+        state = state._replace(trial=trial)
+        going = trial.goes_on(2 * self.control.iterations)
+        return chosen(going, state, self._judged(state))
+
+    def ended(self) -> "Bracket":
+        """The search at its end."""
+        return jax.lax.while_loop(
+            lambda state: ~state.ended, lambda state: self.advanced(state), self.begun()
+        )
+
+    def _length(self) -> Float[Array, ""]:
+        return self.tangent @ (self.there - self.here)
+
+    def _trial(self, share: Array, guess: Point) -> Trial:
+        """The correction at a share of the way, from a guess beside it."""
+        beside = share * self._length() - self.tangent @ (guess - self.here)
+        return Trial.at(guess + beside * self.tangent, self.tangent)
+
+    def _judged(self, state: "Bracket") -> "Bracket":
+        """After a correction that has ended, with the next one begun."""
+        low, high, side, share, trial = state.low, state.high, state.side, state.share, state.trial
+        # With the slope against the share of the way the curve between two trials is a cubic.
+        slope = trial.tangent * (self._length() / (self.tangent @ trial.tangent))
+        value = self.test(trial.point, trial.tangent)
+        found = _Known(share, value, trial.point, trial.tangent, slope)
         is_low, is_high = state.trials == 0, state.trials == 1
-        guess = jnp.where(is_low, here, jnp.where(is_high, there, _cubic(low, high, share)))
-        found, converged = trial(share, guess)
         inner = ~is_low & ~is_high
         in_upper = inner & (jnp.sign(found.value) == jnp.sign(low.value))
         in_lower = inner & ~in_upper
@@ -62,45 +90,27 @@ def locate_event(
         low = low._replace(value=low.value * halved)
         halved = jnp.where(in_upper & (side == 1), 0.5, 1.0)
         high = high._replace(value=high.value * halved)
-        low = _chosen(in_upper | is_low, found, low)
-        high = _chosen(in_lower | is_high, found, high)
+        low = chosen(in_upper | is_low, found, low)
+        high = chosen(in_lower | is_high, found, high)
         differ = low.value * high.value <= 0
         secant = (low.share * high.value - high.share * low.value) / (high.value - low.value)
         secant = jnp.where(jnp.isfinite(secant), secant, 0.5 * (low.share + high.share))
         next_share = jnp.where(is_low, 1.0, secant)
-        settled = (inner & (jnp.abs(next_share - share) < 1e-12)) | (inner & (found.value == 0))
-        return _Bracket(
+        settled = inner & ((jnp.abs(next_share - share) < _CLOSE) | (found.value == 0))
+        next_share = jnp.where(settled, share, next_share)
+        guess = jnp.where(is_low, self.there, _cubic(low, high, next_share))
+        return Bracket(
             trials=state.trials + 1,
             low=low,
             high=high,
             side=jnp.where(in_upper, 1, jnp.where(in_lower, -1, 0)),
-            share=jnp.where(settled, share, next_share),
+            share=next_share,
             last=found,
-            converged=converged,
-            doubtful=state.doubtful | (~inner & ~converged) | (is_high & differ),
-            settled=settled,
+            converged=trial.converged,
+            doubtful=state.doubtful | (~inner & ~trial.converged) | (is_high & differ),
+            ended=settled | (state.trials + 1 >= _TRIALS),
+            trial=self._trial(next_share, guess),
         )
-
-    zero = jnp.array(0.0)
-    nothing = _Known(zero, zero, here, tangent, tangent)
-    state = _Bracket(
-        trials=jnp.array(0),
-        low=nothing,
-        high=nothing,
-        side=jnp.array(0),
-        share=zero,
-        last=nothing,
-        converged=jnp.array(True),
-        doubtful=jnp.array(False),
-        settled=~jnp.asarray(wanted),
-    )
-    end = jax.lax.while_loop(lambda s: ~s.settled & (s.trials < _TRIALS), body, state)
-    inside = jnp.abs(end.share - 0.5) < 0.51
-    changes = end.low.value * end.high.value <= 0
-    resolved = end.converged & inside & changes & jnp.asarray(wanted)
-    # Tangents along a curve are a little late: a sign may seem to change where it does not.
-    missed = ~resolved & end.doubtful & jnp.asarray(wanted)
-    return LocatedEvent(end.last.point, end.last.tangent, resolved, missed)
 
 
 class _Known(NamedTuple):
@@ -113,7 +123,7 @@ class _Known(NamedTuple):
     slope: Array  # dpoint/dshare
 
 
-class _Bracket(NamedTuple):
+class Bracket(NamedTuple):
     """The state of the search for a sign change."""
 
     trials: Array
@@ -124,11 +134,20 @@ class _Bracket(NamedTuple):
     last: _Known
     converged: Array  # the last trial
     doubtful: Array  # an end is not known, or the sign differs at the ends
-    settled: Array
+    ended: Array
+    trial: Trial  # under way
 
+    @property
+    def resolved(self) -> Bool[Array, ""]:
+        """Whether the event is at the last point, once the search has ended."""
+        inside = abs(self.share - 0.5) < 0.51
+        return self.converged & inside & (self.low.value * self.high.value <= 0)
 
-def _chosen(first: Bool[Array, ""], yes: _Known, no: _Known) -> _Known:
-    return _Known(*(jnp.where(first, a, b) for a, b in zip(yes, no, strict=True)))
+    @property
+    def missed(self) -> Bool[Array, ""]:
+        """Whether the sign does change, but the point was not found."""
+        # Tangents along a curve are a little late: a sign may seem to change where it does not.
+        return self.doubtful & ~self.resolved
 
 
 def _cubic(low: _Known, high: _Known, share: Array) -> Point:

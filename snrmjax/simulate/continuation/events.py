@@ -1,20 +1,21 @@
 """Folds, peaks and phase resonances along curves of periodic motions."""
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
-from snrmjax.numerics.blocks import mapped, taken
+from snrmjax.numerics.blocks import over_cores, taken
 from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.lanes import in_lanes, iterated, lanes_for
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance
 from snrmjax.simulate.continuation.continuation import StepControl, TracedCurve, correct
-from snrmjax.simulate.continuation.event_location import LocatedEvent, locate_event
+from snrmjax.simulate.continuation.event_location import Bracket, EventSearch
 
 EVENT_KINDS = ("fold", "peak", "phase_resonance")
-_BLOCK = 8  # intervals that one call works on
+_TOGETHER = 64  # steps of Newton's method before the host sees them
 _INSIDE = 7  # points inside an interval that is looked at more closely
 
 
@@ -49,26 +50,53 @@ def velocities_along(
     )
 
 
+def _search(job: tuple, steps: StepControl) -> EventSearch:
+    balance, kind, here, tangent, there = job
+
+    def test(point: Array, direction: Array) -> Array:
+        heights, slopes = velocities_along(balance, point, direction)
+        return jnp.stack([slopes[0], slopes[1], heights[2]])[kind]
+
+    return EventSearch(balance.linearised, test, here, tangent, there, steps)
+
+
 @compiled
-def _locate(
-    balances: HarmonicBalance,
-    kind: Array,
-    here: Array,
-    tangent: Array,
-    there: Array,
-    wanted: Array,
-    steps: StepControl,
-) -> LocatedEvent:
-    def located(balance: HarmonicBalance, *row: Array) -> LocatedEvent:
-        kind, here, tangent, there, wanted = row
+def _begun(jobs: tuple, wanted: Bool[Array, " lane"], steps: StepControl) -> Bracket:
+    def begun(job: tuple, wanted: Array) -> Bracket:
+        return _search(job, steps).begun()._replace(ended=~wanted)
 
-        def test(point: Array, direction: Array) -> Array:
-            heights, slopes = velocities_along(balance, point, direction)
-            return jnp.stack([slopes[0], slopes[1], heights[2]])[kind]
+    return jax.vmap(begun)(jobs, wanted)
 
-        return locate_event(balance.linearised, test, here, tangent, there, steps, wanted)
 
-    return mapped(located, balances, kind, here, tangent, there, wanted)
+@compiled
+def _advanced(
+    jobs: tuple, states: Bracket, steps: StepControl, idle: Int[Array, ""]
+) -> tuple[Bracket, tuple]:
+    def step(job: tuple, state: Bracket) -> tuple[Bracket, tuple]:
+        return _search(job, steps).advanced(state), (jnp.array(False),)
+
+    return iterated(step, lambda states: ~states.ended, jobs, states, _TOGETHER, idle)
+
+
+def _searched(jobs: tuple, steps: StepControl) -> tuple[np.ndarray, ...]:
+    """Of every job (balance, kind, neighbour, its tangent, other neighbour): where it ended.
+
+    Point and tangent, whether that is the event, and whether there is one that was not found.
+    """
+
+    def begun(jobs: tuple, wanted: Bool[np.ndarray, " lane"]) -> Bracket:
+        return _begun(jobs, wanted, steps)
+
+    def advanced(jobs: tuple, states: Bracket, idle: int) -> tuple[Bracket, tuple]:
+        return _advanced(jobs, states, steps, np.array(idle))
+
+    def result(states: Bracket) -> tuple:
+        return (
+            ~np.asarray(states.ended),
+            *(states.last.point, states.last.tangent, states.resolved, states.missed),
+        )
+
+    return in_lanes(begun, advanced, result, jobs, lanes_for(jobs[0].size + 1))[0]
 
 
 @compiled
@@ -79,7 +107,6 @@ def _between(
     there: Array,
     arriving: Array,
     share: Array,
-    wanted: Array,
     steps: StepControl,
 ) -> tuple:
     """Points of the curve at shares of the way between neighbours, with their tangents.
@@ -88,38 +115,17 @@ def _between(
     """
 
     def corrected(balance: HarmonicBalance, *row: Array) -> tuple:
-        here, tangent, there, arriving, share, wanted = row
+        here, tangent, there, arriving, share = row
         length = tangent @ (there - here)
         chord = there - here
         early, late = (jnp.linalg.norm(chord) * t - chord for t in (tangent, arriving))
         bend = share * (1 - share) * ((1 - share) * early - share * late)
         guess = here + share * chord + bend
         guess = guess + (share * length - tangent @ (guess - here)) * tangent
-        patience = jnp.where(wanted, 2 * steps.iterations, 0)
-        found = correct(balance.linearised, guess, tangent, steps.tolerance, patience)
+        found = correct(balance.linearised, guess, tangent, steps.tolerance, 2 * steps.iterations)
         return found.point, found.tangent, found.converged
 
-    return mapped(corrected, balances, here, tangent, there, arriving, share, wanted)
-
-
-def _in_blocks(
-    function: Callable[..., tuple],
-    balances: HarmonicBalance,
-    owner: np.ndarray,
-    rows: tuple[np.ndarray, ...],
-    steps: StepControl,
-) -> list[np.ndarray]:
-    """A compiled function of rows, called with blocks of one size."""
-    n = len(owner)
-    parts = []
-    for begin in range(0, n, _BLOCK):
-        index = np.minimum(np.arange(begin, begin + _BLOCK), n - 1)
-        wanted = np.arange(begin, begin + _BLOCK) < n
-        arguments = tuple(row[index] for row in rows)
-        mine = taken(balances, owner[index])
-        found = function(mine, *arguments, wanted, steps)
-        parts.append([np.asarray(part)[: n - begin] for part in found])
-    return [np.concatenate(column) for column in zip(*parts, strict=True)]
+    return jax.vmap(corrected)(balances, here, tangent, there, arriving, share)
 
 
 def with_events(
@@ -158,8 +164,8 @@ def with_events(
     if not owner:
         return divided
     here, ahead, there, _ = _neighbours(divided, owner, position)
-    rows = (np.array(kind), here, ahead, there)
-    found, tangents, resolved, missed = _in_blocks(_locate, balances, np.array(owner), rows, steps)
+    jobs = (taken(balances, np.array(owner)), np.array(kind), here, ahead, there)
+    found, tangents, resolved, missed = _searched(jobs, steps)
     for e in np.flatnonzero(missed).tolist():
         curve = divided[owner[e]]
         missed_too = (*curve.not_located, EVENT_KINDS[kind[e]])
@@ -209,7 +215,16 @@ def points_between(
     """Points at shares of the way to the next one, their tangents, and whether they were found."""
     neighbours = _neighbours(curves, owner, position)
     ahead, rows = neighbours[1], (*neighbours, np.array(share))
-    found, tangents, ok = _in_blocks(_between, balances, np.array(owner), rows, steps)
+    n, lanes = len(owner), lanes_for(balances.size + 1)
+
+    def corrected(begin: int) -> list[np.ndarray]:
+        index = np.minimum(np.arange(begin, begin + lanes), n - 1)
+        mine = taken(balances, np.array(owner)[index])
+        found = _between(mine, *(row[index] for row in rows), steps)
+        return [np.asarray(part)[: n - begin] for part in found]
+
+    parts = over_cores(corrected, range(0, n, lanes))
+    found, tangents, ok = (np.concatenate(column) for column in zip(*parts, strict=True))
     turned = np.einsum("ku,ku->k", tangents, ahead) < 0
     return found, np.where(turned[:, None], -tangents, tangents), ok
 

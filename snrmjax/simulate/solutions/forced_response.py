@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from snrmjax.model.structures import Structure, simulated_structure
-from snrmjax.numerics.blocks import mapped, over_cores, taken
+from snrmjax.numerics.blocks import mapped, taken
 from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.lanes import lanes_for
 from snrmjax.numerics.result import AbstractResult, quantity
 from snrmjax.simulate.balance.given_numbers import frequency_range, positive
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, harmonic_balance
@@ -25,7 +26,6 @@ from snrmjax.simulate.continuation.curve_tracing import response_balances, trace
 from snrmjax.simulate.continuation.response_curve import ResponseCurve, assembled
 
 DEFAULT_STEPS = StepControl()
-_BLOCK = 8  # curves that one job completes
 _WHOLE = (CurveStatus.UPPER_END, CurveStatus.LOWER_END, CurveStatus.CLOSED)
 
 
@@ -81,10 +81,11 @@ def forced_response(
     ('UPPER_END', 1)
     """
     loads = positive("forces", forces)
+    ends = frequency_range(from_frequency, to_frequency)
+    models = [simulated_structure(model)] * len(loads)
     settings = ResponseSettings(harmonic_order, n_samples, steps, stability)
-    ends = (from_frequency, to_frequency)
-    batch = forced_response_batch([model] * len(loads), loads, *ends, settings=settings)
-    return [part for parts in batch.curves for part in parts]
+    found = _chunk_of_curves(models, loads, ends, settings, alone=len(loads) == 1)
+    return [part for parts in found for part in parts]
 
 
 class ResponseBatch(AbstractResult):
@@ -121,9 +122,9 @@ def forced_response_batch(
 ) -> ResponseBatch:
     """Forced responses of many models, forces or both, over all cores or on an accelerator.
 
-    Every member is what `forced_response` gives. Members are traced in blocks of one size: on a
-    CPU one after the other, with a block on every core; on an accelerator side by side. Other
-    numbers, or more members, do not compile anew. Memory is bounded by `chunk`, the members at
+    Every member is what `forced_response` gives, to rounding; its digits do not depend on the other
+    members. Several members are traced side by side, on every core. Other numbers, or more
+    members, do not compile anew. Memory is bounded by `chunk`, the members at
     work at a time, beside the curves that are kept.
 
     Arguments: `models` one or many, with the same modes, monomials and effects; `forces` in N,
@@ -191,7 +192,12 @@ def _summary(parts: tuple[ResponseCurve, ...]) -> dict[str, float]:
 
 
 def _chunk_of_curves(
-    models: list[Structure], forces: np.ndarray, ends: np.ndarray, settings: ResponseSettings
+    models: list[Structure],
+    forces: np.ndarray,
+    ends: np.ndarray,
+    settings: ResponseSettings,
+    *,
+    alone: bool = False,
 ) -> list[tuple[ResponseCurve, ...]]:
     leaves = {id(m): jax.tree.leaves(m) for m in models}
     finite = {k: all(np.all(np.isfinite(np.asarray(a))) for a in v) for k, v in leaves.items()}
@@ -205,28 +211,38 @@ def _chunk_of_curves(
     balances = response_balances(
         [models[k] for k in good], forces[good], settings.harmonic_order, settings.n_samples
     )
-    walk = (ends, settings.steps)
+    walk = (ends, settings.steps, 1 if alone else lanes_for(balances.size + 1))
     upward = trace_from_rest(balances, np.arange(len(good)), *walk, downward=False)
-    # Beside a superharmonic resonance the linear response is no start: let the force rise.
-    lost = [k for k, c in enumerate(upward) if c.status == CurveStatus.NO_START]
-    if lost:
-        again = trace_from_rest(balances, np.array(lost), *walk, downward=False, ramp=True)
-        for k, curve in zip(lost, again, strict=True):
-            upward[k] = curve
+
+    def alone(k: int) -> bool:
+        curve = upward[k]
+        reached = curve.status == CurveStatus.UPPER_END
+        return reached and _ends_near_rest(balances, k, curve)
+
     # Below a strong softening the lower end has several solutions and the upper end has one; and
     # where a resonance reaches beyond the upper end, another branch comes in there.
-    reached = [c.status == CurveStatus.UPPER_END for c in upward]
-    alone = [r and _ends_near_rest(balances, k, upward[k]) for k, r in enumerate(reached)]
-    doubtful = [k for k, known in enumerate(alone) if not known]
-    downward = trace_from_rest(balances, np.array(doubtful, dtype=int), *walk, downward=True)
+    doubtful = [k for k in range(len(good)) if not alone(k)]
+    found = trace_from_rest(balances, np.array(doubtful, dtype=int), *walk, downward=True)
+    downward = dict(zip(doubtful, found, strict=True))
+    # Beside a superharmonic resonance the linear response is no start: let the force rise.
+    lost = [
+        k
+        for k, back in downward.items()
+        if upward[k].status == CurveStatus.NO_START and back.status != CurveStatus.LOWER_END
+    ]
+    again = trace_from_rest(balances, np.array(lost, dtype=int), *walk, downward=False, ramp=True)
+    for k, curve in zip(lost, again, strict=True):
+        upward[k] = curve
+        if alone(k):
+            del downward[k]
     owner: list[int] = []
     without_branch: list[int] = []
     parts: list[TracedCurve] = []
     for k, curve in enumerate(upward):
         pieces = [curve]
-        if k in doubtful:
-            back = downward[doubtful.index(k)]
-            if reached[k]:
+        if k in downward:
+            back = downward[k]
+            if curve.status == CurveStatus.UPPER_END:
                 started = len(back.points) > 0
                 known = started and _same_point(back.points[0], curve.points[-1])
                 pieces = [curve, back] if started and not known else [curve]
@@ -236,16 +252,11 @@ def _chunk_of_curves(
                 pieces = [back.reversed()] if whole else [curve, back.reversed()]
         owner += [k] * len(pieces)
         parts += pieces
-    jobs = [np.arange(b, min(b + _BLOCK, len(parts))) for b in range(0, len(parts), _BLOCK)]
-
-    def finished(job: np.ndarray) -> list[ResponseCurve]:
-        mine = taken(balances, np.array([owner[e] for e in job]))
-        some = [parts[e] for e in job]
-        return assembled(mine, some, settings.steps, stability=settings.stability)
-
-    for job, responses in zip(jobs, over_cores(finished, jobs), strict=True):
-        for e, response in zip(job, responses, strict=True):
-            results[good[owner[e]]].append(response)
+    whole = assembled(
+        taken(balances, np.array(owner)), parts, settings.steps, stability=settings.stability
+    )
+    for k, response in zip(owner, whole, strict=True):
+        results[good[k]].append(response)
     for k in without_branch:
         first = results[k][0]
         missed = (*first.not_located, "branch")

@@ -14,7 +14,7 @@ from snrmjax.simulate.continuation.continuation import (
     correct,
     trace_curve,
 )
-from snrmjax.simulate.continuation.event_location import locate_event
+from snrmjax.simulate.continuation.event_location import EventSearch
 
 STEPS = StepControl()
 
@@ -143,7 +143,7 @@ def test_steps_keep_to_their_limits(s_points):
 
 @jax.jit
 def located_fold(here, tangent, there):
-    return locate_event(s_curve, lambda _, t: t[-1], here, tangent, there, STEPS)
+    return EventSearch(s_curve, lambda _, t: t[-1], here, tangent, there, STEPS).ended()
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
@@ -151,16 +151,17 @@ def test_folds_are_located(s_points, sign):
     points, tangents, _ = s_points
     fold = sign / np.sqrt(3)
     k = int(np.searchsorted(points[:, 0], fold)) - 1
-    found, tangent, resolved, missed = located_fold(points[k], tangents[k], points[k + 1])
-    assert bool(resolved)
-    assert not bool(missed)
+    search = located_fold(points[k], tangents[k], points[k + 1])
+    found, tangent = search.last.point, search.last.tangent
+    assert bool(search.resolved)
+    assert not bool(search.missed)
     # Newton to 1e-11; the tangent's share along λ is then 6x·δx/(3x²−1…) of that order.
     np.testing.assert_allclose(found, [fold, fold**3 - fold], atol=1e-10)
     assert abs(float(tangent[-1])) < 1e-10
     # An event that is not there is not resolved, and not missed either.
-    *_, resolved, missed = located_fold(points[k + 5], tangents[k + 5], points[k + 6])
-    assert not bool(resolved)
-    assert not bool(missed)
+    search = located_fold(points[k + 5], tangents[k + 5], points[k + 6])
+    assert not bool(search.resolved)
+    assert not bool(search.missed)
 
 
 def test_a_coarse_curve_and_a_fine_one_agree(s_points):
@@ -304,20 +305,21 @@ def test_a_curve_has_two_points(max_points):
 
 def test_correction_stays_in_its_plane_and_says_when_it_fails():
     start, across = jnp.array([-0.7, 0.9]), jnp.array([0.6, 0.8])
-    point, tangent, count, converged = correct(circle, start, across, 1e-8, 20)
-    assert bool(converged)
-    assert 2 <= int(count) <= 8
+    found = correct(circle, start, across, 1e-8, 20)
+    point = found.point
+    assert bool(found.converged)
+    assert 2 <= int(found.n_solves) <= 8
     # The exact point where the line 0.6x + 0.8λ = 0.3 meets the circle.
     exact = 0.3 * np.array([0.6, 0.8]) + np.sqrt(1 - 0.3**2) * np.array([-0.8, 0.6])
     np.testing.assert_allclose(point, exact, rtol=0, atol=1e-8)  # the tolerance asked for
     assert float(across @ (point - start)) == pytest.approx(0.0, abs=1e-14)
     # The tangent is one iterate older: late by the root of the tolerance.
-    assert float(tangent @ point) == pytest.approx(0.0, abs=1e-4)
-    assert float(tangent @ across) > 0
-    *_, converged = correct(circle, start, across, 1e-8, 2)  # too few iterations
+    assert float(found.tangent @ point) == pytest.approx(0.0, abs=1e-4)
+    assert float(found.tangent @ across) > 0
+    converged = correct(circle, start, across, 1e-8, 2).converged  # too few iterations
     assert not bool(converged)
     # The line 0.6x + 0.8λ = 1.06 passes the circle by.
-    *_, converged = correct(circle, jnp.array([0.9, 0.65]), across, 1e-8, 40)
+    converged = correct(circle, jnp.array([0.9, 0.65]), across, 1e-8, 40).converged
     assert not bool(converged)
-    *_, converged = correct(broken, jnp.array([0.6, 0.6]), across, 1e-8, 20)
+    converged = correct(broken, jnp.array([0.6, 0.6]), across, 1e-8, 20).converged
     assert not bool(converged)

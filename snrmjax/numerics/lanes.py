@@ -1,0 +1,132 @@
+"""Many iterations side by side: a lane whose job has ended takes the next one."""
+
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Int
+
+from snrmjax.numerics.blocks import as_arrays, cores, on_accelerator, over_cores, taken
+
+Jobs, States = Any, Any  # trees of arrays with a leading axis
+
+
+def lanes_for(unknowns: int) -> int:
+    """How many problems of this size are best worked on side by side.
+
+    An instruction on many small problems costs little more than on one; large ones are held up by
+    their factorisations, which follow one another anyway, and then lanes without a job cost.
+    """
+    if on_accelerator():
+        return 1024
+    return 16 if unknowns <= 48 else 4 if unknowns <= 160 else 1
+
+
+def in_lanes(
+    begun: Callable[[Jobs, Bool[np.ndarray, " lane"]], States],
+    advanced: Callable[[Jobs, States, int], tuple[States, tuple]],
+    result: Callable[[States], tuple],
+    jobs: Jobs,
+    lanes: int,
+) -> tuple[tuple[np.ndarray, ...], list[tuple[np.ndarray, ...]]]:
+    """All jobs to their ends, `lanes` at a time on every core.
+
+    Arguments: `begun` gives the states of `lanes` jobs, those of lanes not wanted being at their
+    end; `advanced` takes them some iterations further, as long as more than so many lanes are at
+    work, and gives the rows of each: whether it is kept, then anything, all of shape
+    (iteration, lane, …); `result` says of states which have not ended, and what is wanted of them
+    at their ends. What a job gives does not depend on the lane
+    that it is in, nor on its neighbours.
+    Returns the results, of shape (job, …), and the rows that every job gave on the way.
+    """
+    n = len(jax.tree.leaves(jobs)[0])
+    queue = deque(range(n))
+    ends: list[tuple[np.ndarray, list[np.ndarray]]] = []
+    given: list[list[list[np.ndarray]]] = [[] for _ in range(n)]
+
+    def worked(_: int) -> None:
+        member, busy = np.zeros(lanes, dtype=int), np.zeros(lanes, dtype=bool)
+        states: States = None
+        while True:
+            fresh = np.zeros(lanes, dtype=bool)
+            for lane in np.flatnonzero(~busy)[: len(queue)].tolist():
+                with suppress(IndexError):  # another core was faster
+                    member[lane] = queue.popleft()
+                    busy[lane] = fresh[lane] = True
+            if not busy.any():
+                return
+            if fresh.any():
+                mine = as_arrays(taken(jobs, member))
+                states = _joined(fresh, begun(mine, busy), states)
+            states, rows = advanced(mine, states, lanes // 8 if queue else 0)
+            kept, *parts = (np.asarray(part) for part in rows)
+            going, *found = (np.asarray(part) for part in result(states))
+            for lane in np.flatnonzero(busy & kept.any(axis=0)).tolist():
+                given[member[lane]].append([part[kept[:, lane], lane] for part in parts])
+            over = busy & ~going
+            if over.any():
+                ends.append((member[over], [part[over] for part in found]))
+                busy &= going
+
+    over_cores(worked, range(min(cores(), -(-n // lanes))))
+    order = np.argsort(np.concatenate([members for members, _ in ends]))
+    columns = zip(*(found for _, found in ends), strict=True)
+    results = tuple(np.concatenate(column)[order] for column in columns)
+    return results, [tuple(map(np.concatenate, zip(*rows, strict=True))) for rows in given]
+
+
+def _joined(fresh: Bool[np.ndarray, " lane"], new: States, old: States) -> States:
+    """New states where lanes have begun, the old ones elsewhere."""
+    if old is None or fresh.all():
+        return new
+
+    def joined(a: Any, b: Any) -> np.ndarray:
+        return np.where(fresh.reshape(-1, *(1,) * (np.ndim(a) - 1)), a, b)
+
+    return jax.tree.map(joined, new, old)
+
+
+def iterated(
+    step: Callable[[Any, Any], tuple[Any, tuple]],
+    running: Callable[[States], Any],
+    jobs: Jobs,
+    states: States,
+    length: int,
+    idle: Int[Array, ""],
+) -> tuple[States, tuple]:
+    """Iterations of all lanes in one program: `length`, or until `idle` of them or fewer go on.
+
+    `step(job, state)` gives one lane's next state and its row, the first part of which says
+    whether the row is kept. Returns the states and the rows, of shape (iteration, lane, …).
+    """
+    alone = len(jax.tree.leaves(states)[0]) == 1
+
+    def stepped(states: States) -> tuple[States, tuple]:
+        if not alone:
+            return jax.vmap(step)(jobs, states)
+        first = (jax.tree.map(lambda a: a[0], tree) for tree in (jobs, states))
+        return jax.tree.map(lambda a: a[None], step(*first))
+
+    def body(loop: tuple) -> tuple:
+        k, states, rows = loop
+        going = running(states)
+        new, (kept, *given) = stepped(states)
+
+        def unless_ended(a: Array, b: Array) -> Array:
+            return jnp.where(going.reshape(-1, *(1,) * (a.ndim - 1)), a, b)
+
+        states = jax.tree.map(unless_ended, new, states)
+        row = (kept & going, *given)
+        return k + 1, states, tuple(a.at[k].set(b) for a, b in zip(rows, row, strict=True))
+
+    shapes = jax.eval_shape(stepped, states)[1]
+    rows = tuple(jnp.zeros((length, *part.shape), part.dtype) for part in shapes)
+
+    def going_on(loop: tuple) -> Array:
+        return (loop[0] < length) & (jnp.sum(running(loop[1])) > idle)
+
+    return jax.lax.while_loop(going_on, body, (jnp.array(0), states, rows))[1:]
