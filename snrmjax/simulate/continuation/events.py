@@ -10,10 +10,10 @@ from jaxtyping import Array, Bool, Float
 from snrmjax.numerics.blocks import mapped, taken
 from snrmjax.numerics.compiled import compiled
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance
-from snrmjax.simulate.continuation.continuation import StepControl, TracedCurve, correct
+from snrmjax.simulate.continuation.continuation import CurveEvent, StepControl, TracedCurve, correct
 from snrmjax.simulate.continuation.event_location import LocatedEvent, locate_event
 
-EVENT_KINDS = ("fold", "peak", "phase_resonance")
+EVENT_KINDS = (CurveEvent.FOLD, CurveEvent.PEAK, CurveEvent.PHASE_RESONANCE)
 _BLOCK = 8  # intervals that one call works on
 _INSIDE = 7  # points inside an interval that is looked at more closely
 
@@ -194,7 +194,8 @@ def _divided(
     found, tangents, ok = points_between(balances, curves, owner, position, share, steps)
     keep = np.flatnonzero(ok).tolist()
     return inserted(
-        curves, [NewPoint(owner[k], position[k], found[k], tangents[k], "") for k in keep]
+        curves,
+        [NewPoint(owner[k], position[k], found[k], tangents[k], CurveEvent.NONE) for k in keep],
     )
 
 
@@ -263,7 +264,7 @@ class NewPoint(NamedTuple):
     position: int  # the neighbour before it
     point: np.ndarray
     tangent: np.ndarray
-    label: str
+    event: CurveEvent
     multipliers: np.ndarray | None = None
 
 
@@ -280,14 +281,14 @@ def inserted(curves: list[TracedCurve], new: list[NewPoint]) -> list[TracedCurve
         turn = np.where((np.einsum("ku,ku->k", turn, ahead) < 0)[:, None], -turn, turn)
         n = len(curve.points)
         order = np.lexsort((np.append(np.zeros(n), along), np.append(np.arange(n), where)))
-        names = [*curve.labels, *(e.label for e in mine)]
+        events = [*curve.events, *(e.event for e in mine)]
         multipliers = curve.multipliers
         if multipliers is not None:
             multipliers = np.concatenate([multipliers, [e.multipliers for e in mine]])[order]
         result[number] = curve._replace(
             points=np.concatenate([curve.points, points])[order],
             tangents=np.concatenate([curve.tangents, turn])[order],
-            labels=tuple(names[k] for k in order),
+            events=tuple(events[k] for k in order),
             multipliers=multipliers,
         )
     return result
