@@ -38,7 +38,9 @@ from snrmjax.model.effects import EFFECTS, effect_parameters
 Kinds = tuple[str, ...]
 """An answer: its effects in alphabetic order, or one of those without any."""
 
-NONE, UNKNOWN, NOISE_REJECTED = ("none",), ("unknown",), ("noise_rejected",)
+NONE: Kinds = ("none",)
+UNKNOWN: Kinds = ("unknown",)
+NOISE_REJECTED: Kinds = ("noise_rejected",)
 
 
 class Weighed(NamedTuple):

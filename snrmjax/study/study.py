@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from snrmjax.io.reduction.beam_file import RADIUS, RISE
-from snrmjax.io.reduction.beam_models import BeamModels
-from snrmjax.io.reduction.beam_parameters import beam_rules, check_beam_name
+from snrmjax.condense.beam_description import RADIUS, RISE
+from snrmjax.condense.beam_models import BeamModels
+from snrmjax.condense.beam_parameters import beam_rules, check_beam_name
 from snrmjax.model.parameters import (
     parameter_names,
     parameter_rules,

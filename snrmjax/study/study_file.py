@@ -9,8 +9,7 @@ import numpy as np
 
 from snrmjax.io.files import FilePath, file_name, read_text
 from snrmjax.io.models import read_model
-from snrmjax.io.reduction.beam_file import is_beam_file
-from snrmjax.io.reduction.beam_models import read_beam_models
+from snrmjax.io.reduction.beam_file import is_beam_file, read_beam_models
 from snrmjax.io.tables import read_steady_states
 from snrmjax.io.toml_table import TomlTable, parsed_toml
 from snrmjax.io.units import DEGREE, HERTZ
