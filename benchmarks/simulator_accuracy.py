@@ -55,7 +55,7 @@ def closure(n_points: int) -> None:
         for order in (9, 15, 31, 45, 63):
             for curve in responses(beam, harmonic_order=order):
                 rows = np.linspace(0, len(curve.frequency) - 1, n_points).round().astype(int)
-                rows = [k for k in rows if "fold" not in curve.event[k]]
+                rows = [k for k in rows if curve.event[k] != "fold"]
                 misses = []
                 for k in rows:
                     truth = TimeDomain(model, curve.force, curve.frequency[k])

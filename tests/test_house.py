@@ -82,7 +82,7 @@ SUB_ROOMS = {
     "diagnose.laws": {
         *("diagnose.misfit", "diagnose.search", "diagnose.checks", "diagnose.priors"),
     },
-    "io.calculix": {"io.files", "io.reduction"},
+    "io.calculix": {"io.files"},
     "io.laboratory": {"io.files", "io.rows", "io.units"},
     "io.exchange": {
         *("io.files", "io.units", "io.columns", "io.rows", "io.tables", "io.toml_table"),

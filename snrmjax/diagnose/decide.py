@@ -24,7 +24,7 @@ from snrmjax.diagnose.checks.alternative_laws import (
 )
 from snrmjax.diagnose.checks.gains import LevelForces, doubts_on_gains
 from snrmjax.diagnose.checks.residuals import HeldOutLevels, left_curve, missed_levels, pattern
-from snrmjax.diagnose.evidence import NOISE_REJECTED, NONE, UNKNOWN, Weights
+from snrmjax.diagnose.evidence import NOISE_REJECTED, NONE, UNKNOWN, Kinds, Weights, answer_of
 from snrmjax.diagnose.laws.law_answer import LawAnswer
 from snrmjax.diagnose.misfit.effect_fit import baseline_fit
 from snrmjax.diagnose.search.locating import Located, power_of_answer
@@ -54,7 +54,7 @@ class Judgement(NamedTuple):
     verdict: Verdict
     reasons: tuple[Fact | str, ...]
     open_questions: tuple[Doubt, ...]
-    probabilities: Mapping[str, float]
+    probabilities: Mapping[Kinds, float]
 
 
 def most_probable(found: FoundEffects, weights: Weights) -> FoundEffects:
@@ -120,7 +120,7 @@ def decide(
         left = left if left is not None else left_curve(misfit, fit)
         reasons = [Fact("no_effect_explains"), *([left] if left is not None else [])]
         # What is left has a pattern, and so is no noise of any size.
-        kept = {name: p for name, p in probabilities.items() if name != NOISE_REJECTED}
+        kept = {kinds: p for kinds, p in probabilities.items() if kinds != NOISE_REJECTED}
         return Judgement(Verdict.UNKNOWN, tuple(reasons), (), _else_unknown(kept))
     if not fit.kinds:
         return Judgement(Verdict.NOTHING_MISSING, (), (), probabilities)
@@ -137,8 +137,8 @@ def decide(
     doubted = tuple(objection.reason for objection in objections)
     if any(objection.refutes for objection in objections):
         kept = {
-            name: p if name in (NONE, NOISE_REJECTED) else priors.OPEN * p
-            for name, p in probabilities.items()
+            kinds: p if kinds in (NONE, NOISE_REJECTED) else priors.OPEN * p
+            for kinds, p in probabilities.items()
         }
         return Judgement(Verdict.UNKNOWN, doubted, tuple(objections), _else_unknown(kept))
     unclear = objections or any(len(group) > 1 for group in found.classes)
@@ -157,12 +157,12 @@ def with_law(judgement: Judgement, law: LawAnswer) -> Judgement:
     It has its share of what is outside the library, and of the effects in whose place it stands.
     """
     apart = {
-        name: p
-        for name, p in judgement.probabilities.items()
-        if name != UNKNOWN and len(name.split("+")) <= priors.FEW_EFFECTS
+        kinds: p
+        for kinds, p in judgement.probabilities.items()
+        if kinds != UNKNOWN and len(kinds) <= priors.FEW_EFFECTS
     }
     outside = 1 - sum(apart.values())
-    apart["+".join(law.kinds)] = law.share * outside
+    apart[answer_of(law.kinds)] = law.share * outside
     probabilities = _else_unknown(apart)
     return Judgement(Verdict.DRAWN, law.notes, (), probabilities)
 
@@ -189,8 +189,8 @@ def imitations_of(found: FoundEffects, located: tuple[Located, ...]) -> list[Dou
     )
 
 
-def _else_unknown(kept: Mapping[str, float]) -> dict[str, float]:
+def _else_unknown(kept: Mapping[Kinds, float]) -> dict[Kinds, float]:
     """Probabilities of answers that are kept; the rest is that of a law outside the library."""
-    found = {name: p for name, p in kept.items() if name != UNKNOWN}
+    found = {kinds: p for kinds, p in kept.items() if kinds != UNKNOWN}
     found[UNKNOWN] = 1.0 - sum(found.values())
     return dict(sorted(found.items(), key=lambda pair: -pair[1]))

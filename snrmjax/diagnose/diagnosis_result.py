@@ -1,6 +1,7 @@
 """What a diagnosis finds: the answer, how well it is known, and what would decide what is open."""
 
 import dataclasses
+import itertools
 from collections.abc import Iterable, Mapping
 from enum import StrEnum
 from typing import ClassVar, NamedTuple
@@ -15,6 +16,7 @@ from snrmjax.diagnose.checks.gains import LevelGain
 from snrmjax.diagnose.checks.residuals import HeldOut
 from snrmjax.diagnose.decide import Verdict
 from snrmjax.diagnose.design.discriminating_test import DiscriminatingTest
+from snrmjax.diagnose.evidence import Kinds
 from snrmjax.diagnose.laws.law_search import DrawnLaw
 from snrmjax.diagnose.search.locating import Located
 from snrmjax.diagnose.search.model_search import TriedEffect
@@ -91,7 +93,7 @@ class Answer(NamedTuple):
     completed: Structure | None  # None where no structure can have these parameters
     completed_status: CompletedStatus
     force_gain: float  # acting force over recorded one, where a gain was free; else 1
-    probabilities: dict[str, float]  # of all answers considered; effects are joined by `+`
+    probabilities: dict[Kinds, float]  # of all answers considered
     laws: tuple[DrawnLaw, ...] = ()  # where the verdict is `DRAWN`, the most important first
 
 
@@ -165,18 +167,16 @@ class Diagnosis(AbstractResult):
 
         `none`, `unknown` and, where noise is stated, `noise_rejected` are among them.
         """
-        return self.answer.probabilities
+        return {"+".join(kinds): p for kinds, p in self.answer.probabilities.items()}
 
     @property
     def probability(self) -> float:
         """That the answer given is right: its verdict, or an answer of effects in its classes."""
         verdict = Verdict(self.verdict)
         if not verdict.is_answer:
-            return self.probabilities.get(verdict.value, 0.0)
+            return self.answer.probabilities.get((verdict.value,), 0.0)
         given = {kind for group in self.candidates for kind in group}
-        return float(
-            sum(p for name, p in self.probabilities.items() if set(name.split("+")) <= given)
-        )
+        return float(sum(p for kinds, p in self.answer.probabilities.items() if given >= {*kinds}))
 
     @property
     def completed(self) -> Structure | None:
@@ -207,7 +207,8 @@ class Diagnosis(AbstractResult):
 
     def most_probable(self) -> Fact:
         """The answers with the largest probabilities, each once."""
-        listed = tuple((name, p) for name, p in list(self.probabilities.items())[:5] if p >= 0.01)
+        first = itertools.islice(self.answer.probabilities.items(), 5)
+        listed = tuple((kinds, p) for kinds, p in first if p >= 0.01)
         return Fact("most_probable", verdict=self.probability, answers=listed)
 
     def summary(self) -> tuple[str, ...]:
@@ -298,21 +299,21 @@ class FormerAnswer(NamedTuple):
 
     verdict: str
     effects: tuple[str, ...]
-    probabilities: Mapping[str, float]  # of the answers considered
+    probabilities: Mapping[Kinds, float]  # of the answers considered
     starts: Mapping[str, tuple[float, ...]]  # parameters of every effect that was compared
 
-    def changed_to(self, probabilities: Mapping[str, float]) -> Fact:
+    def changed_to(self, probabilities: Mapping[Kinds, float]) -> Fact:
         """What further states did to the answers that were likely before, or are now."""
         least, before = 0.05, self.probabilities
-        likely = [name for name, p in before.items() if p >= least]
-        likely += [name for name in list(probabilities)[:1] if name in before]
-        likely += [name for name, p in probabilities.items() if p >= least and name not in before]
+        likely = [kinds for kinds, p in before.items() if p >= least]
+        likely += [kinds for kinds in list(probabilities)[:1] if kinds in before]
+        likely += [one for one, p in probabilities.items() if p >= least and one not in before]
         return Fact(
             "answer_before",
             verdict=self.verdict,
             effects=self.effects,
             probabilities=tuple(
-                (name, before.get(name), probabilities.get(name, 0.0))
-                for name in dict.fromkeys(likely)
+                (kinds, before.get(kinds), probabilities.get(kinds, 0.0))
+                for kinds in dict.fromkeys(likely)
             ),
         )

@@ -35,7 +35,12 @@ from snrmjax.identify.test_model.priors import (
 from snrmjax.model.effect_metadata import MotionScales
 from snrmjax.model.effects import EFFECTS, effect_parameters
 
-NONE, UNKNOWN, NOISE_REJECTED = "none", "unknown", "noise_rejected"
+Kinds = tuple[str, ...]
+"""An answer: its effects in alphabetic order, or one of those without any."""
+
+NONE: Kinds = ("none",)
+UNKNOWN: Kinds = ("unknown",)
+NOISE_REJECTED: Kinds = ("noise_rejected",)
 
 
 class Weighed(NamedTuple):
@@ -63,19 +68,19 @@ class Weights(NamedTuple):
         more = np.log(n * priors.IMITATION) + best.log_weight
         return self._replace(unknown=float(np.logaddexp(self.unknown, more)))
 
-    def probabilities(self) -> dict[str, float]:
-        """Of every answer by its name, the largest first; they add up to one."""
-        logs = {answer_name(answer.kinds): answer.log_weight for answer in self.answers}
+    def probabilities(self) -> dict[Kinds, float]:
+        """Of every answer, the largest first; they add up to one."""
+        logs = {answer_of(answer.kinds): answer.log_weight for answer in self.answers}
         logs |= {UNKNOWN: self.unknown, NOISE_REJECTED: self.noise_rejected}
-        logs = {name: value for name, value in logs.items() if np.isfinite(value)}
+        logs = {kinds: value for kinds, value in logs.items() if np.isfinite(value)}
         total = logsumexp(list(logs.values()))
-        found = {name: float(np.exp(value - total)) for name, value in logs.items()}
+        found = {kinds: float(np.exp(value - total)) for kinds, value in logs.items()}
         return dict(sorted(found.items(), key=lambda pair: -pair[1]))
 
 
-def answer_name(kinds: Iterable[str]) -> str:
-    """The name of an answer: its effects in alphabetic order, joined by `+`; `none` without any."""
-    return "+".join(sorted(kinds)) or NONE
+def answer_of(effects: Iterable[str]) -> Kinds:
+    """The answer of effects in any order, and of none."""
+    return tuple(sorted(effects)) or NONE
 
 
 class Marginal(NamedTuple):

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from snrmjax.doctor.corrections import TestCorrection, corrections
-from snrmjax.doctor.findings import Checkup, Finding, Severity, gravest_first
+from snrmjax.doctor.findings import Checkup, Finding, gravest_first
 from snrmjax.doctor.force_checks import deepest_fall, dropout_findings, harmonic_findings
 from snrmjax.doctor.judgement import (
     CheckedStates,
@@ -167,13 +167,11 @@ def _matters(one: TestCorrection, base: Judged) -> bool:
 def _finding(seen: CheckedStates, base: Judged, one: TestCorrection, where: str) -> Finding:
     """What a correction undoes, as a finding."""
     states = base.states
-    severity: Severity = "error"
     misses = {"misfit": one.judged.misfit, "misfit_before": base.misfit}
     rows: tuple[int, ...] = ()
     title = None
     match one.kind:
         case "drift":
-            severity = "warning"
             evidence, advice = Fact("drift", change=one.value, **misses), Fact("advice_drift")
         case "different_structures":
             n = len(seen.files)
@@ -184,7 +182,7 @@ def _finding(seen: CheckedStates, base: Judged, one: TestCorrection, where: str)
         case "volts_as_force":
             evidence, advice, title = _of_gains(one, misses, seen.files)
         case "force_dropout":
-            severity, advice = "warning", Fact("advice_force_in_noise")
+            advice = Fact("advice_force_in_noise")
             evidence = Fact(
                 "force_in_noise",
                 fall=deepest_fall(states),
@@ -199,7 +197,7 @@ def _finding(seen: CheckedStates, base: Judged, one: TestCorrection, where: str)
             rows = tuple(int(seen.row[k]) for k in np.flatnonzero(size > one.value * 0.999))
             advice, limited = Fact("advice_clipped_states"), {"column": one.column, "rows": rows}
             evidence = Fact("states_clipped", limit=one.value, **limited, **misses)
-    return Finding(one.kind, severity, where, evidence, advice, rows, title=title)
+    return Finding(one.kind, where, evidence, advice, rows, title=title)
 
 
 def _of_gains(

@@ -35,6 +35,13 @@ KINDS: tuple[str, ...] = get_args(Kind)
 FORCE_HARMONICS: Kind = "force_harmonics"
 """Of the force that was measured; an effect of the model has this name, too."""
 
+SEVERITIES: dict[str, Severity] = {
+    **dict.fromkeys(KINDS, "error"),
+    **dict.fromkeys((FORCE_HARMONICS, "force_dropout", "drift", "missing_anti_alias"), "warning"),
+}
+"""How grave each kind is: an "error" makes results wrong, a "warning" widens or bends them, an
+"info" is to be known."""
+
 _MEANINGS = {
     "kind": "what is wrong",
     "severity": "error, warning or info",
@@ -59,18 +66,22 @@ class ImportCorrection(NamedTuple):
 class Finding(NamedTuple):
     """One thing that is wrong with a test, or may be.
 
-    `severity`: an "error" makes results wrong, a "warning" widens or bends them, an "info" is to
-    be known. `rows` are states of the table (from 0) that show it, none where a record does.
+    `rows` are states of the table (from 0) that show it, none where a record does.
     """
 
     kind: Kind
-    severity: Severity
     where: str  # file, level, rows or channel
     evidence: Fact | str
     advice: Fact | str  # the line or option that mends it
     rows: tuple[int, ...] = ()
     corrections: tuple[ImportCorrection, ...] = ()  # that an import can do, the likeliest first
     title: Fact | None = None  # where the kind is wider than what was found
+    unsure: bool = False  # something else explains it as well: a warning then
+
+    @property
+    def severity(self) -> Severity:
+        """That of its kind, see `SEVERITIES`."""
+        return "warning" if self.unsure else SEVERITIES[self.kind]
 
     @property
     def name(self) -> str:

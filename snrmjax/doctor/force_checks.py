@@ -31,7 +31,7 @@ def dropout_findings(seen: CheckedStates, where: str) -> list[Finding]:
     evidence = Fact(
         "force_falls", fall=worst, n_levels=len(dropped), of_levels=states.n_levels, rows=rows
     )
-    return [Finding("force_dropout", "warning", where, evidence, Fact("advice_force_falls"), rows)]
+    return [Finding("force_dropout", where, evidence, Fact("advice_force_falls"), rows)]
 
 
 def _falls(states: TestStates) -> Iterator[tuple[Int[np.ndarray, " state"], float, float]]:
@@ -90,7 +90,7 @@ def harmonic_findings(
     if not found:
         return []
     evidence = Fact("response_harmonics_of_force", harmonics=tuple(found))
-    return [Finding(FORCE_HARMONICS, "warning", where, evidence, Fact("advice_harmonics"))]
+    return [Finding(FORCE_HARMONICS, where, evidence, Fact("advice_harmonics"))]
 
 
 def _of_force(

@@ -188,7 +188,7 @@ def misread(recorded: Judged, best: Reading, where: str) -> Finding:
     )
     corrections = () if meaning.correction is None else (meaning.correction,)
     advice = Fact("advice_reading", reading=meaning.name)
-    return Finding(meaning.kind, "error", where, evidence, advice, corrections=corrections)
+    return Finding(meaning.kind, where, evidence, advice, corrections=corrections)
 
 
 def _in_degrees(seen: CheckedStates, known_mass: bool) -> list[Reading]:

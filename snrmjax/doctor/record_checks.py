@@ -130,7 +130,7 @@ def _piled_up(x: Float[np.ndarray, " sample"], at: np.ndarray, width: float) -> 
 
 
 def _clipping(where: str, evidence: Fact) -> Finding:
-    return Finding("clipped_channel", "error", where, evidence, Fact("advice_range"))
+    return Finding("clipped_channel", where, evidence, Fact("advice_range"))
 
 
 def _middle(step: Step, share: float = 0.5) -> slice:
@@ -181,7 +181,7 @@ def _harmonics(x: np.ndarray, steps: list[Step], rate: float, where: str) -> lis
     if not worst[order] > FORCE_HARMONIC:
         return []
     evidence = Fact("record_force_harmonic", order=order + 2, ratio=float(worst[order]))
-    return [Finding(FORCE_HARMONICS, "warning", where, evidence, Fact("advice_amplifier"))]
+    return [Finding(FORCE_HARMONICS, where, evidence, Fact("advice_amplifier"))]
 
 
 def _lines(x: np.ndarray, rows: slice, frequency: float, rate: float) -> np.ndarray:
@@ -236,7 +236,7 @@ def _unsettled(
         change=worst,
         time_s=one.start / rate,
     )
-    return [Finding("unsettled_steps", "error", where, evidence, Fact("advice_unsettled"))]
+    return [Finding("unsettled_steps", where, evidence, Fact("advice_unsettled"))]
 
 
 def _dropped(force: np.ndarray, x: np.ndarray, steps: list[Step], where: str) -> list[Finding]:
@@ -254,7 +254,7 @@ def _dropped(force: np.ndarray, x: np.ndarray, steps: list[Step], where: str) ->
     if drop < FORCE_FALLS or not back or np.ptp(np.log(v)) < 0.25:
         return []
     evidence = Fact("record_force_falls", force=nominal, fall=drop)
-    return [Finding("force_dropout", "warning", where, evidence, Fact("advice_record_force"))]
+    return [Finding("force_dropout", where, evidence, Fact("advice_record_force"))]
 
 
 def _folded(x: np.ndarray, steps: list[Step], rate: float, where: str) -> list[Finding]:
@@ -296,4 +296,4 @@ def _folded(x: np.ndarray, steps: list[Step], rate: float, where: str) -> list[F
         return []
     size, line, order = max(images) if images else (*max(others), None)
     evidence = Fact("line_folded", frequency_hz=line, ratio=size, rate_hz=rate, order=order)
-    return [Finding("missing_anti_alias", "warning", where, evidence, Fact("advice_folded"))]
+    return [Finding("missing_anti_alias", where, evidence, Fact("advice_folded"))]

@@ -5,12 +5,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from snrmjax.doctor.findings import Finding, ImportCorrection, Severity
+from snrmjax.doctor.findings import Finding, ImportCorrection
 from snrmjax.doctor.judgement import Judged, Scale, judge
 from snrmjax.doctor.priors import BAND, CERTAIN, MODAL_MASS, MORE_DAMPING, OTHER_SCALE
 from snrmjax.identify.test_model.states import TestStates
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.facts import Fact
+
+_VOLTS = (ImportCorrection(force_unit="V"),)
 
 
 def is_other_scale(scale: Scale, as_modelled: Judged) -> bool:
@@ -46,32 +48,28 @@ def scale_findings(
         correction = (
             ImportCorrection(response=2**0.5) if off > 0 else ImportCorrection(force=2**0.5)
         )
-        return [
-            Finding("rms_for_peak", "error", where, evidence, advice, corrections=(correction,))
-        ]
+        return [Finding("rms_for_peak", where, evidence, advice, corrections=(correction,))]
     bend = _bend(scale.judged.states, scale.judged.stiffness, model)
     agrees = bend is not None and abs(np.log(bend)) < OTHER_SCALE * 3
     units = [unit for unit in _mixed_units() if abs(off - np.log(unit.mass)) < near]
     units = [unit for unit in units if not (agrees and unit.column == "response")]
-    found = []
-    severity: Severity = "error"
+    found, unsure = [], bool(units)
     if units:
-        severity, size = "warning", Fact("if_units_are_right")
+        size = Fact("if_units_are_right")
         names = tuple(unit[:3] for unit in units)
         evidence = Fact("mixed_units", **asked, factor=units[0].mass, units=names)
         corrections = tuple(unit.correction for unit in units)
         advice = Fact("advice_units", units=names)
-        found.append(
-            Finding("wrong_unit", "error", where, evidence, advice, corrections=corrections)
-        )
+        found.append(Finding("wrong_unit", where, evidence, advice, corrections=corrections))
     of_force, of_shape = _signs(scale.judged, model, bend, agrees=agrees)
     if of_force >= of_shape:
-        evidence = Fact("voltage_for_force", scale=size, gain=kappa)
-        volts = Finding("volts_as_force", severity, where, evidence, Fact("advice_voltage"))
-        found.append(volts._replace(corrections=(ImportCorrection(force_unit="V"),)))
+        evidence, advice = Fact("voltage_for_force", scale=size, gain=kappa), Fact("advice_voltage")
+        found.append(
+            Finding("volts_as_force", where, evidence, advice, corrections=_VOLTS, unsure=unsure)
+        )
     if of_shape >= of_force:
         evidence, advice = Fact("shape_scale", scale=size), Fact("advice_shape", factor=kappa**0.5)
-        found.append(Finding("shape_not_mass_normalised", severity, where, evidence, advice))
+        found.append(Finding("shape_not_mass_normalised", where, evidence, advice, unsure=unsure))
     return found
 
 
@@ -167,5 +165,5 @@ def shaker_damping(fit: Judged, model: Structure, where: str) -> list[Finding]:
     if excess < max(MORE_DAMPING, certain) or np.ptp(times) > 0.5 * excess or abs(away) > ratio:
         return []
     evidence = Fact("shaker_damping", ratio=float(times.min()), frequency_off=abs(away))
-    volts = Finding("volts_as_force", "warning", where, evidence, Fact("advice_shaker_damping"))
-    return [volts._replace(corrections=(ImportCorrection(force_unit="V"),))]
+    advice = Fact("advice_shaker_damping")
+    return [Finding("volts_as_force", where, evidence, advice, corrections=_VOLTS, unsure=True)]

@@ -1,8 +1,7 @@
 from . import calculix
 from .joint_results import read_joint_fit, write_joint_fit
 from .models import read_model, write_model
-from .reduction.beam_models import read_beam_models
-from .reduction.beam_source import read_beam
+from .reduction.beam_file import read_beam, read_beam_models
 from .reduction.load_tables import read_load_tables
 from .tables import read_steady_states, write_steady_states, write_table
 

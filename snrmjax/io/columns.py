@@ -4,9 +4,9 @@ import re
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from snrmjax.io.files import near_miss
 from snrmjax.io.rows import Cells, shortened_name
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.names import near_miss
 from snrmjax.numerics.rules import FRACTION, IN_RANGE_HZ, NOT_NEGATIVE, POSITIVE, SHORT, WHOLE, Rule
 
 PHASOR = ("velocity_re_m_s", "velocity_im_m_s")

@@ -106,7 +106,9 @@ def read_former_answer(path: FilePath) -> FormerAnswer:
             )
             for kind, row in rows.items()
         }
-        probabilities = {str(name): float(p) for name, p in answer["probabilities"].items()}
+        probabilities = {
+            tuple(name.split("+")): float(p) for name, p in answer["probabilities"].items()
+        }
         return FormerAnswer(str(answer["verdict"]), tuple(answer["effects"]), probabilities, starts)
     except (json.JSONDecodeError, KeyError, TypeError, AttributeError, ValueError) as error:
         if isinstance(error, ValueError) and not isinstance(error, json.JSONDecodeError):

@@ -6,15 +6,7 @@ import jax
 import numpy as np
 import tomli_w
 
-from snrmjax.io.files import (
-    FilePath,
-    file_name,
-    near_miss,
-    read_text,
-    shown,
-    suggestion,
-    write_atomically,
-)
+from snrmjax.io.files import FilePath, file_name, read_text, shown, write_atomically
 from snrmjax.io.toml_table import TomlTable, parsed_toml
 from snrmjax.io.units import DEGREE, HERTZ, in_unit
 from snrmjax.model.effect_base import AbstractEffect
@@ -35,6 +27,7 @@ from snrmjax.model.potential import (
     polynomial_potential,
 )
 from snrmjax.model.structures import Structure, structure
+from snrmjax.numerics.names import near_miss, suggestion
 from snrmjax.numerics.rules import BELOW_ONE, IN_RANGE_HZ, NOT_NEGATIVE, NOT_ZERO, POSITIVE, Rule
 
 _TOP_KEYS = (

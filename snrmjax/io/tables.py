@@ -20,13 +20,14 @@ from snrmjax.io.columns import (
     harmonic_columns,
     read_header,
 )
-from snrmjax.io.files import FilePath, file_name, read_text, shown, suggestion, write_atomically
+from snrmjax.io.files import FilePath, file_name, read_text, shown, write_atomically
 from snrmjax.io.rows import Cells, cells_of
 from snrmjax.io.units import DEGREE, HERTZ, in_unit
 from snrmjax.measure.states import NO_PHASE, UNNAMED_SENSOR, SteadyStates, steady_states
 from snrmjax.model.modes import LinearModes
 from snrmjax.model.structures import Structure, modes_of
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.names import suggestion
 
 
 def read_steady_states(

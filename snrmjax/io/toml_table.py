@@ -4,7 +4,8 @@ import tomllib
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
-from snrmjax.io.files import shown, suggestion
+from snrmjax.io.files import shown
+from snrmjax.numerics.names import suggestion
 from snrmjax.numerics.rules import Rule
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from snrmjax.condense.condensation import Condensation, reduced_model
 from snrmjax.condense.load_cases import StaticCases
 from snrmjax.condense.load_set import modal_loads
+from snrmjax.condense.reduction import ReductionSource, run_load_cases
 from snrmjax.condense.scale_study import (
     TOLERANCE,
     LoadScaleStudy,
@@ -18,9 +19,8 @@ from snrmjax.condense.scale_study import (
 )
 from snrmjax.io.calculix.reduction import read_deck_source
 from snrmjax.io.files import FilePath
-from snrmjax.io.reduction.beam_source import read_beam
+from snrmjax.io.reduction.beam_file import read_beam
 from snrmjax.io.reduction.load_tables import read_load_tables
-from snrmjax.io.reduction.source import ReductionSource, run_load_cases
 from snrmjax.io.units import HERTZ
 from snrmjax.model.potential import monomial_key
 from snrmjax.model.structures import Structure, equilibria

@@ -213,16 +213,14 @@ def _nearest_mode(scaled: ScaledModes, files: TestFiles) -> int:
 
 def _sorted(named: NamedRecord, model: Structure) -> RecordedTest:
     try:
-        return recorded_test(named.record, model.modes)
+        return recorded_test(dataclasses.replace(named.record, name=named.file), model.modes)
     except ValueError as error:
-        moves = any(channel.quantity in _MOTIONS for channel in named.record.channels)
-        mend = (
-            ""
-            if moves
-            else f" `snrmjax import {named.file}` says what the file holds and how to import it; "
+        if any(channel.quantity in _MOTIONS for channel in named.record.channels):
+            raise
+        raise ValueError(
+            f"{error} `snrmjax import {named.file}` says what the file holds and how to import it; "
             "put the map.toml that the import writes into the folder."
-        )
-        raise ValueError(f"{named.file}: {str(error).lstrip(' :')}{mend}") from error
+        ) from error
 
 
 def _refuse_doubled(names: Sequence[str], parts: Sequence[SteadyStates]) -> None:

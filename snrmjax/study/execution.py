@@ -20,11 +20,11 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from snrmjax.io.compilation_cache import WORTH_KEEPING, default_cache_folder
-from snrmjax.study.computations.base import COMPLETE, joined, with_refused
+from snrmjax.study.computations.base import COMPLETE, Failure, MemberStatus, joined, with_refused
 from snrmjax.study.store import StudyFolder, write_chunk
 from snrmjax.study.study import Ensemble
 
-LOST = "lost: the process that computed it died"
+LOST = Failure(MemberStatus.LOST, "the process that computed it died")
 
 _DEATHS_BESIDE = 2  # of a chunk's worker, before the chunk is computed alone
 _TRIES_OF_ONE = 3  # of a member alone in a process, before it is given up

@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from snrmjax.io.reduction.beam_models import BeamModels
+from snrmjax.condense.beam_models import BeamModels
 from snrmjax.study.study import Study
 
 _LONGEST = 64  # numbers of an array that are written out; longer ones are known by their hash

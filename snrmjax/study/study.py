@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from snrmjax.io.reduction.beam_file import RADIUS, RISE
-from snrmjax.io.reduction.beam_models import BeamModels
-from snrmjax.io.reduction.beam_parameters import beam_rules, check_beam_name
+from snrmjax.condense.beam_description import RADIUS, RISE
+from snrmjax.condense.beam_models import BeamModels
+from snrmjax.condense.beam_parameters import beam_rules, check_beam_name
 from snrmjax.model.parameters import (
     parameter_names,
     parameter_rules,
@@ -24,7 +24,14 @@ from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import taken
 from snrmjax.numerics.rules import POSITIVE, Rule
 from snrmjax.simulate.balance.labelled import HERTZ
-from snrmjax.study.computations.base import FORCE, AbstractComputation, Members, with_refused
+from snrmjax.study.computations.base import (
+    FORCE,
+    AbstractComputation,
+    Failure,
+    Members,
+    refusal,
+    with_refused,
+)
 from snrmjax.study.sampling import Sampling, drawn_members, member_seed, number_of_members
 from snrmjax.study.variations import AbstractVariation
 
@@ -109,7 +116,7 @@ class Ensemble(NamedTuple):
         study, rows = self.study, self.table[list(numbers)]
         models = models_of(study, rows)
         there = [k for k, model in enumerate(models) if isinstance(model, Structure)]
-        missing = {k: model for k, model in enumerate(models) if isinstance(model, str)}
+        missing = {k: model for k, model in enumerate(models) if isinstance(model, Failure)}
         forces = rows[there][:, [study.names.index(FORCE)]] if FORCE in study.names else None
         seeds = [member_seed(study.seed, numbers[k]) for k in there]
         members = Members([models[k] for k in there], forces, seeds)  # type: ignore[misc]
@@ -119,7 +126,7 @@ class Ensemble(NamedTuple):
         return with_refused(study.computation, outputs, missing)
 
 
-def models_of(study: Study, rows: Float[np.ndarray, "member name"]) -> list[Structure | str]:
+def models_of(study: Study, rows: Float[np.ndarray, "member name"]) -> list[Structure | Failure]:
     """The models of members with these values of the varied quantities, or why there is none."""
     named = [k for k, name in enumerate(study.names) if name != FORCE]
     if study.model_of is not None:
@@ -134,14 +141,14 @@ def models_of(study: Study, rows: Float[np.ndarray, "member name"]) -> list[Stru
 
 def _made(
     model_of: Callable[[dict[str, float]], Structure], values: dict[str, float]
-) -> Structure | str:
+) -> Structure | Failure:
     if isinstance(model_of, BeamModels):
         named = {_in_model(name): value for name, value in values.items()}
         values = {name: value * unit for (name, unit), value in named.items()}
     try:
         return model_of(values)
     except ValueError as error:
-        return f"refused: {str(error).splitlines()[0]}"
+        return refusal(error)
 
 
 @eqx.filter_jit

@@ -1,15 +1,15 @@
 """Studies as TOML files."""
 
 import os
+from collections.abc import Callable
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 
 from snrmjax.io.files import FilePath, file_name, read_text
 from snrmjax.io.models import read_model
-from snrmjax.io.reduction.beam_file import is_beam_file
-from snrmjax.io.reduction.beam_models import read_beam_models
+from snrmjax.io.reduction.beam_file import is_beam_file, read_beam_models
 from snrmjax.io.tables import read_steady_states
 from snrmjax.io.toml_table import TomlTable, parsed_toml
 from snrmjax.io.units import DEGREE, HERTZ
@@ -95,16 +95,21 @@ def _sampling(top: TomlTable, file: str, variations: tuple[AbstractVariation, ..
 
 
 def _variation(table: TomlTable) -> AbstractVariation:
-    place = table.place
+    if "parameters" in table.entries:
+        return _joint(table)
+    if "parameter" not in table.entries:
+        raise ValueError(f"{table.place} lacks the key `parameter`.")
+    return _single(table)
+
+
+def _made(
+    table: TomlTable, kind: Callable[..., AbstractVariation], *arguments: Any
+) -> AbstractVariation:
+    """A variation; what it refuses is refused with the table's place."""
     try:
-        if "parameters" in table.entries:
-            return _joint(table)
-        if "parameter" not in table.entries:
-            raise ValueError(f"{place} lacks the key `parameter`.")
-        return _single(table)
+        return kind(*arguments)
     except ValueError as error:
-        text = str(error)
-        raise (error if place in text else ValueError(f"{place} cannot be read: {text}")) from error
+        raise ValueError(f"{table.place} cannot be read: {error}") from error
 
 
 def _single(table: TomlTable) -> AbstractVariation:
@@ -118,20 +123,20 @@ def _single(table: TomlTable) -> AbstractVariation:
         )
     if ways == ["values"]:
         table.check_keys(("parameter", "values"))
-        return Discrete(name, np.array(table.numbers("values", each="value")))
+        return _made(table, Discrete, name, np.array(table.numbers("values", each="value")))
     if ways == ["range"]:
         table.check_keys(("parameter", "range"), ("points",))
         ends = table.numbers("range", each="end")
         if len(ends) != 2:
             raise table.refusal("range", "two numbers", table.entries["range"])
         points = table.whole("points", 2) if "points" in table.entries else None
-        return Uniform(name, ends[0], ends[1], points)
+        return _made(table, Uniform, name, *ends, points)
     if table.choice("distribution", ("uniform", "normal", "lognormal")) == "uniform":
         table.check_keys(("parameter", "distribution", "low", "high"))
-        return Uniform(name, table.number("low"), table.number("high"))
+        return _made(table, Uniform, name, table.number("low"), table.number("high"))
     table.check_keys(("parameter", "distribution", "mean", "std"))
     make = Normal if table.text("distribution") == "normal" else LogNormal
-    return make(name, table.number("mean"), table.number("std"))
+    return _made(table, make, name, table.number("mean"), table.number("std"))
 
 
 def _joint(table: TomlTable) -> AbstractVariation:
@@ -149,9 +154,8 @@ def _joint(table: TomlTable) -> AbstractVariation:
     ]
     if len(each) != len(names) or any(len(row) != len(names) for row in each):
         raise table.refusal("covariance", f"{len(names)} rows of {len(names)} numbers", rows)
-    return MultivariateNormal(
-        tuple(names), np.array(table.numbers("mean", each="entry")), np.array(each)
-    )
+    mean = np.array(table.numbers("mean", each="entry"))
+    return _made(table, MultivariateNormal, tuple(names), mean, np.array(each))
 
 
 def _computation(

@@ -20,7 +20,7 @@ from snrmjax.diagnose import priors
 from snrmjax.diagnose.checks.gains import LevelForces
 from snrmjax.diagnose.checks.residuals import HeldOut, HeldOutLevels, pattern
 from snrmjax.diagnose.decide import decide, most_probable
-from snrmjax.diagnose.evidence import Weighed, Weights, weights_of
+from snrmjax.diagnose.evidence import NOISE_REJECTED, NONE, UNKNOWN, Weighed, Weights, weights_of
 from snrmjax.diagnose.misfit.candidates import candidate
 from snrmjax.diagnose.misfit.effect_fit import baseline_fit, fit_effect
 from snrmjax.diagnose.misfit.predictions import predictions_of, scales_of
@@ -53,7 +53,7 @@ def test_noise_as_it_is_stated_lacks_nothing():
     for seed in range(2):
         found = verdict_on(misfit_of(), noise(seed))
         assert found.verdict == "none"
-        assert found.probabilities["none"] > 0.6
+        assert found.probabilities[NONE] > 0.6
 
 
 def test_scatter_that_grows_with_the_level_is_no_noise():
@@ -62,7 +62,7 @@ def test_scatter_that_grows_with_the_level_is_no_noise():
     assert found.reasons[1].kind == "level_worse"
     assert found.reasons[1]["level"] == 4
     # What has a pattern is no noise of any size.
-    assert "noise_rejected" not in found.probabilities
+    assert NOISE_REJECTED not in found.probabilities
     assert sum(found.probabilities.values()) == pytest.approx(1.0)
 
 
@@ -94,7 +94,7 @@ def test_a_wave_along_the_levels_is_no_noise_of_any_size(stated):
         # Where nothing is stated the search hands over misfits of the size of the noise.
         rows = rows if stated else rows / np.sqrt(np.mean(rows**2))
         found = verdict_on(misfit, rows)
-        assert (found.verdict == "unknown") == (found.probabilities["unknown"] > 0.9) == unknown
+        assert (found.verdict == "unknown") == (found.probabilities[UNKNOWN] > 0.9) == unknown
 
 
 @pytest.fixture(scope="module")
@@ -189,11 +189,11 @@ def test_answers_that_a_level_refutes_keep_a_small_share(turned):
     assert before.verdict == "ambiguous"
     assert after.verdict == "unknown"
     for name in ("sensor_phase_error", "close_mode"):
-        share = after.probabilities[name] / before.probabilities[name]
+        share = after.probabilities[(name,)] / before.probabilities[(name,)]
         assert share == pytest.approx(priors.OPEN)
-    assert after.probabilities["none"] == before.probabilities["none"]
+    assert after.probabilities[NONE] == before.probabilities[NONE]
     assert sum(after.probabilities.values()) == pytest.approx(1.0)
-    assert max(after.probabilities, key=after.probabilities.get) == "unknown"
+    assert max(after.probabilities, key=after.probabilities.get) == UNKNOWN
     assert after.open_questions[0].decide_by.kind == "measure_level_again"
 
 

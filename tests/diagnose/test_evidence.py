@@ -13,12 +13,15 @@ from truths.made_up_misfits import fit_to, misfit_of, noise
 import snrmjax as sj
 from snrmjax.diagnose import priors
 from snrmjax.diagnose.evidence import (
+    NOISE_REJECTED,
+    NONE,
+    UNKNOWN,
     Marginal,
     Weighed,
     Weights,
     _Sizes,
     _sizes_of,
-    answer_name,
+    answer_of,
     discrepancies,
     either,
     log_evidence,
@@ -64,33 +67,33 @@ def test_two_descriptions_of_the_same_data_are_weighed_together():
     two = Weights((weighed("a", 1.0), weighed("b", -3.0)), unknown=-4.0, noise_rejected=-5.0)
     found = either(one, two, np.log(0.4)).probabilities()
     odds = {
-        "none": 1.0,
-        "a": np.exp(-1) + 0.4 * np.exp(1),
-        "b": 0.4 * np.exp(-3),
-        "unknown": np.exp(-2) + 0.4 * np.exp(-4),
-        "noise_rejected": 0.4 * np.exp(-5),
+        NONE: 1.0,
+        ("a",): np.exp(-1) + 0.4 * np.exp(1),
+        ("b",): 0.4 * np.exp(-3),
+        UNKNOWN: np.exp(-2) + 0.4 * np.exp(-4),
+        NOISE_REJECTED: 0.4 * np.exp(-5),
     }
     assert found == pytest.approx({k: v / sum(odds.values()) for k, v in odds.items()})
-    assert next(iter(found)) == "a"
+    assert next(iter(found)) == ("a",)
 
 
 def test_probabilities_are_weights_over_their_sum():
     for shift in (0.0, -1e4):
         answers = (weighed("a+b", np.log(2) + shift), weighed("none", shift))
         found = Weights(answers, shift, -np.inf).probabilities()
-        assert found == pytest.approx({"a+b": 0.5, "none": 0.25, "unknown": 0.25})
-    assert next(iter(found)) == "a+b"
+        assert found == pytest.approx({("a", "b"): 0.5, NONE: 0.25, UNKNOWN: 0.25})
+    assert next(iter(found)) == ("a", "b")
 
 
-def test_an_answer_has_one_name_whatever_the_order_of_its_effects():
-    assert answer_name(("b", "a")) == answer_name(frozenset("ab")) == "a+b"
-    assert answer_name(()) == "none"
+def test_an_answer_is_one_whatever_the_order_of_its_effects():
+    assert answer_of(("b", "a")) == answer_of(frozenset("ab")) == ("a", "b")
+    assert answer_of(()) == NONE
 
 
 def test_laws_that_act_like_an_answer_have_their_share_of_its_weight():
     some = Weights((weighed("a", 0.0), weighed("none", -50.0)), -50.0, -50.0)
     both = some.with_imitations(2)
-    odds = both.probabilities()["unknown"] / both.probabilities()["a"]
+    odds = both.probabilities()[UNKNOWN] / both.probabilities()[("a",)]
     assert odds == pytest.approx(2 * priors.IMITATION)
     assert some.with_imitations(0) is some
     nothing = Weights((weighed("none", 0.0), weighed("a", -50.0)), -50.0, -50.0)
@@ -238,7 +241,7 @@ def test_a_smooth_misfit_that_no_effect_explains_is_one_of_an_unknown_law():
         lead = log_evidence(beside, sizes).right - log_evidence(alone, sizes).right
         assert lead > 10 if better else -5 < lead < 0
         probabilities = weights_of(FoundEffects(made, fit, fit, (), ())).probabilities()
-        assert (probabilities["unknown"] > 0.9) == better
+        assert (probabilities[UNKNOWN] > 0.9) == better
 
 
 def test_an_answer_is_probable_and_all_add_up(damped):

@@ -29,8 +29,9 @@ from typer.testing import CliRunner
 import snrmjax as sj
 from snrmjax.cli import app
 from snrmjax.diagnose.diagnosis_result import FormerAnswer
+from snrmjax.diagnose.evidence import NONE, answer_of
 from snrmjax.diagnose.measurement_plan import measurement_plan
-from snrmjax.io.measurement_plans import read_further_states, write_plan
+from snrmjax.io.measurement_plans import read_former_answer, read_further_states, write_plan
 
 
 def answer(omega, force, kind, rng):
@@ -185,9 +186,18 @@ def test_planned_states_resonate_where_the_structure_does(asked):
 
 
 def test_what_changed_names_old_and_new_answers():
-    former = FormerAnswer("ambiguous", ("a",), {"a": 0.5, "b": 0.4, "c": 0.1, "d": 0.0}, {})
-    changed = former.changed_to({"b": 0.9, "e": 0.1})["probabilities"]
-    assert changed == (("a", 0.5, 0.0), ("b", 0.4, 0.9), ("c", 0.1, 0.0), ("e", None, 0.1))
+    a, b, c, d, e = (("a",), ("b",), ("c",), ("d",), ("a", "b"))
+    former = FormerAnswer("ambiguous", a, {a: 0.5, b: 0.4, c: 0.1, d: 0.0}, {})
+    changed = former.changed_to({b: 0.9, e: 0.1})["probabilities"]
+    assert changed == ((a, 0.5, 0.0), (b, 0.4, 0.9), (c, 0.1, 0.0), (e, None, 0.1))
+
+
+def test_answers_of_a_file_are_those_of_a_diagnosis(tmp_path):
+    told = {"verdict": "named", "effects": ["b", "a"], "tried": []}
+    told["probabilities"] = {"a+b": 0.9, "none": 0.1}
+    (tmp_path / "diagnosis.json").write_text(json.dumps(told))
+    former = read_former_answer(tmp_path / "diagnosis.json")
+    assert former.probabilities == {answer_of(former.effects): 0.9, NONE: 0.1}
 
 
 @pytest.fixture(scope="module")

@@ -6,6 +6,7 @@ from scipy.signal import lsim
 from truths.one_mode import CUBIC, OMEGA, SHAPE, ZETA, model, noisy, states, table
 
 import snrmjax as sj
+from snrmjax.doctor.findings import KINDS, SEVERITIES, Finding
 from snrmjax.doctor.judgement import Scale, checked_states, judge, with_mass
 from snrmjax.doctor.scale_findings import is_other_scale
 from snrmjax.measure import Channel, time_recording
@@ -14,6 +15,12 @@ from snrmjax.measure import Channel, time_recording
 def raised(data, structure=None, recordings=()):
     found = sj.doctor.check_test(data, structure, recordings)
     return [one.kind for one in found.findings if one.severity != "info"]
+
+
+def test_a_finding_is_as_grave_as_its_kind_unless_something_else_explains_it():
+    assert set(SEVERITIES) == set(KINDS)
+    sure = Finding("volts_as_force", "", "", "")
+    assert (sure.severity, sure._replace(unsure=True).severity) == ("error", "warning")
 
 
 @pytest.mark.parametrize(

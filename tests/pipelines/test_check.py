@@ -158,7 +158,7 @@ def test_options_of_a_laboratorys_files_are_those_of_their_map(correction, optio
     read = mends.FilesRead(
         (Path("raw/a.csv"),), Path("raw/map.toml"), ImportMap((ResponseMap("a", "acceleration"),))
     )
-    finding = Finding("wrong_unit", "error", "", "", "Again.", (), (correction,))
+    finding = Finding("wrong_unit", "", "", "Again.", (), (correction,))
     (told,) = mends.with_imports(Checkup((finding,)), read).findings
     line = f"snrmjax import raw/a.csv --map raw/map.toml {options} --out raw/mended"
     assert str(told.advice) == (f"Again: `{line}`." if options else "Again.")

@@ -14,8 +14,14 @@ from snrmjax.cli import app
 from snrmjax.io.exchange.import_map import steps_of_map
 from snrmjax.measure import Channel, frequency_responses, time_recording
 from snrmjax.measure.recordings.step_counts import StepCounts, joined_counts
-from snrmjax.pipelines.folder_contents import read_test_files
-from snrmjax.pipelines.whole_test import _refuse_doubled, _Stages, _taken_sensors, _used_steps
+from snrmjax.pipelines.folder_contents import NamedRecord, read_test_files
+from snrmjax.pipelines.whole_test import (
+    _refuse_doubled,
+    _sorted,
+    _Stages,
+    _taken_sensors,
+    _used_steps,
+)
 
 HERTZ = 2 * np.pi
 OWN, RATIO = 50 * HERTZ, 0.01
@@ -111,6 +117,15 @@ def test_a_file_without_a_sensor_is_said_to_be_the_models_only_one(tmp_path):
     assert _taken_sensors(read_test_files(tmp_path), files.model) == ()
 
 
+@pytest.mark.parametrize(("quantity", "moves"), [("velocity", True), ("unknown", False)])
+def test_a_record_that_is_no_test_is_named_by_its_file(quantity, moves):
+    record = time_recording(np.zeros((1, 64)), [Channel("tip", quantity)], RATE)  # without a name
+    modes = sj.model.linear_modes([OWN], [RATIO], [[1.0]], [1.0], sensors=("tip",))
+    with pytest.raises(ValueError, match=r"^run\.mat[: ]") as raised:
+        _sorted(NamedRecord("run.mat", record), sj.model.structure(modes))
+    assert ("`snrmjax import run.mat`" not in str(raised.value)) == moves
+
+
 STEPS, DWELL = 10, 6.0
 MOVING = (2, 3, 7)  # of the steps: their response still grows by a third
 
@@ -198,6 +213,8 @@ def test_a_folder_of_raw_files_gives_the_backbone_of_its_oscillator(tmp_path):
     assert float(model.modes.natural_frequency[0]) == pytest.approx(OWN, rel=2e-4)
     assert json.loads((out / "check.json").read_text()) == []
     page = (out / "report.html").read_text()
+    assert "mode of interest" in page
+    assert "linear mode<" not in page  # without errors, beside that with them
     for heading in ("Files", "Check", "States", "Backbone: ", "Diagnosis: "):
         assert f">{heading}" in page
     rows = np.genfromtxt(out / "identify" / "backbone.csv", delimiter=",", names=True)

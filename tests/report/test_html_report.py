@@ -337,7 +337,7 @@ def test_resonances_beside_the_nearest_of_harmonic_balance(identification):
             1e-3,
             [0.1, 0.125, 0.3],
             [80.0, 80.5, 95.0],
-            ["", "peak+phase_resonance", "phase_resonance"],
+            ["", "phase_resonance", "phase_resonance"],
         ),
         simulated(2e-3, [0.2], [82.0], ["fold"]),
         simulated(3e-3, [0.3], [82.0], ["phase_resonance"]),

@@ -12,8 +12,8 @@ from truths.printed_page import unreadable
 import snrmjax as sj
 from snrmjax.cli import main
 from snrmjax.condense.load_set import LoadSet
-from snrmjax.io.reduction.load_tables import read_load_tables
-from snrmjax.io.reduction.source import ReductionSource, ShapeLines, write_load_cases
+from snrmjax.condense.reduction import ReductionSource, ShapeLines
+from snrmjax.io.reduction.load_tables import read_load_tables, write_load_cases
 from snrmjax.pipelines.reduce import reduce_model
 from snrmjax.report.figures.reduction import (
     FURTHER,

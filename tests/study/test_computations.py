@@ -7,7 +7,7 @@ import snrmjax as sj
 from snrmjax.numerics.facts import Fact
 from snrmjax.report.study.study_report import members_ended
 from snrmjax.study.analysis.digest import digest
-from snrmjax.study.computations.base import HIGHEST_AT_END, NO_PEAK
+from snrmjax.study.computations.base import MemberStatus
 from snrmjax.study.computations.responses import velocity_bounds
 
 from .conftest import OMEGA, PARTICIPATION, SHAPE, InThisProcess
@@ -142,7 +142,7 @@ def test_a_range_without_the_resonance_has_a_status_of_its_own(linear_model, tmp
     computation = sj.study.Peaks(within, [0.5])
     varied = (sj.study.Discrete("mode_1.natural_frequency", [OMEGA, 0.5 * OMEGA, 1.5 * OMEGA]),)
     data = computed(linear_model, computation, varied, tmp_path)
-    assert data.status.values.tolist() == ["upper_end", NO_PEAK, NO_PEAK]
+    assert data.status.values.tolist() == ["upper_end", *2 * [MemberStatus.NO_PEAK]]
     np.testing.assert_array_equal(np.isnan(data.peak_frequency_hz), [False, True, True])
     found = digest(data)
     assert found.failures.n_outside == found.failures.n_failed == 2
@@ -162,5 +162,5 @@ def test_a_peak_below_the_response_at_the_end_of_the_range_is_not_the_highest(tm
     varied = (sj.study.Discrete("mode_2.participation", [3.0, 0.0003]),)
     computation = sj.study.Peaks(within, [0.5])
     data = computed(sj.model.structure(modes), computation, varied, tmp_path)
-    assert data.status.values.tolist() == [HIGHEST_AT_END, "upper_end"]
+    assert data.status.values.tolist() == [MemberStatus.HIGHEST_AT_END, "upper_end"]
     assert np.all(np.abs(data.peak_frequency_hz * HERTZ / OMEGA - 1) < 0.01)

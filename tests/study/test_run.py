@@ -180,7 +180,7 @@ def test_a_member_that_kills_its_process_is_a_row_with_a_status(study_of_module,
     run = run_here(study_of_module, tmp_path / "s.zarr", InThisProcess(before))
     data = run.open()
     assert run.failed == 1
-    assert data.status.values[4] == LOST
+    assert data.status.values[4] == str(LOST) == "lost: the process that computed it died"
     assert np.isnan(data.peak_velocity_m_s[4])
     others = np.arange(7) != 4
     expected = peak_velocity(0.5, DAMPING[others])

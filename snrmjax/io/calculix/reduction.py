@@ -7,11 +7,11 @@ import numpy as np
 from jaxtyping import Float
 
 from snrmjax.condense.load_cases import StaticCases
+from snrmjax.condense.reduction import ASSUMED_DAMPING, ReductionSource, ShapeLines
 from snrmjax.io.calculix.deck import Deck, read_deck
 from snrmjax.io.calculix.modes import DeckModes, modes_of_deck
 from snrmjax.io.calculix.static import STEP_OF_CASES, run_static_cases
 from snrmjax.io.files import FilePath
-from snrmjax.io.reduction.source import ASSUMED_DAMPING, ReductionSource, ShapeLines
 from snrmjax.numerics.facts import Fact
 
 Place = tuple[int, str]

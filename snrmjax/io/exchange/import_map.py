@@ -7,11 +7,12 @@ from typing import Any, NamedTuple
 
 import tomli_w
 
-from snrmjax.io.files import FilePath, file_name, read_text, shown, suggestion
+from snrmjax.io.files import FilePath, file_name, read_text, shown
 from snrmjax.io.laboratory.contents import TextFormat
 from snrmjax.io.toml_table import TomlTable, parsed_toml
 from snrmjax.measure.recordings.step_counts import StepCounts
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.names import suggestion
 
 _MOTIONS = ("displacement", "velocity", "acceleration")
 _CHANNELS, _NUMBERS, _TEXTS = "Channels and columns", "What the numbers are", "Text files"

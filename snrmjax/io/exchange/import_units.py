@@ -7,10 +7,10 @@ import numpy as np
 from jaxtyping import Float
 
 from snrmjax.io.exchange.import_map import Assumptions, ImportMap
-from snrmjax.io.files import near_miss
 from snrmjax.io.laboratory.physical_units import UnitMeaning, unit_meaning
 from snrmjax.measure.recordings.channels import SI_UNIT, Quantity
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.names import near_miss
 
 AMPLITUDE_FACTORS = {"peak": 1.0, "": 1.0, "rms": np.sqrt(2.0), "peak_to_peak": 0.5}
 """What makes peak amplitudes of peak, rms and peak-to-peak ones."""

@@ -17,13 +17,13 @@ from snrmjax.io.exchange.import_units import (
     phase_in_rad,
     require_name,
 )
-from snrmjax.io.files import near_miss
 from snrmjax.io.laboratory.contents import NumberTable
 from snrmjax.io.laboratory.names import role_of
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.velocity_states import velocity_factors
 from snrmjax.measure.states import UNNAMED_SENSOR
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.names import near_miss
 
 _DEVIATION = re.compile(r"stdev|stddev|std|sigma|deviation|dev")
 

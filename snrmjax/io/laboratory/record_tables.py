@@ -5,11 +5,12 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from snrmjax.io.files import FilePath, suggestion
+from snrmjax.io.files import FilePath
 from snrmjax.io.rows import header_of, read_cells
 from snrmjax.measure.recordings.channels import Channel, Quantity
 from snrmjax.measure.recordings.time_recording import TimeRecording, time_recording
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.names import suggestion
 
 _COLUMNS: dict[str, Quantity] = {
     "force_n": "force",

@@ -30,48 +30,31 @@ mass_kg = 1e-3
 inertia_kg_m2 = 2e-8                 # optional, about the axis of bending
 """
 
-from collections.abc import Mapping
-from typing import NamedTuple
-
 import numpy as np
 
+from snrmjax.condense.beam_description import (
+    LENGTH,
+    MOST_RISE,
+    POISSON,
+    RADIUS,
+    RISE,
+    SIDES,
+    STIFFNESSES,
+    THICKNESS,
+    BeamDescription,
+    what_is_loose,
+)
+from snrmjax.condense.beam_models import BeamModels
+from snrmjax.condense.beam_source import beam_source
+from snrmjax.condense.reduction import ReductionSource, run_load_cases
 from snrmjax.io.files import FilePath, file_name, read_text
 from snrmjax.io.toml_table import TomlTable, parsed_toml
-from snrmjax.numerics.rules import BELOW_ONE, FRACTION, NOT_NEGATIVE, POSITIVE, Rule
+from snrmjax.numerics.rules import BELOW_ONE, FRACTION, NOT_NEGATIVE, POSITIVE
 
 MOST_ELEMENTS = 400
 SUPPORTS = ("clamped", "pinned", "free")
-SIDES = ("left", "right")
-STIFFNESSES = ("axial_n_m", "transverse_n_m", "rotation_nm_rad")
-
 _TABLES = ("material", "section", "geometry", "supports", "condense", "sensors", "force")
 _POINT_MASS = "point_mass"
-POISSON = Rule("above -1 and below 0.5", lambda value: -1 < value < 0.5)
-MOST_RISE = 0.95  # of the length over twice the radius: an arch below a half circle
-
-
-RISE, RADIUS = "geometry.rise_m", "geometry.radius_m"
-LENGTH, THICKNESS = "geometry.length_m", "section.thickness_m"
-
-
-class BeamDescription(NamedTuple):
-    """A beam or arch as its file says.
-
-    `numbers` have the names of tables and keys ("section.thickness_m"), stiffnesses of a support
-    "supports.left.rotation_nm_rad" (infinite: held) and point masses "point_mass_1.mass_kg". Those
-    that the file does not state are missing.
-    """
-
-    name: str
-    numbers: tuple[tuple[str, float], ...]  # SI units
-    elements: int
-    modes: tuple[int, ...]  # counted from one
-    load_scale: float | None  # thicknesses
-    degree: int
-    damping_ratio: tuple[float, ...] | None  # one a mode; None: not stated
-    sensors: tuple[tuple[str, float], ...]  # names and fractions of the length
-    force_at: float | None  # fraction of the length; None: uniform
-    masses_at: tuple[float, ...] = ()  # fractions of the length
 
 
 def read_beam_description(path: FilePath) -> BeamDescription:
@@ -141,6 +124,32 @@ def read_beam_description(path: FilePath) -> BeamDescription:
     )
 
 
+def read_beam(path: FilePath) -> ReductionSource:
+    """Read a beam and prepare its finite elements, modes and load cases.
+
+    Forces act across the beam; one newton of a uniform force is spread over its whole length.
+    Raises `ValueError` as `read_beam_description` does, and where the elements have no such modes
+    or a sensor or force is at a place that none of them moves.
+    """
+    return beam_source(read_beam_description(path), file_name(path))
+
+
+def read_beam_models(path: FilePath) -> BeamModels:
+    """Read a beam file as a function from its numbers to reduced models.
+
+    Typical use: `models = sj.io.read_beam_models("beam.toml")`, then
+    `models({"section.thickness_m": 0.6e-3})`, alone, within `jax.grad`, in a study, or in
+    `sj.identify.calibrate_to_backbone`.
+    Returns the models. Raises `ValueError` as `read_beam` does, and where no load scale is stated
+    and none is found for the beam of the file.
+    """
+    stated, file = read_beam_description(path), file_name(path)
+    source = beam_source(stated, file)
+    displacement, _ = run_load_cases(source)
+    thickness = dict(stated.numbers)[THICKNESS]
+    return BeamModels(stated, file, tuple((np.asarray(displacement) / thickness).tolist()))
+
+
 def is_beam_file(path: FilePath) -> bool:
     """Whether a TOML describes a beam (and not a model): whether it has a table of one.
 
@@ -148,20 +157,6 @@ def is_beam_file(path: FilePath) -> bool:
     """
     top = parsed_toml(read_text(path), file_name(path))
     return "mode" not in top.entries and any(name in top.entries for name in _TABLES[:5])
-
-
-def what_is_loose(numbers: Mapping[str, float]) -> str | None:
-    """Which rigid-body motion the two supports leave, in words, or nothing."""
-    axial, transverse, rotation = (
-        [numbers[f"supports.{side}.{key}"] for side in SIDES] for key in STIFFNESSES
-    )
-    if not any(axial):
-        return "nothing holds the beam along its axis"
-    if not any(transverse):
-        return "nothing holds the beam across its axis"
-    if not (all(transverse) or any(rotation)):
-        return "nothing keeps the beam from turning"
-    return None
 
 
 def _geometry(geometry: TomlTable, section: TomlTable) -> dict[str, float]:

@@ -43,12 +43,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from snrmjax.condense.load_cases import ReductionBasis, StaticCases
-from snrmjax.io.files import FilePath, read_text, shown, suggestion
-from snrmjax.io.reduction.source import ASSUMED_DAMPING, ReductionSource
+from snrmjax.condense.reduction import ASSUMED_DAMPING, ReductionSource
+from snrmjax.io.files import FilePath, read_text, shown
 from snrmjax.io.rows import Cells, read_cells
+from snrmjax.io.tables import write_table
 from snrmjax.io.toml_table import TomlTable, parsed_toml
 from snrmjax.io.units import HERTZ
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.names import suggestion
 from snrmjax.numerics.rules import BELOW_ONE, IN_RANGE_HZ, NOT_ZERO, POSITIVE
 
 _KEYS = ("name", "numbers", "damping_ratio", "shapes", "mass", "participation", "sensors")
@@ -269,3 +271,25 @@ def _read_table(path: FilePath, stems: tuple[str, ...], single: tuple[str, ...] 
                 raise ValueError(f"{cells.file} lacks the column `{stem}_{k + 1}`.")
     cells.require_rows()
     return _Table(cells, groups)
+
+
+def write_load_cases(path: FilePath, cases: StaticCases) -> None:
+    """Write load cases: `case, f_1…, q_1…[, energy]`, as `--tables` reads them.
+
+    The modes count from one in the order of the reduced model. Fields of a case without solution
+    are empty.
+    """
+    n_cases, n_modes = cases.force.shape
+    force = np.asarray(cases.force)
+    moved = np.where(cases.usable[:, None], cases.modal_displacement, np.nan)
+    columns = {"case": list(cases.names) or [str(k + 1) for k in range(n_cases)]}
+    columns |= {f"f_{m + 1}": _texts(force[:, m]) for m in range(n_modes)}
+    columns |= {f"q_{m + 1}": _texts(moved[:, m]) for m in range(n_modes)}
+    if cases.energy is not None:
+        columns["energy"] = _texts(np.where(cases.usable, cases.energy, np.nan))
+    write_table(path, columns)
+
+
+def _texts(values: np.ndarray) -> list[str]:
+    """Numbers in full, since small differences of them count; an empty field for NaN."""
+    return ["" if np.isnan(value) else repr(value) for value in values.tolist()]

@@ -10,9 +10,9 @@ from matplotlib.ticker import MaxNLocator
 
 from snrmjax.condense.condensation import Condensation
 from snrmjax.condense.load_cases import StaticCases
+from snrmjax.condense.reduction import ShapeLines
 from snrmjax.condense.scale_study import TOLERANCE, LoadScaleStudy
 from snrmjax.condense.static_response import static_displacement
-from snrmjax.io.reduction.source import ShapeLines
 from snrmjax.model.potential import monomial_key
 from snrmjax.report.style import (
     BACKGROUND,

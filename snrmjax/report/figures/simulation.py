@@ -270,7 +270,7 @@ def points_figure(
     `ValueError` without a finite value.
     """
     if not np.isfinite(y).any():
-        raise ValueError(f"there is nothing to show: no {beside.split(' (')[0].lower()} was found.")
+        raise ValueError(f"there is nothing to show: {title} has no finite value.")
     figure, ((axes,),) = panels(COLUMN, 3.4, 1, 1)
     if joined:
         banded(axes, x, y, error, SIMULATED)

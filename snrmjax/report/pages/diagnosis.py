@@ -51,7 +51,7 @@ from snrmjax.report.pages.resonance_table import (
     resonance_rows,
     velocity_unit,
 )
-from snrmjax.report.sentences.diagnose import effect_name
+from snrmjax.report.sentences.diagnose import effect_name, kinds_in_words
 from snrmjax.report.sentences.diagnose import probability_in_words as in_words
 from snrmjax.report.style import PrintedFigure, unit_for, with_unit
 
@@ -295,8 +295,8 @@ def _candidates_section(diagnosis: Diagnosis, shown: Mapping[str, ReportFigure])
         if step
     ]
     rows = [
-        (_OTHER_ANSWERS.get(name) or _answer(name), in_words(value))
-        for name, value in list(diagnosis.probabilities.items())[:_SHOWN]
+        (_OTHER_ANSWERS.get(kinds) or kinds_in_words(kinds), in_words(value))
+        for kinds, value in list(diagnosis.answer.probabilities.items())[:_SHOWN]
     ]
     tables.insert(0, ReportTable(("answer", "probability"), rows, _PROBABILITIES))
     return Section("What else was considered", (), [shown["candidates"]], tables)
@@ -354,10 +354,6 @@ def _unit(kind: str, name: str) -> str:
 
 def _meaning(kind: str, name: str) -> str:
     return effect_class(kind).parameters()[name].meaning or _words(name)
-
-
-def _answer(name: str) -> str:
-    return " with ".join(map(effect_name, name.split("+")))
 
 
 def _words(name: str) -> str:

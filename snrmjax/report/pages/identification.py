@@ -214,6 +214,13 @@ def identification_sentence(identification: Identification, modes: LinearModes) 
     )
 
 
+def linear_mode_row(modes: LinearModes) -> tuple[str, str]:
+    """The mode of interest as the model has it."""
+    j = modes.mode_of_interest
+    linear, damping = float(modes.natural_frequency[j]) / HERTZ, float(modes.damping_ratio[j])
+    return "linear mode", f"{linear:.5g} Hz, {100 * damping:.3g} % damping"
+
+
 def identification_summary(
     identification: Identification, modes: LinearModes, words: CurveWords | None = None
 ) -> Rows:
@@ -233,12 +240,11 @@ def identification_summary(
     def extremes(course: _Course) -> str:
         return " to ".join(f"{course.values[k]:.4g} {at(course, k)}" for k in course.extreme())
 
-    j = modes.mode_of_interest
-    linear = float(modes.natural_frequency[j]) / HERTZ
+    linear = float(modes.natural_frequency[modes.mode_of_interest]) / HERTZ
     change = frequency.values[-1] - frequency.values[0]
     used, every = int(np.sum(np.asarray(points.usable))), len(np.asarray(points.status))
     rows = [
-        ("linear mode", f"{linear:.5g} Hz, {100 * float(modes.damping_ratio[j]):.3g} % damping"),
+        linear_mode_row(modes),
         ("natural frequency (± 95 %)", ends(frequency)),
         ("change over the range", minus(f"{change:+.3g} Hz ({100 * change / linear:+.3g} %)")),
         ("damping ratio (± 95 %)", ends(damping)),

@@ -13,6 +13,7 @@ from snrmjax.report.figures.live import NEEDED, has_bokeh
 from snrmjax.report.figures.state_explorer import state_explorer
 from snrmjax.report.html import Report, ReportTable, Section, write_report
 from snrmjax.report.pages import diagnosis, identified_test, modes
+from snrmjax.report.pages.identification import linear_mode_row
 
 _TAPPED = "A state that is tapped shows its record, where there is one."
 
@@ -81,8 +82,7 @@ def _check(checkup: Checkup) -> str:
 def _report(found: WholeTest, stages: list[_Stage], result: str) -> Report:
     rows = [row for stage in stages for row in stage.report.summary]
     if found.modes is not None:  # which has the linear mode with its errors already
-        of_modes = len(stages[0].report.summary)
-        rows = [*rows[:of_modes], *(row for row in rows[of_modes:] if row[0] != "linear mode")]
+        rows.remove(linear_mode_row(found.identified.model.modes))
     live = None
     if has_bokeh():
         records = found.folded if found.stepped else ()

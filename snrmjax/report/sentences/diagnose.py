@@ -68,8 +68,9 @@ def _times(misfit: float) -> str:
     return f"{misfit:.1f}" if misfit < 10 else f"{misfit:.0f}"
 
 
-def _answer(name: str) -> str:
-    return " with ".join(effect_name(kind) for kind in name.split("+"))
+def kinds_in_words(kinds: Sequence[str]) -> str:
+    """The effects of an answer, or that of none, in words."""
+    return " with ".join(map(effect_name, kinds))
 
 
 def _verdict(
@@ -113,8 +114,8 @@ def _verdict(
     )
 
 
-def _most_probable(*, verdict: float, answers: Sequence[tuple[str, float]]) -> str:
-    listed = ", ".join(f"{_answer(name)} {probability_in_words(p)}" for name, p in answers)
+def _most_probable(*, verdict: float, answers: Sequence[tuple[Sequence[str], float]]) -> str:
+    listed = ", ".join(f"{kinds_in_words(one)} {probability_in_words(p)}" for one, p in answers)
     return f"{probability_in_words(verdict)} of this verdict ({listed})"
 
 
@@ -122,12 +123,12 @@ def _before(
     *,
     verdict: str,
     effects: Sequence[str],
-    probabilities: Sequence[tuple[str, float | None, float]],
+    probabilities: Sequence[tuple[Sequence[str], float | None, float]],
 ) -> str:
     changes = [
-        f"{_answer(name)} "
+        f"{kinds_in_words(kinds)} "
         + (f"now {100 * now:.0f} %" if p is None else f"{100 * p:.0f} % → {100 * now:.0f} %")
-        for name, p, now in probabilities
+        for kinds, p, now in probabilities
     ]
     named = effect_names(effects) or "no effect"
     return (
@@ -290,7 +291,7 @@ SENTENCES: dict[str, Wording] = {
         "with the effects found the gain becomes {gain:.3g} N/V (before: {before:.3g})."
     ),
     "best_as_recorded": lambda *, effects, levels, lead: (
-        f"with the forces as recorded the best answer is {_answer('+'.join(effects) or 'none')}, "
+        f"with the forces as recorded the best answer is {kinds_in_words(effects) or 'none'}, "
         f"and it fits worse than a gain of the force of {level_names(levels)} (Schwarz's "
         f"criterion: by {lead:.0f})."
     ),

@@ -8,7 +8,7 @@ from scipy.optimize import elementwise
 
 from snrmjax.numerics.blocks import taken
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance
-from snrmjax.simulate.continuation.continuation import StepControl, TracedCurve
+from snrmjax.simulate.continuation.continuation import CurveEvent, StepControl, TracedCurve
 from snrmjax.simulate.continuation.events import (
     NewPoint,
     inserted,
@@ -16,7 +16,11 @@ from snrmjax.simulate.continuation.events import (
 )
 from snrmjax.simulate.continuation.stability import MARGIN, floquet_multipliers
 
-BIFURCATIONS = ("branch_point", "period_doubling", "neimark_sacker")
+BIFURCATIONS = (
+    CurveEvent.BRANCH_POINT,
+    CurveEvent.PERIOD_DOUBLING,
+    CurveEvent.NEIMARK_SACKER,
+)
 _FOLDS_OWN = 12  # points from a fold at which its multiplier may cross
 _CROSSING = 5e-7  # of a step, to which the crossing of the circle is located
 
@@ -35,7 +39,7 @@ def with_bifurcations(
     `balance` is stacked, of one member.
     """
     curve = curve._replace(multipliers=multipliers)
-    regular = np.array([k for k, label in enumerate(curve.labels) if "fold" not in label], int)
+    regular = np.flatnonzero([event != CurveEvent.FOLD for event in curve.events])
     outside, beyond_one = _outside(multipliers), _beyond_one(multipliers)
     rest = outside - beyond_one
     crossings, beside_fold, quiet_folds = [], [], []
@@ -145,10 +149,10 @@ def _is_beyond_one(multipliers: np.ndarray) -> np.ndarray:
     return real & (multipliers.real > 1.0 + MARGIN)
 
 
-def _crossing_kind(multipliers: Complex[np.ndarray, " multiplier"]) -> str:
+def _crossing_kind(multipliers: Complex[np.ndarray, " multiplier"]) -> CurveEvent:
     """What kind of bifurcation the multiplier nearest to the unit circle makes."""
     nearest = multipliers[np.argmin(np.abs(np.abs(multipliers) - 1.0))]
     # At a crossing of +1 or −1 two multipliers of a light damped mode may be close by.
     if abs(nearest.imag) > 1e-4:
-        return "neimark_sacker"
-    return "period_doubling" if nearest.real < 0 else "branch_point"
+        return CurveEvent.NEIMARK_SACKER
+    return CurveEvent.PERIOD_DOUBLING if nearest.real < 0 else CurveEvent.BRANCH_POINT

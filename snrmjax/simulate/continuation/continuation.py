@@ -1,6 +1,7 @@
 """Pseudo-arclength continuation of curves of solutions, with steps chosen by curvature."""
 
 from collections.abc import Callable
+from enum import StrEnum
 from typing import NamedTuple, TypeVar
 
 import equinox as eqx
@@ -102,6 +103,18 @@ class Curve(NamedTuple):
     n_solves: Int[Array, ""]  # linear systems factorised on the way
 
 
+class CurveEvent(StrEnum):
+    """What happens at a point of a curve, `NONE` at most of them."""
+
+    NONE = ""
+    FOLD = "fold"
+    PEAK = "peak"
+    PHASE_RESONANCE = "phase_resonance"
+    BRANCH_POINT = "branch_point"
+    PERIOD_DOUBLING = "period_doubling"
+    NEIMARK_SACKER = "neimark_sacker"
+
+
 class TracedCurve(NamedTuple):
     """Points along one curve and what was found at them, on the host."""
 
@@ -109,7 +122,7 @@ class TracedCurve(NamedTuple):
     tangents: Float[np.ndarray, "point unknown"]
     status: CurveStatus = CurveStatus.UPPER_END
     n_solves: int = 0
-    labels: tuple[str, ...] = ()  # events at the points; none before they were looked for
+    events: tuple[CurveEvent, ...] = ()  # at the points; none before they were looked for
     not_located: tuple[str, ...] = ()  # kinds of the events whose place was not found
     multipliers: Complex[np.ndarray, "point multiplier"] | None = None
 

@@ -11,10 +11,10 @@ from snrmjax.numerics.blocks import over_cores, taken
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.lanes import in_lanes, iterated, lanes_for
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance
-from snrmjax.simulate.continuation.continuation import StepControl, TracedCurve, correct
+from snrmjax.simulate.continuation.continuation import CurveEvent, StepControl, TracedCurve, correct
 from snrmjax.simulate.continuation.event_location import Bracket, EventSearch
 
-EVENT_KINDS = ("fold", "peak", "phase_resonance")
+EVENT_KINDS = (CurveEvent.FOLD, CurveEvent.PEAK, CurveEvent.PHASE_RESONANCE)
 _TOGETHER = 64  # steps of Newton's method before the host sees them
 _INSIDE = 7  # points inside an interval that is looked at more closely
 
@@ -200,7 +200,8 @@ def _divided(
     found, tangents, ok = points_between(balances, curves, owner, position, share, steps)
     keep = np.flatnonzero(ok).tolist()
     return inserted(
-        curves, [NewPoint(owner[k], position[k], found[k], tangents[k], "") for k in keep]
+        curves,
+        [NewPoint(owner[k], position[k], found[k], tangents[k], CurveEvent.NONE) for k in keep],
     )
 
 
@@ -278,7 +279,7 @@ class NewPoint(NamedTuple):
     position: int  # the neighbour before it
     point: np.ndarray
     tangent: np.ndarray
-    label: str
+    event: CurveEvent
     multipliers: np.ndarray | None = None
 
 
@@ -295,14 +296,14 @@ def inserted(curves: list[TracedCurve], new: list[NewPoint]) -> list[TracedCurve
         turn = np.where((np.einsum("ku,ku->k", turn, ahead) < 0)[:, None], -turn, turn)
         n = len(curve.points)
         order = np.lexsort((np.append(np.zeros(n), along), np.append(np.arange(n), where)))
-        names = [*curve.labels, *(e.label for e in mine)]
+        events = [*curve.events, *(e.event for e in mine)]
         multipliers = curve.multipliers
         if multipliers is not None:
             multipliers = np.concatenate([multipliers, [e.multipliers for e in mine]])[order]
         result[number] = curve._replace(
             points=np.concatenate([curve.points, points])[order],
             tangents=np.concatenate([curve.tangents, turn])[order],
-            labels=tuple(names[k] for k in order),
+            events=tuple(events[k] for k in order),
             multipliers=multipliers,
         )
     return result

@@ -17,7 +17,12 @@ from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, truncatio
 from snrmjax.simulate.balance.harmonics import velocity_phasors, with_sines
 from snrmjax.simulate.balance.labelled import HERTZ, fundamental_variables
 from snrmjax.simulate.continuation.bifurcations import with_bifurcations
-from snrmjax.simulate.continuation.continuation import CurveStatus, StepControl, TracedCurve
+from snrmjax.simulate.continuation.continuation import (
+    CurveEvent,
+    CurveStatus,
+    StepControl,
+    TracedCurve,
+)
 from snrmjax.simulate.continuation.events import with_events
 from snrmjax.simulate.continuation.stability import (
     Stability,
@@ -75,7 +80,7 @@ class ResponseCurve(MotionCurve):
     """
 
     force: float = setting()  # N
-    event: tuple[str, ...] = quantity(  # "" or what happens at the point; see `forced_response`
+    event: tuple[CurveEvent, ...] = quantity(  # see `forced_response`
         "point", "", "what happens there", static=True
     )
     multipliers: Complex[np.ndarray, "point multiplier"] | None = None  # None: not asked for
@@ -104,7 +109,7 @@ class ResponseCurve(MotionCurve):
 
     def at_events(self, kind: str) -> np.ndarray:
         """Indices of the points at which an event of this kind was located."""
-        return np.array([k for k, e in enumerate(self.event) if kind in e.split("+")], dtype=int)
+        return np.array([k for k, e in enumerate(self.event) if e == kind], dtype=int)
 
     def summary(self) -> tuple[str, ...]:
         """Force, range, largest velocity, stability, events and status."""
@@ -115,7 +120,7 @@ class ResponseCurve(MotionCurve):
             height = np.abs(self.velocity[:, 1])
             k, r = np.unravel_index(np.argmax(height), height.shape)
             hertz = self.frequency / HERTZ
-            events = _counted(kind for e in self.event for kind in e.split("+") if kind)
+            events = _counted(filter(None, self.event))
             lines += [
                 f"frequency {hertz.min():.4g} to {hertz.max():.4g} Hz",
                 f"velocity fundamental up to {height[k, r]:.4g} m/s at"
@@ -158,7 +163,7 @@ def assembled(
     Arguments: `balances` stacked, one for every curve; `steps` with which they were traced.
     """
     labelled = with_events(
-        balances, [c._replace(labels=("",) * len(c.points)) for c in curves], steps
+        balances, [c._replace(events=(CurveEvent.NONE,) * len(c.points)) for c in curves], steps
     )
 
     def finished(number: int) -> ResponseCurve:
@@ -176,7 +181,7 @@ def assembled(
         return ResponseCurve(
             **motions,
             force=float(balance.force),
-            event=curve.labels,
+            event=curve.events,
             status=curve.status,
             multipliers=curve.multipliers,
             truncation=truncation,

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from snrmjax.numerics.facts import Fact
-from snrmjax.study.computations.base import COMPLETE, HIGHEST_AT_END, NO_PEAK
+from snrmjax.study.computations.base import COMPLETE, MemberStatus
 
 if TYPE_CHECKING:
     import xarray
@@ -35,18 +35,15 @@ class Failures(NamedTuple):
     @property
     def n_outside(self) -> int:
         """How many members were computed but have their resonance outside the range."""
-        return sum(self.failed_counts.get(name, 0) for name in (NO_PEAK, HIGHEST_AT_END))
+        outside = MemberStatus.NO_PEAK, MemberStatus.HIGHEST_AT_END
+        return sum(self.failed_counts.get(name, 0) for name in outside)
 
     @property
     def facts(self) -> tuple[Fact, ...]:
         """What to do about members whose resonance is not in the range of a study of peaks."""
         counts = self.failed_counts
-        facts = []
-        if NO_PEAK in counts:
-            facts.append(Fact("no_peak_in_range", n_members=counts[NO_PEAK]))
-        if HIGHEST_AT_END in counts:
-            facts.append(Fact("highest_at_range_end", n_members=counts[HIGHEST_AT_END]))
-        return tuple(facts)
+        outside = MemberStatus.NO_PEAK, MemberStatus.HIGHEST_AT_END
+        return tuple(Fact(name.value, n_members=counts[name]) for name in outside if name in counts)
 
 
 class FailureShare(NamedTuple):

@@ -2,6 +2,7 @@
 
 import abc
 from collections.abc import Mapping, Sequence
+from enum import StrEnum
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -14,10 +15,41 @@ from snrmjax.model.structures import Structure
 MEMBER = "member"
 FORCE = "force_n"
 TEXT = "text"
-COMPLETE = ("upper_end", "lower_end", "closed", "largest_velocity", "solved", "answered")
+
+
+class MemberStatus(StrEnum):
+    """How a member ended, beside the names of `CurveStatus` in small letters."""
+
+    SOLVED = "solved"
+    ANSWERED = "answered"
+    LARGEST_VELOCITY = "largest_velocity"  # was reached, as asked for
+    NO_PEAK = "no_peak_in_range"  # of a response that was traced, like the next two
+    HIGHEST_AT_END = "highest_at_range_end"
+    PEAK_NOT_LOCATED = "peak_not_located"
+    REFUSED = "refused"
+    LOST = "lost"
+
+
+COMPLETE = (
+    *(MemberStatus.SOLVED, MemberStatus.ANSWERED, MemberStatus.LARGEST_VELOCITY),
+    *("upper_end", "lower_end", "closed"),
+)
 """Statuses of members that have their whole result."""
-NO_PEAK, HIGHEST_AT_END = "no_peak_in_range", "highest_at_range_end"
-"""Statuses of members whose response was traced but whose resonance is not in the range."""
+
+
+class Failure(NamedTuple):
+    """Why a member has no result; the store has both in one text."""
+
+    status: MemberStatus
+    reason: str
+
+    def __str__(self) -> str:
+        return f"{self.status}: {self.reason}"
+
+
+def refusal(error: ValueError) -> Failure:
+    """That a member was refused, by the first line of the reason."""
+    return Failure(MemberStatus.REFUSED, str(error).splitlines()[0])
 
 
 class Output(NamedTuple):
@@ -105,13 +137,13 @@ def of_forces(values: OfForces | Sequence[float] | np.ndarray | None) -> OfForce
     return OfForces(None if values is None else np.asarray(values, dtype=np.float64))
 
 
-def blank_rows(outputs: dict[str, Output], sizes: dict[str, int], status: str) -> dict[str, Any]:
-    """Rows of members for which there is nothing but a status."""
+def blank_rows(outputs: dict[str, Output], sizes: dict[str, int], why: Failure) -> dict[str, Any]:
+    """Rows of members for which there is nothing but a failure."""
     rows = {}
     for name, output in outputs.items():
         shape = tuple(sizes.get(dimension, 0) for dimension in output.dimensions)
         if output.kind == TEXT:
-            rows[name] = np.full(shape, status if name == "status" else "")
+            rows[name] = np.full(shape, str(why) if name == "status" else "")
         else:
             rows[name] = np.full(shape, np.nan if output.kind == "f8" else 0, output.kind)
     return rows
@@ -120,16 +152,16 @@ def blank_rows(outputs: dict[str, Output], sizes: dict[str, int], status: str) -
 def with_refused(
     computation: AbstractComputation,
     rows: dict[str, np.ndarray] | None,
-    refused: Mapping[int, str],
+    refused: Mapping[int, Failure],
 ) -> dict[str, np.ndarray]:
-    """Rows of members, with those in between that have nothing but a status.
+    """Rows of members, with those in between that have no result.
 
-    Arguments: `rows` of the others, in order; None: there are none. `refused` are the statuses of
-    the rest by their place among all.
+    Arguments: `rows` of the others, in order; None: there are none. `refused` are the rest
+    by their place among all.
     """
     outputs = computation.outputs()
     sizes = {name: len(axis.values) for name, axis in computation.axes().items()}
-    blanks = [blank_rows(outputs, {MEMBER: 1, **sizes}, status) for status in refused.values()]
+    blanks = [blank_rows(outputs, {MEMBER: 1, **sizes}, why) for why in refused.values()]
     whole = joined([*([] if rows is None else [rows]), *blanks])
     n = len(whole["status"])
     places = [*(k for k in range(n) if k not in refused), *refused]
@@ -159,6 +191,5 @@ class AbstractSingly(AbstractComputation):
             try:
                 parts.append(self.member(jax.device_put(model), force, members.seeds[k]))
             except ValueError as error:
-                reason = str(error).splitlines()[0]
-                parts.append(with_refused(self, None, {0: f"refused: {reason}"}))
+                parts.append(with_refused(self, None, {0: refusal(error)}))
         return joined(parts)

@@ -14,6 +14,7 @@ from snrmjax.study.computations.base import (
     MEMBER,
     TEXT,
     AbstractSingly,
+    MemberStatus,
     Output,
 )
 
@@ -70,7 +71,7 @@ class DampedModes(AbstractModes):
         mode = damped_normal_mode(model, self.largest_velocity, harmonic_order=self.harmonic_order)
         rows = _rows(mode.status, mode.frequency, np.abs(mode.velocity[:, 1, 0]))
         if mode.status == CurveStatus.AMPLITUDE_LIMIT:  # which was asked for: a whole mode
-            rows["status"] = np.array(["largest_velocity"])
+            rows["status"] = np.array([MemberStatus.LARGEST_VELOCITY])
         return {**rows, "point_damping_ratio": mode.damping_ratio}
 
 

@@ -13,12 +13,11 @@ from snrmjax.simulate.continuation.response_curve import ResponseCurve
 from snrmjax.simulate.solutions.forced_response import ResponseSettings, forced_response_batch
 from snrmjax.study.computations.base import (
     COMPLETE,
-    HIGHEST_AT_END,
-    NO_PEAK,
     TEXT,
     AbstractComputation,
     Axis,
     Members,
+    MemberStatus,
     OfForces,
     Output,
     of_forces,
@@ -192,10 +191,10 @@ def peak_status(curves: Sequence[ResponseCurve], status: str) -> str:
     highest = max(np.concatenate(peaks), default=None)
     if highest is None:
         missed = any("peak" in curve.not_located for curve in curves)
-        return "peak_not_located" if missed else NO_PEAK
+        return MemberStatus.PEAK_NOT_LOCATED if missed else MemberStatus.NO_PEAK
     open_ended = [v for v, c in zip(speed, curves, strict=True) if c.status != CurveStatus.CLOSED]
     at_ends = max((max(v[0], v[-1]) for v in open_ended), default=0.0)
-    return HIGHEST_AT_END if at_ends > highest else status
+    return MemberStatus.HIGHEST_AT_END if at_ends > highest else status
 
 
 def velocity_bounds(

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from snrmjax.diagnose.diagnosis import diagnose_model
+from snrmjax.diagnose.evidence import answer_of
 from snrmjax.identify.inference.identification import Identification, identify_backbone
 from snrmjax.identify.pointwise.inversion_result import PointStatus
 from snrmjax.measure.states import SteadyStates
@@ -19,6 +20,7 @@ from snrmjax.study.computations.base import (
     TEXT,
     AbstractSingly,
     Axis,
+    MemberStatus,
     Output,
 )
 from snrmjax.study.computations.responses import ResponseRange
@@ -63,7 +65,7 @@ class AbstractIdentified(AbstractSingly):
             "damping_ratio_std": values.damping_ratio_std,
         }
         return {
-            "status": np.array(["solved"]),
+            "status": np.array([MemberStatus.SOLVED]),
             "n_states": np.array([data.n_states], dtype="i4"),
             "n_solved": np.array([np.sum(status == PointStatus.OK)], dtype="i4"),
             **{name: np.asarray(one)[None] for name, one in row.items()},
@@ -130,12 +132,12 @@ class Diagnoses(AbstractSingly):
     def member(self, model: Structure, force: np.ndarray | None, seed: int) -> dict:
         """See `AbstractSingly.member`."""
         diagnosis = diagnose_model(model, self.data)
-        name = "+".join(diagnosis.effects)
+        answer = answer_of(diagnosis.effects)
         return {
-            "status": np.array(["answered"]),
+            "status": np.array([MemberStatus.ANSWERED]),
             "verdict": np.array([str(diagnosis.verdict.value)]),
-            "effects": np.array([name]),
-            "probability": np.array([diagnosis.probabilities.get(name or "none", np.nan)]),
+            "effects": np.array(["+".join(diagnosis.effects)]),
+            "probability": np.array([diagnosis.answer.probabilities.get(answer, np.nan)]),
             "gap_before": np.array([diagnosis.gap.before]),
             "gap_after": np.array([diagnosis.gap.after]),
         }

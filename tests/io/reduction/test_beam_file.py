@@ -9,12 +9,12 @@ import pytest
 
 import snrmjax as sj
 from snrmjax.cli import main
+from snrmjax.condense.beam_parameters import beam_parameters, check_beam_name
 from snrmjax.io.reduction.beam_file import (
     is_beam_file,
+    read_beam,
     read_beam_description,
 )
-from snrmjax.io.reduction.beam_parameters import beam_parameters, check_beam_name
-from snrmjax.io.reduction.beam_source import read_beam
 
 BEAM = """name = "flat beam"
 [material]

@@ -12,7 +12,7 @@ from snrmjax.model.potential import polynomial_potential
 from snrmjax.model.structures import structure
 from snrmjax.simulate.continuation import bifurcations, events
 from snrmjax.simulate.continuation.bifurcations import BIFURCATIONS, with_bifurcations
-from snrmjax.simulate.continuation.continuation import StepControl, TracedCurve
+from snrmjax.simulate.continuation.continuation import CurveEvent, StepControl, TracedCurve
 from snrmjax.simulate.continuation.curve_tracing import response_balances
 from snrmjax.simulate.continuation.events import EVENT_KINDS
 from snrmjax.simulate.solutions.forced_response import forced_response
@@ -292,7 +292,7 @@ def line_with_a_crossing(monkeypatch, between):
 
     monkeypatch.setattr(bifurcations, "floquet_multipliers", multipliers_at)
     monkeypatch.setattr(bifurcations, "points_between", points_between)
-    curve = TracedCurve(points, np.outer(np.ones(6), [0, 0, 0, 1.0]), labels=("",) * 6)
+    curve = TracedCurve(points, np.outer(np.ones(6), [0, 0, 0, 1.0]), events=(CurveEvent.NONE,) * 6)
     multipliers = multipliers_at(None, None, points[:, -1])
     return with_bifurcations(balance, curve, multipliers, StepControl()), multipliers_at
 
@@ -303,7 +303,7 @@ def test_multipliers_stay_with_their_points_where_two_points_are_one(monkeypatch
         monkeypatch, lambda exact: (np.floor(1e5 * exact) / 1e5, np.ones(len(exact), dtype=bool))
     )
     assert found.points[:, -1].tolist() == [0, 1, 2, 2, 3, 4, 5]
-    assert found.labels.index("period_doubling") in (2, 3)
+    assert found.events.index("period_doubling") in (2, 3)
     wanted = multipliers_at(None, None, found.points[:, -1])
     np.testing.assert_array_equal(found.multipliers, wanted)
 
@@ -328,7 +328,7 @@ def test_a_fold_that_is_not_located_is_named():
     steps = np.diff(points, axis=0)
     tangents = np.concatenate([steps, steps[-1:]])
     tangents /= np.linalg.norm(tangents, axis=1)[:, None]
-    bare = TracedCurve(points, tangents, labels=("",) * len(points))
+    bare = TracedCurve(points, tangents, events=(CurveEvent.NONE,) * len(points))
     (found,) = events.with_events(balances, [bare], StepControl(tolerance=-1.0))
     assert len(found.points) == len(points)
     assert {"fold", "peak", "phase_resonance"} == set(found.not_located)

@@ -183,7 +183,7 @@ def test_multipliers_along_a_response_are_those_of_the_integrated_map(
     kinds = [np.flatnonzero(curve.is_stable), np.flatnonzero(curve.is_unstable)]
     assert all(len(kind) >= 16 for kind in kinds)
     for k in np.concatenate([kind[:: len(kind) // 5] for kind in kinds]):
-        if "fold" in curve.event[k]:  # there the largest multiplier is 1
+        if curve.event[k] == "fold":  # there the largest multiplier is 1
             continue
         truth = time_domain(model, curve.force, curve.frequency[k]).multipliers(
             state_of(curve.coefficients[k], curve.frequency[k])

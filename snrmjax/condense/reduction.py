@@ -1,4 +1,4 @@
-"""What a reduced-order model is made from, wherever it comes from, and what is written of it."""
+"""What a reduced-order model is made from, wherever it comes from."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -13,8 +13,6 @@ from snrmjax.condense.condensation import Condensation
 from snrmjax.condense.load_cases import ReductionBasis, StaticCases
 from snrmjax.condense.load_set import StaticSolver, displacement_for_ratio, modal_loads
 from snrmjax.condense.scale_study import SCALES
-from snrmjax.io.files import FilePath
-from snrmjax.io.tables import write_table
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.facts import Fact
 
@@ -87,25 +85,3 @@ def run_load_cases(
     force: Any = loads.force if traced else np.asarray(loads.force)
     cases = source.solve(force)
     return displacement, dataclasses.replace(cases, names=loads.names)
-
-
-def write_load_cases(path: FilePath, cases: StaticCases) -> None:
-    """Write load cases: `case, f_1…, q_1…[, energy]`, as `--tables` reads them.
-
-    The modes count from one in the order of the reduced model. Fields of a case without solution
-    are empty.
-    """
-    n_cases, n_modes = cases.force.shape
-    force = np.asarray(cases.force)
-    moved = np.where(cases.usable[:, None], cases.modal_displacement, np.nan)
-    columns = {"case": list(cases.names) or [str(k + 1) for k in range(n_cases)]}
-    columns |= {f"f_{m + 1}": _texts(force[:, m]) for m in range(n_modes)}
-    columns |= {f"q_{m + 1}": _texts(moved[:, m]) for m in range(n_modes)}
-    if cases.energy is not None:
-        columns["energy"] = _texts(np.where(cases.usable, cases.energy, np.nan))
-    write_table(path, columns)
-
-
-def _texts(values: np.ndarray) -> list[str]:
-    """Numbers in full, since small differences of them count; an empty field for NaN."""
-    return ["" if np.isnan(value) else repr(value) for value in values.tolist()]

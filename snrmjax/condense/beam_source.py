@@ -1,4 +1,4 @@
-"""A beam file as what a reduced-order model is made from: its finite elements and their modes."""
+"""A beam as what a reduced-order model is made from: its finite elements and their modes."""
 
 from typing import NamedTuple
 
@@ -7,22 +7,20 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from snrmjax.condense.elements.beam import Beam, PointMass, Support
-from snrmjax.condense.elements.beam_modes import beam_modes, participation, shape_at
-from snrmjax.condense.elements.statics import static_cases
-from snrmjax.condense.load_cases import ReductionBasis, StaticCases
-from snrmjax.condense.load_set import StaticSolver
-from snrmjax.io.files import FilePath, file_name
-from snrmjax.io.reduction.beam_file import (
+from snrmjax.condense.beam_description import (
     LENGTH,
     SIDES,
     STIFFNESSES,
     THICKNESS,
     BeamDescription,
-    read_beam_description,
 )
-from snrmjax.io.reduction.beam_parameters import rise_of
-from snrmjax.io.reduction.source import ASSUMED_DAMPING, ReductionSource, ShapeLines
+from snrmjax.condense.beam_parameters import rise_of
+from snrmjax.condense.elements.beam import Beam, PointMass, Support
+from snrmjax.condense.elements.beam_modes import beam_modes, participation, shape_at
+from snrmjax.condense.elements.statics import static_cases
+from snrmjax.condense.load_cases import ReductionBasis, StaticCases
+from snrmjax.condense.load_set import StaticSolver
+from snrmjax.condense.reduction import ASSUMED_DAMPING, ReductionSource, ShapeLines
 from snrmjax.model.modes import have_values
 from snrmjax.numerics.facts import Fact
 
@@ -30,22 +28,12 @@ _BLOCK = 8  # load cases at once
 _NOWHERE = 1e-9  # of the largest shape: a sensor that no mode moves
 
 
-def read_beam(path: FilePath) -> ReductionSource:
-    """Read a beam and prepare its finite elements, modes and load cases.
-
-    Forces act across the beam; one newton of a uniform force is spread over its whole length.
-    Raises `ValueError` as `read_beam_description` does, and where the elements have no such modes
-    or a sensor or force is at a place that none of them moves.
-    """
-    return beam_source(read_beam_description(path), file_name(path))
-
-
 def beam_source(stated: BeamDescription, file: str) -> ReductionSource:
     """Prepare finite elements, modes and load cases of a beam; messages name its `file`.
 
     Beams that differ in numbers alone share their compiled programs. Numbers that are traced
-    (within `jax.jit` and derivatives) are taken as they are. Raises `ValueError` as `read_beam`
-    does.
+    (within `jax.jit` and derivatives) are taken as they are. Raises `ValueError` where the
+    elements have no such modes or a sensor or force is at a place that none of them moves.
     """
     beam = beam_of(stated)
     try:

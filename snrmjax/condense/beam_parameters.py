@@ -7,9 +7,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from snrmjax.condense.elements.beam import rise_of_radius
-from snrmjax.io.files import suggestion
-from snrmjax.io.reduction.beam_file import (
+from snrmjax.condense.beam_description import (
     LENGTH,
     MOST_RISE,
     POISSON,
@@ -21,6 +19,8 @@ from snrmjax.io.reduction.beam_file import (
     BeamDescription,
     what_is_loose,
 )
+from snrmjax.condense.elements.beam import rise_of_radius
+from snrmjax.numerics.names import suggestion
 from snrmjax.numerics.rules import NOT_NEGATIVE, POSITIVE, Rule
 
 _HELD = "it is held there; to vary its stiffness state one, such as {side} = {{ {key} = 1e6 }}"

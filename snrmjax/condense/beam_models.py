@@ -9,17 +9,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from snrmjax.condense.condensation import reduced_model
-from snrmjax.io.files import FilePath, file_name
-from snrmjax.io.reduction.beam_file import THICKNESS, BeamDescription, read_beam_description
-from snrmjax.io.reduction.beam_parameters import (
+from snrmjax.condense.beam_description import THICKNESS, BeamDescription
+from snrmjax.condense.beam_parameters import (
     beam_parameters,
     check_beam_name,
     require_beam,
     with_beam_parameters,
 )
-from snrmjax.io.reduction.beam_source import beam_source
-from snrmjax.io.reduction.source import run_load_cases
+from snrmjax.condense.beam_source import beam_source
+from snrmjax.condense.condensation import reduced_model
+from snrmjax.condense.reduction import run_load_cases
 from snrmjax.model.parameters import parameter_names, with_parameters
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.compiled import compiled
@@ -28,7 +27,7 @@ _FORCE = "force_n"  # of a study: it is no number of the beam
 
 
 class BeamModels(eqx.Module):
-    """Reduced models of a beam by its numbers; make it with `read_beam_models`.
+    """Reduced models of a beam by its numbers; make it with `snrmjax.io.read_beam_models`.
 
     Call it with values by name, as `parameters` has them, to get the model of that beam. The load
     cases keep their size in thicknesses (`displacement`, one number a mode), so that the model is
@@ -81,19 +80,3 @@ def _model(models: BeamModels, values: Mapping[str, Any]) -> Structure:
 
 # One program: step by step, derivatives would compile each step.
 _traced_model = compiled(_model)
-
-
-def read_beam_models(path: FilePath) -> BeamModels:
-    """Read a beam file as a function from its numbers to reduced models.
-
-    Typical use: `models = sj.io.read_beam_models("beam.toml")`, then
-    `models({"section.thickness_m": 0.6e-3})`, alone, within `jax.grad`, in a study, or in
-    `sj.identify.calibrate_to_backbone`.
-    Returns the models. Raises `ValueError` as `read_beam` does, and where no load scale is stated
-    and none is found for the beam of the file.
-    """
-    stated, file = read_beam_description(path), file_name(path)
-    source = beam_source(stated, file)
-    displacement, _ = run_load_cases(source)
-    thickness = dict(stated.numbers)[THICKNESS]
-    return BeamModels(stated, file, tuple((np.asarray(displacement) / thickness).tolist()))
