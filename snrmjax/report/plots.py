@@ -76,15 +76,6 @@ def _curves(values: Any, *, sensor: str = "the sensor") -> Figure:
     )
 
 
-def _harmonics(fit: Any) -> Figure:
-    amplitude = np.abs(np.asarray(fit.amplitude)).reshape(-1, len(fit.harmonic_order))
-    good = amplitude[np.all(np.isfinite(amplitude), axis=1)]
-    words = (f"{len(good)} records", "Harmonic order", "Amplitude (unit of the record)")
-    figure = points_figure(fit.harmonic_order, np.maximum(good.T, 1e-300), *words)
-    figure.axes[0].set_yscale("log")
-    return figure
-
-
 def _force_over_drive(drive: Any, force: Any, std: Any, *, joined: bool = False) -> Figure:
     force, error = np.asarray(force), BAND * np.nan_to_num(np.asarray(std))
     unit = unit_for(force[np.isfinite(force)], "N")
@@ -124,7 +115,6 @@ _FIGURES: dict[str, Callable[..., Figure]] = {
         [one], [], sensor=one.sensor
     ),
     "ForceCalibration": _calibration,
-    "HarmonicFit": _harmonics,
     "Identification": lambda one, **settings: figures.backbone_figure(
         one.points, one.backbone, **settings
     ),
