@@ -85,8 +85,8 @@ def _force_over_drive(drive: Any, force: Any, std: Any, *, joined: bool = False)
     )
 
 
-def _calibration(found: Any, *, largest_drive: float = 1.0) -> Figure:
-    drive = np.linspace(0.0, largest_drive, 50)
+def _calibration(found: Any) -> Figure:
+    drive = np.linspace(0.0, 1.0, 50)
     return _force_over_drive(drive, found.force(drive), found.force_std(drive), joined=True)
 
 

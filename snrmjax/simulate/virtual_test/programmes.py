@@ -304,13 +304,13 @@ def steady_states_of(
         [Channel("force", "force"), Channel("velocity", "velocity"), Channel("drive", "voltage")],
         rate,
     )
-    first = test.steps.first / rate
+    first, dwell = test.steps.first / rate, test.steps.samples / rate
     found = stepped_sine_states(
         *(recording, "force", ["velocity"]),
         harmonic_order=harmonic_order,
         level=level,
         sensors=(modes.sensors[sensor],),
-        frequencies=np.stack([first, first + test.steps.samples / rate, test.steps.frequency], 1),
+        frequencies=list(zip(first, first + dwell, test.steps.frequency, strict=True)),
         drive="drive",
         settle=0.0,
         tolerance=np.inf,
