@@ -1,6 +1,6 @@
 from .condensation import reduced_model
 from .elements.beam import Beam, PointMass, Support, rise_of_radius
-from .elements.beam_modes import base_participation, beam_modes, participation, shape_at
+from .elements.beam_modes import beam_modes, participation, shape_at
 from .elements.statics import StaticStatus, static_cases, static_solutions
 from .load_cases import ReductionBasis, StaticCases
 from .load_set import displacement_for_ratio, modal_loads
@@ -15,7 +15,6 @@ __all__ = [
     "StaticCases",
     "StaticStatus",
     "Support",
-    "base_participation",
     "beam_modes",
     "displacement_for_ratio",
     "fit_potential",

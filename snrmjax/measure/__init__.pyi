@@ -1,7 +1,6 @@
 from .base_excitation import base_excited_states
 from .equivalent_force import EquivalentForce, equivalent_force
 from .force_calibration import ForceCalibration, apply_calibration, calibrate_force
-from .harmonic_fit import HarmonicFit, fit_harmonics, phasor_relative_to_force
 from .indicators import appropriation_of, nnm_appropriation
 from .recordings.channels import Channel
 from .recordings.frequency_responses import FrequencyResponses, frequency_responses
@@ -9,7 +8,6 @@ from .recordings.multisine import MultisineResponses, multisine_responses
 from .recordings.ring_down import find_ring_downs
 from .recordings.stepped_sine import SteppedSineStates, stepped_sine_states
 from .recordings.time_recording import TimeRecording, time_recording
-from .records import steady_state_from_records
 from .signals import force_velocity_loop, peak_amplitude, synthesise
 from .states import SteadyStates, join_steady_states, steady_states
 from .sweeps.slow_sweep import SweptStates, sweep_states
@@ -20,7 +18,6 @@ __all__ = [
     "EquivalentForce",
     "ForceCalibration",
     "FrequencyResponses",
-    "HarmonicFit",
     "MultisineResponses",
     "SteadyStates",
     "SteppedSineStates",
@@ -32,15 +29,12 @@ __all__ = [
     "calibrate_force",
     "equivalent_force",
     "find_ring_downs",
-    "fit_harmonics",
     "force_velocity_loop",
     "frequency_responses",
     "join_steady_states",
     "multisine_responses",
     "nnm_appropriation",
     "peak_amplitude",
-    "phasor_relative_to_force",
-    "steady_state_from_records",
     "steady_states",
     "stepped_sine_states",
     "sweep_bias",

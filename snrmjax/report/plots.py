@@ -76,15 +76,6 @@ def _curves(values: Any, *, sensor: str = "the sensor") -> Figure:
     )
 
 
-def _harmonics(fit: Any) -> Figure:
-    amplitude = np.abs(np.asarray(fit.amplitude)).reshape(-1, len(fit.harmonic_order))
-    good = amplitude[np.all(np.isfinite(amplitude), axis=1)]
-    words = (f"{len(good)} records", "Harmonic order", "Amplitude (unit of the record)")
-    figure = points_figure(fit.harmonic_order, np.maximum(good.T, 1e-300), *words)
-    figure.axes[0].set_yscale("log")
-    return figure
-
-
 def _force_over_drive(drive: Any, force: Any, std: Any, *, joined: bool = False) -> Figure:
     force, error = np.asarray(force), BAND * np.nan_to_num(np.asarray(std))
     unit = unit_for(force[np.isfinite(force)], "N")
@@ -94,8 +85,8 @@ def _force_over_drive(drive: Any, force: Any, std: Any, *, joined: bool = False)
     )
 
 
-def _calibration(found: Any, *, largest_drive: float = 1.0) -> Figure:
-    drive = np.linspace(0.0, largest_drive, 50)
+def _calibration(found: Any) -> Figure:
+    drive = np.linspace(0.0, 1.0, 50)
     return _force_over_drive(drive, found.force(drive), found.force_std(drive), joined=True)
 
 
@@ -124,7 +115,6 @@ _FIGURES: dict[str, Callable[..., Figure]] = {
         [one], [], sensor=one.sensor
     ),
     "ForceCalibration": _calibration,
-    "HarmonicFit": _harmonics,
     "Identification": lambda one, **settings: figures.backbone_figure(
         one.points, one.backbone, **settings
     ),

@@ -19,7 +19,6 @@ from .solutions.time_integration import (
     settled_motion,
     stepped_motions,
 )
-from .virtual_test.controlled_test import phase_controlled_test
 from .virtual_test.equipment import Instruments, Shaker
 from .virtual_test.laboratory import AbstractController, Laboratory, run_test
 from .virtual_test.phase_loop import LoopGains, phase_sweep
@@ -66,7 +65,6 @@ __all__ = [
     "normal_mode_at_velocities",
     "periodic_motion",
     "phase_controlled",
-    "phase_controlled_test",
     "phase_resonance_test",
     "phase_sweep",
     "response_controlled",

@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from truths.derivatives import check_derivatives, numbers
@@ -11,11 +10,9 @@ import snrmjax as sj
 
 ORDERS = (0, 1, 2, 3)
 OMEGA = 2 * np.pi * 20.0
-TIME = np.linspace(0.0, 0.21, 64)
+TIME = np.linspace(0.0, 0.21, 64)[:5]
 RNG = np.random.default_rng(3)
 AMPLITUDES = RNG.normal(size=(3, 4)) + 1j * RNG.normal(size=(3, 4))
-RECORDS = np.asarray(sj.measure.synthesise(AMPLITUDES.real + 0j, ORDERS, OMEGA, TIME))
-RECORDS = RECORDS + 0.01 * RNG.normal(size=RECORDS.shape)
 
 
 def moved(relative):
@@ -25,13 +22,10 @@ def moved(relative):
 
 def of_signals(relative):
     amplitudes = moved(relative[:12])
-    time = TIME[:5]
     loop = sj.measure.force_velocity_loop(2.0, amplitudes, ORDERS, n_points=5)
     return numbers(
-        sj.measure.synthesise(amplitudes, ORDERS, OMEGA * (1 + relative[12]), time),
+        sj.measure.synthesise(amplitudes, ORDERS, OMEGA * (1 + relative[12]), TIME),
         sj.measure.peak_amplitude(amplitudes, ORDERS),
-        # But for the fundamental, which is real then.
-        sj.measure.phasor_relative_to_force(amplitudes, amplitudes[:, 1], ORDERS)[:, 2:],
         loop.velocity,
         loop.mean_power,
     )
@@ -69,27 +63,6 @@ def test_indicators(broken):
     )
     # State 1 fails, but for its harmonics, which count.
     check_derivatives(of_indicators, 7, data, failed=[] if broken is None else [1, 4])
-
-
-def moved_records(relative, records):
-    """Records with other sizes and, all of them, with more of a harmonic."""
-    shape = 1 + relative[3] * jnp.cos(3 * OMEGA * TIME)
-    return jnp.where(jnp.isnan(records), jnp.nan, RECORDS * (1 + relative[:3, None]) * shape)
-
-
-def of_fits(relative, records):
-    frequency = OMEGA * (1 + 1e-3 * relative[4])
-    fit = sj.measure.fit_harmonics(TIME, moved_records(relative, records), frequency, (1, 2, 3))
-    stated = (fit.covariance[..., 1, 1], fit.amplitude_std[..., 1:], fit.phase_std[..., 1:])
-    return numbers(fit.amplitude, *stated, fit.noise_std, fit.residual_rms)
-
-
-@pytest.mark.parametrize("broken", [False, True])
-def test_harmonic_fits(broken):
-    records = RECORDS.copy()
-    if broken:
-        records[1, 5] = np.nan
-    check_derivatives(of_fits, 5, records, failed=[1] if broken else [])
 
 
 def of_calibrations(relative, drive, data):

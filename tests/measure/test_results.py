@@ -1,22 +1,9 @@
-"""What the results of records and of a force calibration say, label and show."""
+"""What the results of a force calibration say, label and show."""
 
 import numpy as np
 from matplotlib.figure import Figure
 
 import snrmjax as sj
-
-OMEGA = 2 * np.pi * 20.0
-TIME = np.linspace(0.0, 0.21, 64)
-
-
-def test_a_harmonic_fit():
-    records = np.stack([2.0 * np.cos(OMEGA * TIME), np.full(64, np.nan)])
-    fit = sj.measure.fit_harmonics(TIME, records, OMEGA, (1, 2))
-    data = fit.to_xarray()
-    assert data.frequency_hz.attrs["units"] == "Hz"
-    np.testing.assert_allclose(data.amplitude_re.sel(record=0, harmonic=1), 2.0)
-    assert data.status.values.tolist() == ["successful", "not_finite"]
-    assert isinstance(fit.plot(), Figure)
 
 
 def test_a_force_calibration():

@@ -61,34 +61,34 @@ def test_some_states_by_mask_and_by_rows(rows):
     np.testing.assert_array_equal(some.velocity, [[0.6], [0.6 + 0.2j]])
 
 
-def test_records_joined_written_and_read_back(tmp_path):
+def test_records_written_and_read_back(tmp_path):
     """What was recorded is what a file gives back: V = Ae^{iφ} at every level, known exactly."""
-    time = np.linspace(0.0, 0.5, 2000)
+    rate, dwell = 4000.0, 2000  # samples a level: two steps
     truth = {1: 0.2 * np.exp(0.1j), 2: 0.4 * np.exp(-0.3j), 3: 0.5 * np.exp(0.05j)}
     third = {level: 0.01 * level * np.exp(0.7j) for level in truth}
-    parts = []
-    for level, velocity in truth.items():
-        force = level * np.cos(OMEGA * time + 0.4)
-        record = np.real(
-            velocity * np.exp(1j * (OMEGA * time + 0.4))
-            + third[level] * np.exp(3j * (OMEGA * time + 0.4))
-        )
-        parts.append(
-            sj.measure.steady_state_from_records(
-                time, force, record, OMEGA, level=level, harmonic_order=(1, 3), sensors=("tip",)
-            )
-        )
-    joined = sj.measure.join_steady_states(parts)
-    sj.io.write_steady_states(tmp_path / "measured.csv", joined)
+    turn = np.exp(1j * (OMEGA * np.arange(3 * dwell) / rate + 0.4))
+    level = np.repeat(list(truth), dwell)
+    velocity = np.repeat(list(truth.values()), dwell) * turn
+    velocity = velocity + np.repeat(list(third.values()), dwell) * turn**3
+    channels = [sj.measure.Channel("CH1", "force"), sj.measure.Channel("CH2", "velocity")]
+    record = sj.measure.time_recording(np.stack([level * turn, velocity]).real, channels, rate)
+    found = sj.measure.stepped_sine_states(
+        *(record, "CH1", ["CH2"]),
+        harmonic_order=(1, 3),
+        sensors=["tip"],
+        frequencies=[(0.25 * k, 0.25 * (k + 1), OMEGA) for k in range(6)],
+        settle=0.0,
+    )
+    sj.io.write_steady_states(tmp_path / "measured.csv", found.states)
     again = sj.io.read_steady_states(tmp_path / "measured.csv")
     assert again.sensors == ("tip",)
     assert again.harmonic_order == (3,)
-    np.testing.assert_array_equal(again.level, list(truth))
+    np.testing.assert_array_equal(again.level, [1, 1, 2, 2, 3, 3])
     np.testing.assert_allclose(again.frequency, OMEGA, rtol=1e-14)
     # The fit of records free of noise ends at rounding of Ωt, about 1e-12.
-    np.testing.assert_allclose(again.force, [1.0, 2.0, 3.0], rtol=1e-10)
-    np.testing.assert_allclose(again.velocity[:, 0], list(truth.values()), rtol=1e-10)
-    np.testing.assert_allclose(again.harmonics[:, 0, 0], list(third.values()), rtol=1e-9)
+    np.testing.assert_allclose(again.force, again.level, rtol=1e-10)
+    np.testing.assert_allclose(again.velocity[::2, 0], list(truth.values()), rtol=1e-10)
+    np.testing.assert_allclose(again.harmonics[::2, 0, 0], list(third.values()), rtol=1e-9)
 
 
 class TestSaying:
@@ -142,12 +142,6 @@ def test_lists_and_arrays_are_alike():
         for verb in (sj.measure.peak_amplitude, sj.measure.nnm_appropriation):
             as_list, as_array = verb(amplitudes, given), verb(np.array(amplitudes), orders)
             np.testing.assert_array_equal(as_list, as_array)
-    time = np.linspace(0.0, 0.5, 200)
-    record = np.cos(OMEGA * time)
-    state = sj.measure.steady_state_from_records(
-        list(time), list(record), [list(record)], OMEGA, harmonic_order=[1, 3]
-    )
-    np.testing.assert_allclose(state.force, 1.0, rtol=1e-9)
     points = sj.identify.invert_phasor([6.0], [500.0], [0.6 + 0.0j], [0.0])
     np.testing.assert_allclose(points.natural_frequency, [500.0])
     np.testing.assert_allclose(sj.identify.closed_form([6.0], [500.0], [0.6 + 0.0j])[1], [0.01])

@@ -2,22 +2,16 @@
 
 import numpy as np
 import pytest
+from truths.duffing import CUBIC, MASS, RATIO, REST, beam
 
 import snrmjax as sj
 from snrmjax.methods import MethodStatus
 
-REST, RATIO, CUBIC = 2 * np.pi * 40.0, 0.01, 3e9  # cubic in 1/(m² s²)
-MASS = 0.8
-
 
 @pytest.fixture(scope="module")
 def laboratory():
-    shape = 1 / np.sqrt(MASS)
-    modes = sj.model.linear_modes([REST], [RATIO], [[shape]], [shape])
-    potential = sj.model.polynomial_potential({"1111": CUBIC * shape**2 / 4}, 1)
     shaker = sj.simulate.Shaker(3.0, 8.0, mass=0.05, damping=1.0, stiffness=500.0)
-    beam = sj.model.structure(modes, potential)
-    return sj.simulate.Laboratory(beam, shaker, sj.simulate.Instruments(), 6000.0)
+    return sj.simulate.Laboratory(beam(), shaker, sj.simulate.Instruments(), 6000.0)
 
 
 def stiffness(velocity, omega):

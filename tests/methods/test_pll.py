@@ -2,21 +2,16 @@
 
 import numpy as np
 import pytest
+from truths import duffing
+from truths.duffing import CUBIC, RATIO, REST
 
 import snrmjax as sj
 from snrmjax.methods import MethodStatus
 
-REST, RATIO, CUBIC = 2 * np.pi * 40.0, 0.01, 3e9  # cubic per unit of modal mass, 1/(m² s²)
-MASS = 0.8
-
 
 @pytest.fixture(scope="module")
 def beam():
-    shape = 1 / np.sqrt(MASS)
-    modes = sj.model.linear_modes([REST], [RATIO], [[shape]], [shape])
-    # ẍ + … + β x³ with x = φ q is q̈ + … + β φ² q³: V = β φ² q⁴ / 4.
-    potential = sj.model.polynomial_potential({"1111": CUBIC * shape**2 / 4}, 1)
-    return sj.model.structure(modes, potential)
+    return duffing.beam()
 
 
 def laboratory(beam, **noise):

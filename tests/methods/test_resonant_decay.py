@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 from scipy.special import ellipk
+from truths import duffing
 
 import snrmjax as sj
 
-REST, DAMPING, CUBIC = 2 * np.pi * 40.0, 1.2, 6e9  # rad/s, 1/s, 1/(m² s²)
+REST, DAMPING, CUBIC = duffing.REST, duffing.DECAY_RATE, duffing.DECAY_CUBIC
 READINGS = ("peaks", "zero_crossings", "hilbert")
 # Relative errors of frequency and damping: the analytic signal is wrong by 1/cycles near its ends.
 ACCURACY = {"peaks": (2e-5, 0.025), "zero_crossings": (2e-5, 0.025), "hilbert": (2e-4, 0.04)}
@@ -15,15 +15,7 @@ ACCURACY = {"peaks": (2e-5, 0.025), "zero_crossings": (2e-5, 0.025), "hilbert": 
 
 @pytest.fixture(scope="module")
 def decay():
-    """Duffing's oscillator released at 2 mm: q̈ + D q̇ + ω² q + β q³ = 0, integrated in time."""
-    time = np.arange(0, 2.5, 1 / 4000)
-
-    def rate(_, state):
-        q, v = state
-        return v, -DAMPING * v - REST**2 * q - CUBIC * q**3
-
-    found = solve_ivp(rate, (0, time[-1]), (2e-3, 0.0), t_eval=time, rtol=1e-10, atol=1e-14)
-    return time, found.y[1]
+    return duffing.decay(4000)
 
 
 def free_motion(size):

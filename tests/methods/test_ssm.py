@@ -4,24 +4,17 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.special import ellipj, ellipk
+from truths import duffing
 
 import snrmjax as sj
 from snrmjax.methods.records.normal_form import NormalForm, form_of, seen, unknowns_of
 
-REST, DAMPING, CUBIC = 2 * np.pi * 40.0, 1.2, 6e9  # rad/s, 1/s, 1/(m² s²)
+REST, DAMPING, CUBIC = duffing.REST, duffing.DECAY_RATE, duffing.DECAY_CUBIC
 
 
 @pytest.fixture(scope="module")
 def decay():
-    """Duffing's oscillator released at 2 mm: q̈ + D q̇ + ω² q + β q³ = 0, integrated in time."""
-    time = np.arange(0, 2.5, 1 / 2000)
-
-    def rate(_, state):
-        q, v = state
-        return v, -DAMPING * v - REST**2 * q - CUBIC * q**3
-
-    found = solve_ivp(rate, (0, time[-1]), (2e-3, 0.0), t_eval=time, rtol=1e-10, atol=1e-14)
-    return time, found.y[1]
+    return duffing.decay(2000)
 
 
 def exact():

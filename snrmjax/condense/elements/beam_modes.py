@@ -129,14 +129,6 @@ def participation(
     return shape_at(beam, basis, at)
 
 
-def base_participation(beam: Beam, basis: ReductionBasis) -> Float[Array, " mode"]:
-    """ΦᵀM1 of a motion of the ground across the chord, kg^1/2.
-
-    An acceleration a of the ground forces mode r by −Γ_r a, and Γ_r² is its effective mass (kg).
-    """
-    return basis.filter @ jnp.asarray(np.arange(beam.n_dof) % 3 == 1, dtype=jnp.float64)
-
-
 def _check_fraction(fraction: float) -> None:
     if not 0 <= fraction <= 1:
         raise ValueError(f"a place must be a fraction of the length, but is {fraction:g}.")

@@ -26,6 +26,7 @@ from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.least_squares import inverse_of
 
 _LISTED = 8  # sources on one screen
+_AMPLITUDES = 25  # at which shares are taken
 
 
 class Contribution(NamedTuple):
@@ -96,7 +97,7 @@ def _bend_slopes(fit: JointFit) -> Float[np.ndarray, "row unknown"]:
     return slopes
 
 
-def contributions(fit: JointFit, *, n_amplitudes: int = 25) -> Contributions:
+def contributions(fit: JointFit) -> Contributions:
     """What noise, every level's errors and every linear parameter add to the bands of both curves.
 
     To first order, as the fit's own covariance: (JᵀJ)⁻¹ = Σ (dθ/dy σ)² over every error y, with
@@ -114,7 +115,7 @@ def contributions(fit: JointFit, *, n_amplitudes: int = 25) -> Contributions:
     points = jacobian[: 2 * len(problem.data.level)].reshape(-1, 2, p)[:n]
     by_state = np.einsum("pq,siq,sie->pse", inverse, points, by_error) * np.asarray(fit.data.std)
     measured = np.asarray(fit.motion().displacement)
-    at = np.linspace(measured.min(), measured.max(), n_amplitudes)
+    at = np.linspace(measured.min(), measured.max(), _AMPLITUDES)
     slopes = values_at_displacement(fit, at).slopes
 
     rows: list[tuple[str, str, np.ndarray]] = []

@@ -148,7 +148,6 @@ def _identify(
         alternative_damping_ratio=solved.alternative_damping_ratio,
         sensitivity=sensitivity,
         relative_std=filtered_std,
-        linear_variance=linear_variance,
         filter_residual=jnp.where(sound, filter_residual, jnp.nan),
         status=jnp.where(usable, solved.status, status),
         sensor=modes.sensors[r],

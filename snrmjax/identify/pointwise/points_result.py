@@ -41,7 +41,6 @@ class BackbonePoints(AbstractResult):
     alternative_damping_ratio: Float[Array, " state"]
     sensitivity: Float[Array, "state output input"]  # of ω̃², 2ζ̃ω̃, log amplitude to `INPUTS`
     relative_std: Float[Array, "state input"]  # 1σ of `INPUTS`
-    linear_variance: Float[Array, "state output"]  # from the other linear modes' stated errors
     filter_residual: Float[Array, " state"]  # part of the mode's motion that its shape misses
     status: Int[Array, " state"] = quantity("state", "", "outcome", of=PointStatus)
     sensor: str = setting()

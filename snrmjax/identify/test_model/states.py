@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Complex, Float, Int
+from jaxtyping import Complex, Float, Int
 
 from snrmjax.identify.test_model.priors import FORCE_TO_VELOCITY
 
@@ -51,17 +51,6 @@ class TestStates(NamedTuple):
     def amplitude(self) -> Float[np.ndarray, " state"]:
         """Displacement amplitudes, m."""
         return np.abs(self.velocity) / self.frequency
-
-    def some(self, keep: Bool[np.ndarray, " state"]) -> "TestStates":
-        """Some of the states, their levels as they were counted."""
-        rows = {
-            name: getattr(self, name)[keep]
-            for name in ("level", "frequency", "force", "velocity", "errors")
-        }
-        if isinstance(self.trend, np.ndarray):
-            rows["trend"] = self.trend[keep]
-        beside = None if self.beside is None else self.beside[keep]
-        return self._replace(**rows, beside=beside)
 
 
 def state_errors(

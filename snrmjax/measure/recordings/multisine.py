@@ -1,8 +1,7 @@
-"""Frequency responses and distortion levels from periodic multisines.
+"""Frequency responses from periodic multisines.
 
 Whatever repeats from period to period is signal, the rest is noise; whatever differs from one
-realisation of random phases to the next beyond noise is nonlinear. A multisine that leaves out some
-lines shows at odd and at even ones among them what an odd and an even nonlinearity do.
+realisation of random phases to the next beyond noise is nonlinear.
 
 Reference: R. Pintelon & J. Schoukens, System Identification: A Frequency Domain Approach, 2nd ed.
 (2012), section 4.3 (robust and fast method for the best linear approximation).
@@ -12,7 +11,7 @@ from collections.abc import Sequence
 from typing import ClassVar, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Complex, Float
+from jaxtyping import Complex, Float
 
 from snrmjax.measure.recordings.channels import Channel, channel_number
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses, frequency_responses
@@ -29,40 +28,28 @@ _OFF = 0.05  # samples by which a period may miss a whole number
 
 
 class MultisineResponses(AbstractResult):
-    """Best linear approximation of multisine tests, its errors and distortion levels.
+    """Best linear approximation of multisine tests, and its errors.
 
     Standard deviations are rms of the complex errors of the means. `total_std` holds nonlinear
-    scatter from realisation to realisation too; NaN for one realisation. Levels at detection lines
-    (not excited, within the excited band) are peak amplitudes in SI units of the responses.
+    scatter from realisation to realisation too; NaN for one realisation.
     """
 
-    coordinates: ClassVar[tuple[str, ...]] = ("frequency_hz", "line_hz", "response")
+    coordinates: ClassVar[tuple[str, ...]] = ("frequency_hz", "response")
 
     responses: FrequencyResponses
-    output: Float[np.ndarray, "response frequency"]  # amplitudes at the excited lines
-    # Whether a detection line is an odd multiple of 1/period.
-    odd: Bool[np.ndarray, " line"]
     noise_std: Float[np.ndarray, "response frequency"] = quantity(
         "response frequency_hz", "SI", "error by noise"
     )
     total_std: Float[np.ndarray, "response frequency"] = quantity(
         "response frequency_hz", "SI", "error by noise and nonlinearity"
     )
-    line: Float[np.ndarray, " line"] = quantity("line_hz", "Hz", "detection line")
-    distortion: Float[np.ndarray, "response line"] = quantity(
-        "response line_hz", "SI", "amplitude at the line"
-    )
-    distortion_noise: Float[np.ndarray, "response line"] = quantity(
-        "response line_hz", "SI", "1σ of noise at the line"
-    )
     period: float = setting()  # s
     periods: int = setting()  # used of each realisation
     realisations: int = setting()
 
     def summary(self) -> tuple[str, ...]:
-        """Lines, noise and distortion."""
+        """Lines, noise and scatter."""
         hertz = self.responses.frequency / HERTZ
-        size = np.sqrt(np.mean(self.output**2))
         lines = [
             f"MultisineResponses: {len(hertz)} lines, {hertz[0]:.6g} to {hertz[-1]:.6g} Hz, "
             f"{self.periods} periods of {self.period:.4g} s, {self.realisations} realisations",
@@ -71,15 +58,6 @@ class MultisineResponses(AbstractResult):
         if self.realisations > 1:
             share = 100 * _relative(self.total_std, self.responses.values)
             lines.append(f"noise and nonlinear scatter {share:.2g} %")
-        for name, chosen in (("odd", self.odd), ("even", ~self.odd)):
-            if chosen.any():
-                level, noise = (
-                    20 * np.log10(max(np.sqrt(np.mean(part[:, chosen] ** 2)) / size, 1e-16))
-                    for part in (self.distortion, self.distortion_noise)
-                )
-                lines.append(
-                    f"{name} distortion {level:.1f} dB of the output, noise {noise:.1f} dB"
-                )
         return tuple(lines)
 
     def variables(self) -> dict[str, Variable]:
@@ -94,7 +72,6 @@ class MultisineResponses(AbstractResult):
             "frequency_hz": linear["frequency_hz"],
             **values,
             **super().variables(),
-            "odd": Variable(("line_hz",), self.odd, "", "odd line"),
         }
 
 
@@ -141,27 +118,18 @@ def multisine_responses(
     total = (
         np.sqrt(np.maximum(scatter, noise_std**2)) if count > 1 else np.full_like(scatter, np.nan)
     )
-    detection = np.setdiff1d(np.arange(excited[0], excited[-1] + 1), excited)
-    level, floor = _distortion(spectra, mean, excited, detection)
-    turned = HERTZ * rate / samples
     linear = frequency_responses(
-        excited * turned,
+        excited * HERTZ * rate / samples,
         mean[:, None],
         [_in_si(records[0], name) for name in names[1:]],
         [_in_si(records[0], force)],
         averages=periods * count,
         name=records[0].name,
     )
-    output = [np.abs(record.mean[1:, excited]) ** 2 for record in spectra]
     return MultisineResponses(
         responses=linear,
-        output=np.sqrt(np.mean(output, axis=0)),
-        odd=detection % 2 == 1,
         noise_std=noise_std,
         total_std=total,
-        line=detection * turned,
-        distortion=level,
-        distortion_noise=floor,
         period=samples / rate,
         periods=periods,
         realisations=count,
@@ -311,22 +279,3 @@ def _response(spectra: _Spectra, lines: np.ndarray) -> tuple[np.ndarray, np.ndar
         - 2 * np.real(spectra.mixed[1:, lines] * ratio.conj())
     )
     return ratio, np.maximum(variance, 0.0) / np.abs(drive) ** 2 / spectra.periods
-
-
-def _distortion(
-    spectra: list[_Spectra], ratio: np.ndarray, excited: np.ndarray, detection: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Amplitudes at lines that are not excited, without what the force itself has there."""
-    linear = np.array(
-        [
-            np.interp(detection, excited, row.real) + 1j * np.interp(detection, excited, row.imag)
-            for row in ratio
-        ]
-    )
-    squares, noise = [], []
-    for spectrum in spectra:
-        left = spectrum.mean[1:, detection] - linear * spectrum.mean[0, detection]
-        squares.append(np.abs(left) ** 2)
-        noise.append(spectrum.variance[1:, detection] / spectrum.periods)
-    floor = np.mean(noise, axis=0)
-    return np.sqrt(np.mean(squares, axis=0)), np.sqrt(floor)

@@ -13,7 +13,6 @@ from snrmjax.model.structures import Structure
 from snrmjax.numerics.result import AbstractResult, Variable, setting
 from snrmjax.simulate.balance.given_numbers import frequency_range, positive
 from snrmjax.simulate.continuation.response_curve import ResponseCurve
-from snrmjax.simulate.solutions.controlled import ControlledCurve
 from snrmjax.simulate.solutions.forced_response import ResponseSettings, forced_response_batch
 from snrmjax.simulate.virtual_test.appropriation import (
     around,
@@ -54,7 +53,7 @@ class VirtualTest(AbstractResult):
 
     steady_states: SteadyStates
     jumps: tuple[tuple[int, float], ...]  # (level, frequency in rad/s) where a branch ended
-    curves: tuple[ResponseCurve | ControlledCurve, ...]  # the exact responses behind the test
+    curves: tuple[ResponseCurve, ...]  # the exact responses behind the test
     # States aimed at that the test did not reach, or that were not found.
     n_missing: int = setting(default=0)
     # Steps of a time integration that had not settled: none is recorded.

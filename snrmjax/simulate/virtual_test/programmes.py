@@ -18,8 +18,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from snrmjax.measure.records import steady_state_from_records
-from snrmjax.measure.states import SteadyStates, join_steady_states
+from snrmjax.measure.recordings.channels import Channel
+from snrmjax.measure.recordings.stepped_sine import stepped_sine_states
+from snrmjax.measure.recordings.time_recording import time_recording
+from snrmjax.measure.states import SteadyStates
 from snrmjax.model.modes import reference_sensor
 from snrmjax.simulate.balance.given_numbers import positive
 from snrmjax.simulate.virtual_test.laboratory import (
@@ -283,10 +285,10 @@ def steady_states_of(
     level: int = 1,
     harmonic_order: tuple[int, ...] = (1, 2, 3),
 ) -> SteadyStates:
-    """The steady states of a stepped sine: harmonics fitted to the settled part of every step.
+    """The steady states of a stepped sine, from the part of every step that was kept.
 
-    Arguments: `level` that they all belong to; `harmonic_order` as in `steady_state_from_records`.
-    Returns `SteadyStates` of the reference sensor, with the standard deviations of the fits: a step
+    Arguments: `level` that they all belong to; `harmonic_order` as in `stepped_sine_states`.
+    Returns `SteadyStates` of the reference sensor, one a step, with standard deviations: a step
     that has not settled, or on which the motion jumps, has a large one.
     Raises `ValueError` for a test without steps, and for a step that cannot be fitted.
     """
@@ -296,21 +298,24 @@ def steady_states_of(
     sensor, j = reference_sensor(modes), modes.mode_of_interest
     # Records have the sign in which force and velocity agree; states have the model's.
     turn = float(np.sign(modes.mode_shape[sensor, j] * modes.participation[j]))
-    time, force, velocity = (
-        np.asarray(column) for column in (test.record.time, test.record.force, test.record.velocity)
+    record, rate = test.record, laboratory.sampling_rate
+    recording = time_recording(
+        np.stack([record.force, turn * record.velocity, record.voltage]),
+        [Channel("force", "force"), Channel("velocity", "velocity"), Channel("drive", "voltage")],
+        rate,
     )
-    found = []
-    for omega, first in zip(test.steps.frequency, test.steps.first, strict=True):
-        part = slice(int(first), int(first) + test.steps.samples)
-        found.append(
-            steady_state_from_records(
-                time[part],
-                force[part],
-                turn * velocity[part],
-                float(omega),
-                level=level,
-                harmonic_order=harmonic_order,
-                sensors=(modes.sensors[sensor],),
-            )
-        )
-    return join_steady_states(found)
+    first, dwell = test.steps.first / rate, test.steps.samples / rate
+    found = stepped_sine_states(
+        *(recording, "force", ["velocity"]),
+        harmonic_order=harmonic_order,
+        level=level,
+        sensors=(modes.sensors[sensor],),
+        frequencies=list(zip(first, first + dwell, test.steps.frequency, strict=True)),
+        drive="drive",
+        settle=0.0,
+        tolerance=np.inf,
+    )
+    if found.states.n_states < len(first):
+        reasons = ", ".join(f"{count} {reason}" for reason, count in found.counts.reasons)
+        raise ValueError(f"not every step of `test` can be fitted: {reasons}.")
+    return found.states

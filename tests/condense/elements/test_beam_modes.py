@@ -8,7 +8,6 @@ from scipy.optimize import brentq
 
 from snrmjax.condense.elements.beam import Beam, PointMass, Support, rise_of_radius
 from snrmjax.condense.elements.beam_modes import (
-    base_participation,
     beam_modes,
     participation,
     shape_at,
@@ -54,16 +53,14 @@ def test_a_mass_at_the_tip_lowers_the_frequency():
     assert abs(found / exact - 1) < 8e-5
 
 
-def test_participation_and_base_motion_of_a_pinned_beam():
-    # φ = √(2/m) sin πx/L: uniform force 2/π, base motion m times it.
+def test_participation_of_a_pinned_beam():
+    # φ = √(2/m) sin πx/L: uniform force 2/π.
     beam = _beam(left="pinned", right="pinned")
     basis = beam_modes(beam, (1,))
     peak = np.sqrt(2 / (_MASS * _L))
     np.testing.assert_allclose(shape_at(beam, basis, 0.5), [peak], rtol=2e-5)
     np.testing.assert_allclose(participation(beam, basis), [2 / np.pi * peak], rtol=2e-5)
     np.testing.assert_allclose(participation(beam, basis, 0.25), [peak / 2**0.5], rtol=2e-5)
-    moved = base_participation(beam, basis)
-    np.testing.assert_allclose(moved, [2 / np.pi * peak * _MASS * _L], rtol=2e-5)
     np.testing.assert_allclose(basis.filter @ basis.shapes, [[1.0]], rtol=1e-12)
 
 

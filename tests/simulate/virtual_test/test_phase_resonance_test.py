@@ -11,7 +11,6 @@ from snrmjax.model.beams import CURVED_BEAM_FORCES, curved_beam
 from snrmjax.model.effects import make_effect
 from snrmjax.model.modes import RigidBodyModes, linear_modes, linear_response
 from snrmjax.model.structures import structure
-from snrmjax.simulate.virtual_test.controlled_test import phase_controlled_test
 from snrmjax.simulate.virtual_test.phase_resonance_test import (
     SweepSimulation,
     _swept,
@@ -361,58 +360,11 @@ def test_in_time_a_test_jumps_and_records_what_is_settled(exact):
         assert np.abs(left - frequency).min() < 2 * step
 
 
-# ---------------------------------------------------------------------------- under a controller
-
-
-def test_a_phase_locked_loop_on_a_linear_structure_is_the_closed_form():
-    wanted = np.array([0.6, 0.0, -0.6])
-    test = phase_controlled_test(curved_beam(), TINY, wanted)
-    states, modes = test.steady_states, curved_beam().modes
-    assert states.level.tolist() == [1] * 3 + [2] * 3
-    # The nonlinear terms are 1e-7 of it, as above.
-    np.testing.assert_allclose(phases(states), np.tile(wanted, 2), atol=1e-9)
-    np.testing.assert_array_equal(states.force, np.repeat(TINY, 3))
-    own, ratio = float(modes.natural_frequency[0]), float(modes.damping_ratio[0])
-    # tan φ = (ω² − Ω²)/(2ζωΩ)
-    slope = ratio * own * np.tan(wanted)
-    np.testing.assert_allclose(
-        states.frequency, np.tile(np.sqrt(own**2 + slope**2) - slope, 2), rtol=1e-6
-    )
-    np.testing.assert_allclose(
-        states.velocity, linear_response(modes, states.frequency, states.force), rtol=1e-5
-    )
-
-
-def test_a_phase_locked_loop_records_what_jumps_leave_out(exact):
-    test = phase_controlled_test(curved_beam(), FORCES, [0.5, 0.0, -0.5])
-    states = test.steady_states
-    # The curve at +0.5 rad turns back at 0.26 mN: a rising force does not get to the second level.
-    rising = test.curves[0].force
-    assert rising[np.argmax(np.diff(rising) < 0)] < FORCES[1]
-    np.testing.assert_allclose(phases(states), [0.5, 0.0, -0.5, 0.0, -0.5], atol=1e-9)
-    assert states.level.tolist() == [1, 1, 1, 2, 2]
-    unstable = 0
-    for k in range(5):
-        # On the forced response, where the phase passes the one asked for.
-        curve = exact.curves[int(states.level[k]) - 1]
-        phase, target = np.angle(curve.velocity[:, 1, 0]), phases(states)[k]
-        passed = np.flatnonzero((phase[:-1] - target) * (phase[1:] - target) <= 0)
-        share = (target - phase[passed]) / (phase[passed + 1] - phase[passed])
-        on = curve.frequency[passed] * (1 - share) + curve.frequency[passed + 1] * share
-        place = passed[np.argmin(np.abs(on - states.frequency[k]))]
-        # Linear interpolation over a step.
-        assert np.abs(on / states.frequency[k] - 1).min() < 2e-3
-        unstable += not curve.is_stable[place]
-    assert unstable >= 1
-    assert test.jumps == ()
-    assert len(test.curves) == 3
-
-
-def test_errors_and_chain_are_the_same_for_every_test():
+def test_errors_and_chain_are_those_of_any_test():
     errors = MeasurementErrors(amplitude=0.01, phase=0.02, force=0.03)
     noisy, plain = Recording(errors, seed=3), Recording(seed=3)
-    exact_one = phase_controlled_test(curved_beam(), TINY, [0.0]).steady_states
-    drawn = phase_controlled_test(curved_beam(), TINY, [0.0], recording=noisy).steady_states
+    exact_one = run(TINY, points_per_level=1).steady_states
+    drawn = run(TINY, points_per_level=1, recording=noisy).steady_states
     same = VisitedStates(np.array([1, 2]), np.zeros(2), np.ones(2), np.ones(2), np.ones((2, 3, 1)))
     by_hand = recorded_states(curved_beam(), same, noisy)
     plain = recorded_states(curved_beam(), same, plain)
@@ -462,20 +414,6 @@ def test_errors_and_chain_are_the_same_for_every_test():
 def test_wrong_settings_are_named(options, message):
     with pytest.raises(ValueError, match=message):
         run(**options)
-
-
-@pytest.mark.parametrize(
-    ("forces", "phases", "message"),
-    [
-        ([0.0], [0.0], "`forces` must be positive"),
-        ([], [0.0], "`forces` must have at least one number"),
-        ([1e-9], [], "`phases` must name at least one phase"),
-        ([1e-9], [2.0], "`phase` must lie between"),
-    ],
-)
-def test_wrong_settings_of_a_phase_locked_loop_are_named(forces, phases, message):
-    with pytest.raises(ValueError, match=message):
-        phase_controlled_test(curved_beam(), forces, phases)
 
 
 def test_a_range_without_resonance_has_no_states():

@@ -3,22 +3,18 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from truths.duffing import CUBIC, MASS, RATIO, REST, beam
 
 import snrmjax as sj
 
-REST, RATIO, CUBIC, MASS = 2 * np.pi * 40.0, 0.01, 3e9, 0.8  # cubic per modal mass, 1/(m² s²)
 RATE = 3000.0
 
 
 @pytest.fixture(scope="module")
 def laboratory():
-    shape = 1 / np.sqrt(MASS)
-    # The sensor looks the other way: states must come out with the model's sign.
-    modes = sj.model.linear_modes([REST], [RATIO], [[-shape]], [shape])
-    potential = sj.model.polynomial_potential({"1111": CUBIC * shape**2 / 4}, 1)
     shaker = sj.simulate.Shaker(30.0, 8.0, mass=0.05, damping=1.0, stiffness=500.0)
-    beam = sj.model.structure(modes, potential)
-    return sj.simulate.Laboratory(beam, shaker, sj.simulate.Instruments(), RATE)
+    # The sensor looks the other way: states must come out with the model's sign.
+    return sj.simulate.Laboratory(beam(sign=-1.0), shaker, sj.simulate.Instruments(), RATE)
 
 
 def impedance(size, omega):
