@@ -21,7 +21,6 @@ from snrmjax.cli.rom_command import rom
 from snrmjax.cli.simulate_commands import nnm, simulate
 from snrmjax.cli.study_commands import study_app
 from snrmjax.cli.whole_test_command import whole_test
-from snrmjax.io.compilation_cache import use_compilation_cache
 
 app = typer.Typer(
     name="snrmjax",
@@ -79,7 +78,10 @@ app.add_typer(study_app)
 
 def main() -> None:
     """Run the commands; wrong input ends with exit code 2 and one sentence."""
-    use_compilation_cache()
+    if sys.argv[1:] and "--help" not in sys.argv:  # help does not wait for the import of JAX
+        from snrmjax.io.compilation_cache import use_compilation_cache
+
+        use_compilation_cache()
     try:
         app()
     except ValueError as error:

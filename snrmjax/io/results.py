@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 
-import jax
 import numpy as np
 
 from snrmjax.identify.inference.identification import Identification
@@ -13,7 +12,7 @@ from snrmjax.identify.prediction.resonance_distribution import QUANTILES, Resona
 from snrmjax.io.files import FilePath
 from snrmjax.io.tables import write_table
 from snrmjax.io.units import HERTZ
-from snrmjax.measure.signals import peak_amplitude
+from snrmjax.simulate.balance.labelled import velocity_peaks
 from snrmjax.simulate.continuation.response_curve import ResponseCurve
 from snrmjax.simulate.continuation.stability import Stability
 from snrmjax.simulate.solutions.normal_modes import NormalModeBranch
@@ -43,16 +42,16 @@ def write_response(
     """
     r = _place(curves[0].sensors, sensor) if curves else 0
     force = np.concatenate([np.full(len(c.frequency), c.force) for c in curves])
-    fundamental = np.concatenate([c.velocity[:, 1, r] for c in curves])
+    velocity = np.concatenate([c.velocity[:, :, r] for c in curves])
     write_table(
         path,
         {
             "force_n": force,
             "point": _numbered(force),
             "frequency_hz": np.concatenate([c.frequency for c in curves]) / HERTZ,
-            "velocity_h1_re_m_s": fundamental.real,
-            "velocity_h1_im_m_s": fundamental.imag,
-            "velocity_peak_m_s": _peaks(np.concatenate([c.velocity[:, :, r] for c in curves])),
+            "velocity_h1_re_m_s": velocity[:, 1].real,
+            "velocity_h1_im_m_s": velocity[:, 1].imag,
+            "velocity_peak_m_s": velocity_peaks(velocity),
             "stable": np.concatenate([c.is_stable for c in curves]),
             "event": [event for c in curves for event in _events(c)],
         },
@@ -83,7 +82,7 @@ def write_normal_mode(
             "point": np.arange(len(branch.frequency)),
             "frequency_hz": branch.frequency / HERTZ,
             "velocity_h1_m_s": np.abs(branch.velocity[:, 1, r]),
-            "velocity_peak_m_s": _peaks(branch.velocity[:, :, r]),
+            "velocity_peak_m_s": velocity_peaks(branch.velocity[:, :, r]),
             "energy_j": branch.energy,
         },
     )
@@ -173,7 +172,7 @@ def summarise(identification: Identification, values: BackboneValues) -> dict:
     """
     points, noise = identification.points, identification.fit.noise
     frequency = np.asarray(values.natural_frequency) / HERTZ
-    damping, velocity = values.damping_ratio, values.velocity
+    damping, velocity = np.asarray(values.damping_ratio), np.asarray(values.velocity)
     status = np.asarray(points.status)
     return {
         "sensor": points.sensor,
@@ -238,9 +237,3 @@ def _numbered(force: np.ndarray) -> np.ndarray:
     """Point numbers that start again at 0 with every force."""
     starts = np.flatnonzero(np.concatenate([[True], np.diff(force) != 0]))
     return np.arange(len(force)) - np.repeat(starts, np.diff(np.append(starts, len(force))))
-
-
-def _peaks(velocity: np.ndarray) -> np.ndarray:
-    """Peak of the time signal of every point, from its harmonics without the mean (which is 0)."""
-    orders = tuple(range(1, velocity.shape[1]))
-    return np.asarray(jax.jit(peak_amplitude, static_argnums=1)(velocity[:, 1:], orders))

@@ -68,6 +68,11 @@ def value_of(array: Any) -> np.ndarray | None:
     return None if isinstance(array, jax.core.Tracer) else np.asarray(array)
 
 
+def on_host(array: Any) -> Any:
+    """An array as NumPy's, of which parts are taken without a program; a traced one as it is."""
+    return array if isinstance(array, jax.core.Tracer) else np.asarray(array)
+
+
 def numbers_as_arrays(tree: T) -> T:
     """A tree whose floating-point and complex numbers of Python are NumPy's.
 

@@ -109,9 +109,8 @@ class FitResiduals(NamedTuple):
 
 def fit_residuals(fit: JointFit) -> FitResiduals:
     """The residuals of a joint fit, with the place of their states."""
-    modes, velocity = fit.modes, np.asarray(fit.motion().velocity)
-    j, r = modes.mode_of_interest, fit.data.sensor
-    sign = np.sign(float(modes.mode_shape[r, j] * modes.participation[j]))
+    velocity = np.asarray(fit.motion().velocity)
+    sign = np.sign(float(fit.problem.modal_constant))
     return FitResiduals(
         level=np.asarray(fit.data.level) + 1,
         velocity=np.abs(velocity),

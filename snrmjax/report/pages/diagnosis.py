@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 
+import jax
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -206,7 +207,7 @@ def _key_numbers(diagnosis: Diagnosis, predicted: Sequence[LevelResponse]) -> li
     if diagnosis.effects and gap.after > AS_NOISE:
         misfit += "; the ± above holds only if the noise is as stated"
     rows.append(("misfit of the force (rms), errors of levels and laws in it", misfit))
-    if np.isfinite(np.asarray(relative_errors(diagnosis.data))).any():
+    if np.isfinite(np.asarray(relative_errors(jax.tree.map(np.asarray, diagnosis.data)))).any():
         rows.append(
             (
                 "random part of it, by neighbouring states",
@@ -310,7 +311,7 @@ def _limits_section(diagnosis: Diagnosis) -> Section:
     rows, misfit, scales = [], diagnosis.force_misfit, None
     if diagnosis.completed is not None:
         modes, data = diagnosis.completed.modes, diagnosis.data
-        columns = (np.abs(data.velocity[:, misfit.sensor]), data.frequency, data.force)
+        columns = (np.abs(np.asarray(data.velocity)[:, misfit.sensor]), data.frequency, data.force)
         of_states = (np.asarray(column)[misfit.rows] for column in columns)
         scales = scales_of_motions(modes, misfit.sensor, *of_states)
     for name, limit in sorted(diagnosis.detection_limits.items()):

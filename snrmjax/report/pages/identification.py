@@ -234,11 +234,11 @@ def identification_summary(
         return " to ".join(f"{course.values[k]:.4g} {at(course, k)}" for k in course.extreme())
 
     j = modes.mode_of_interest
-    linear = float(modes.natural_frequency[j]) / HERTZ
+    linear = modes.natural_frequency.item(j) / HERTZ
     change = frequency.values[-1] - frequency.values[0]
     used, every = int(np.sum(np.asarray(points.usable))), len(np.asarray(points.status))
     rows = [
-        ("linear mode", f"{linear:.5g} Hz, {100 * float(modes.damping_ratio[j]):.3g} % damping"),
+        ("linear mode", f"{linear:.5g} Hz, {100 * modes.damping_ratio.item(j):.3g} % damping"),
         ("natural frequency (± 95 %)", ends(frequency)),
         ("change over the range", minus(f"{change:+.3g} Hz ({100 * change / linear:+.3g} %)")),
         ("damping ratio (± 95 %)", ends(damping)),

@@ -98,7 +98,7 @@ def identification_figures(
 
 def _linear_modal_damping(model: Structure) -> float:
     j = model.modes.mode_of_interest
-    return 2 * float(model.modes.damping_ratio[j] * model.modes.natural_frequency[j])
+    return 2 * model.modes.damping_ratio.item(j) * model.modes.natural_frequency.item(j)
 
 
 def _typical_states(found: IdentifiedTest) -> list[int]:
