@@ -20,9 +20,9 @@ def demo(out: Out) -> None:
     from snrmjax.io.units import HERTZ
     from snrmjax.model.beams import FLAT_BEAM_FORCES
     from snrmjax.pipelines.identify import identify_test
-    from snrmjax.report.figures.identification import save_figure
     from snrmjax.report.figures.simulation import simulated_response_figure
     from snrmjax.report.pages import identified_test as page
+    from snrmjax.report.style import save_figure
 
     with staged(out) as folder:
         model = sj.model.flat_beam()

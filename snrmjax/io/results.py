@@ -1,14 +1,11 @@
 """Results as tables and as one summary: what the commands write."""
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from snrmjax.identify.inference.identification import Identification
-from snrmjax.identify.pointwise.backbone import BackboneValues
 from snrmjax.identify.pointwise.inversion_result import PointStatus
-from snrmjax.identify.pointwise.prediction import PredictedResponse, Resonance
-from snrmjax.identify.prediction.resonance_distribution import QUANTILES, ResonanceDistribution
 from snrmjax.io.files import FilePath
 from snrmjax.io.tables import write_table
 from snrmjax.io.units import HERTZ
@@ -16,6 +13,12 @@ from snrmjax.simulate.balance.labelled import velocity_peaks
 from snrmjax.simulate.continuation.response_curve import ResponseCurve
 from snrmjax.simulate.continuation.stability import Stability
 from snrmjax.simulate.solutions.normal_modes import NormalModeBranch
+
+if TYPE_CHECKING:  # a simulation does not wait for the imports of an identification
+    from snrmjax.identify.inference.identification import Identification
+    from snrmjax.identify.pointwise.backbone import BackboneValues
+    from snrmjax.identify.pointwise.prediction import PredictedResponse, Resonance
+    from snrmjax.identify.prediction.resonance_distribution import ResonanceDistribution
 
 BACKBONE_POINTS = 200
 # What other programs rely on: the columns of backbone.csv and points.csv, in their order.
@@ -89,7 +92,7 @@ def write_normal_mode(
 
 
 def write_points(
-    path: FilePath, identification: Identification, *, added: tuple[str, int] | None = None
+    path: FilePath, identification: "Identification", *, added: tuple[str, int] | None = None
 ) -> None:
     """Write the identified points, one row a steady state.
 
@@ -101,7 +104,7 @@ def write_points(
 
 
 def write_backbone(
-    path: FilePath, identification: Identification, *, added: tuple[str, int] | None = None
+    path: FilePath, identification: "Identification", *, added: tuple[str, int] | None = None
 ) -> None:
     """Write the backbone with its 1σ between the smallest and the largest point used.
 
@@ -111,7 +114,7 @@ def write_backbone(
 
 
 def write_values(
-    path: FilePath, values: BackboneValues, *, added: tuple[str, int] | None = None
+    path: FilePath, values: "BackboneValues", *, added: tuple[str, int] | None = None
 ) -> None:
     """Write natural frequency and damping against velocity, with 1σ.
 
@@ -135,7 +138,7 @@ def _with_amplitude(
 
 def write_prediction(
     path: FilePath,
-    responses: Sequence[PredictedResponse],
+    responses: "Sequence[PredictedResponse]",
     *,
     drives: Sequence[float | None] = (),
     velocity_stds: Sequence[np.ndarray] = (),
@@ -165,7 +168,7 @@ def write_prediction(
     )
 
 
-def summarise(identification: Identification, values: BackboneValues) -> dict:
+def summarise(identification: "Identification", values: "BackboneValues") -> dict:
     """The headline numbers of an identification, by name, in the units of the files.
 
     Arguments: `values` of the curves from the smallest to the largest measured amplitude.
@@ -201,7 +204,7 @@ def summarise(identification: Identification, values: BackboneValues) -> dict:
     }
 
 
-def summarise_resonance(resonance: Resonance) -> dict:
+def summarise_resonance(resonance: "Resonance") -> dict:
     """A predicted resonance by name, in the units of the files."""
     return {
         "force_n": resonance.force,
@@ -212,8 +215,10 @@ def summarise_resonance(resonance: Resonance) -> dict:
     }
 
 
-def summarise_distribution(distribution: ResonanceDistribution) -> dict:
+def summarise_distribution(distribution: "ResonanceDistribution") -> dict:
     """Whether a further level has its resonance in a range, and where, in units of the files."""
+    from snrmjax.identify.prediction.resonance_distribution import QUANTILES
+
     return {
         "force_n": distribution.force,
         "largest_amplitude_ratio": distribution.largest_amplitude_ratio,

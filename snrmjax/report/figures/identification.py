@@ -6,8 +6,7 @@ are in Hz, degrees and per cent of critical damping. Figures need no display and
 matplotlib's settings.
 """
 
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +19,6 @@ from snrmjax.identify.pointwise.prediction import (
     PredictedResponse,
     Resonance,
 )
-from snrmjax.io.files import FilePath, file_name, write_atomically
 from snrmjax.io.units import DEGREE, HERTZ
 from snrmjax.measure.indicators import appropriation_of
 from snrmjax.measure.signals import force_velocity_loop
@@ -53,7 +51,6 @@ from snrmjax.report.style import (
     SERIES,
     SIMULATED,
     STAR,
-    PrintedFigure,
     banded,
     dress,
     explain_lines,
@@ -64,8 +61,6 @@ from snrmjax.report.style import (
     panels,
     phase_axis,
     plain,
-    png_bytes,
-    printed,
     response_line,
     share_frequencies,
     stars,
@@ -84,24 +79,6 @@ class DampingSeries(NamedTuple):
     label: str
     points: BackbonePoints | None = None
     backbone: Backbone | None = None
-
-
-def save_figure(path: FilePath, figure: Figure, *, dots_per_inch: float = 220.0) -> None:
-    """Write a figure as a PNG, whole or not at all.
-
-    Raises `ValueError` when `path` does not end in .png or cannot be written.
-    """
-    if not file_name(path).lower().endswith(".png"):
-        raise ValueError(f"`path` must end in .png, but is {file_name(path)}.")
-    write_atomically(path, png_bytes(figure, dots_per_inch=dots_per_inch))
-
-
-def save_figures(folder: Path, figures: Mapping[str, Figure]) -> dict[str, PrintedFigure]:
-    """Write figures as PNG files into a folder, each under its name; as printed, for a report."""
-    drawn = {name: printed(figure) for name, figure in figures.items()}
-    for name, one in drawn.items():
-        write_atomically(folder / f"{name}.png", one.png)
-    return drawn
 
 
 def _named_with_bars(*axes: tuple[np.ndarray, np.ndarray]) -> str:

@@ -36,7 +36,6 @@ from snrmjax.report.figures.diagnosis import (
     misfit_figure,
 )
 from snrmjax.report.figures.drawn_laws import LAW_CAPTION, drawn_laws_figure, law_tables
-from snrmjax.report.figures.identification import save_figures
 from snrmjax.report.html import (
     Report,
     ReportFigure,
@@ -54,7 +53,7 @@ from snrmjax.report.pages.resonance_table import (
 )
 from snrmjax.report.sentences.diagnose import effect_name
 from snrmjax.report.sentences.diagnose import probability_in_words as in_words
-from snrmjax.report.style import PrintedFigure, unit_for, with_unit
+from snrmjax.report.style import PrintedFigure, save_figures, unit_for, with_unit
 
 _SHOWN = 10  # candidates
 _LEAST_P_VALUE = 1e-12  # smaller ones are not told apart

@@ -24,7 +24,7 @@ from snrmjax.report.pages.joint_fit import (
     words_of_fit,
 )
 from snrmjax.report.sampling import SHOWN_AMPLITUDES, VELOCITY, ShownAmplitude
-from snrmjax.report.style import PrintedFigure
+from snrmjax.report.style import PrintedFigure, save_figures
 
 
 def settings_in_words(found: IdentifiedTest) -> dict[str, str]:
@@ -211,7 +211,7 @@ def write(
     ]
     summary["notes"] = [str(note) for note in found.notes]
     write_summary(folder / "summary.json", summary)
-    figures = plot.save_figures(folder, identification_figures(found, shown))
+    figures = save_figures(folder, identification_figures(found, shown))
     if found.joint is not None:
         done = done | {"curves": curves_in_words(found.joint.fit)}
     report = findings_report(found, title, done, figures)
