@@ -2,11 +2,14 @@
 
 from collections.abc import Callable
 from functools import cache, wraps
+from threading import Lock
 from typing import Any, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
 import numpy as np
+
+from snrmjax.numerics.program_store import NotKept, kept_program, programs_are_kept
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -42,10 +45,36 @@ def compiled(function: Callable[..., R], *, long_loops: bool = False) -> Callabl
 
     run.__name__ = function.__name__
     inside = jax.jit(run, static_argnums=(0, 1))
+    kept: dict[tuple, _Once] = {}
 
     @cache
     def outermost(hurried: bool) -> Callable[..., R]:
         return jax.jit(run, static_argnums=(0, 1), compiler_options=_options(hurried, long_loops))
+
+    def whole(
+        structure: Any, fixed: tuple, arrays: list, hurried: bool, *argued: Any
+    ) -> Callable[[list], R] | None:
+        """The program as it is kept on disk, from which it is read or to which it is written."""
+
+        def build() -> tuple[jax.stages.Lowered, Any]:
+            trees: list[Any] = []
+
+            def flat(*rows: Any) -> list:
+                leaves, tree = jax.tree.flatten(run(structure, fixed, list(rows)))
+                trees.append(tree)
+                return leaves
+
+            flat.__name__ = f"{function.__name__}_kept"
+            options = _options(hurried, long_loops)
+            program = jax.jit(flat, compiler_options=options).lower(*arrays)
+            return program, jax.tree.unflatten(trees[-1], range(trees[-1].num_leaves))
+
+        try:
+            program, like = kept_program(function, argued, (hurried, long_loops), build)
+        except NotKept:
+            return None
+        results = jax.tree.structure(like)
+        return lambda rows: jax.tree.unflatten(results, program(*rows))
 
     @wraps(function)
     def call(*arguments: Any, **named: Any) -> R:
@@ -55,8 +84,16 @@ def compiled(function: Callable[..., R], *, long_loops: bool = False) -> Callabl
         fixed = tuple(_Array if known else a for a, known in zip(leaves, is_array, strict=True))
         arrays = [a for a, known in zip(leaves, is_array, strict=True) if known]
         traced = any(isinstance(a, jax.core.Tracer) for a in arrays)
+        if traced:
+            return inside(structure, fixed, arrays)
         hurried = jax.config.values["jax_disable_most_optimizations"]
-        return (inside if traced else outermost(hurried))(structure, fixed, arrays)
+        if programs_are_kept():
+            shapes = tuple((a.shape, a.dtype, getattr(a, "weak_type", False)) for a in arrays)
+            once = kept.setdefault((structure, fixed, shapes, hurried), _Once())
+            program = once.made(lambda: whole(structure, fixed, arrays, hurried, arguments, named))
+            if program is not None:
+                return program(arrays)
+        return outermost(hurried)(structure, fixed, arrays)
 
     return call
 
@@ -100,6 +137,21 @@ def _number(leaf: Any) -> Any:
 
 class _Array:
     """Stands where an array was taken out."""
+
+
+class _Once:
+    """What is made at the first call, in whichever thread that is."""
+
+    def __init__(self) -> None:
+        self._lock = Lock()
+        self._made: list[Any] = []
+
+    def made(self, make: Callable[[], T]) -> T:
+        """What `make` made, now or before."""
+        with self._lock:
+            if not self._made:
+                self._made.append(make())
+        return self._made[0]
 
 
 @cache
