@@ -17,7 +17,8 @@ def use_compilation_cache(folder: str | os.PathLike[str] | None = None) -> None:
     Arguments: `folder` to keep them in; None takes the one that JAX's own variable
     JAX_COMPILATION_CACHE_DIR names, or else the user's cache folder for snrmjax and this kind of
     processor, which the commands use too. To be called before the first simulation. Machines with
-    different processors need folders of their own.
+    different processors need folders of their own. Programs of the package are kept whole, known
+    by its sources: functions and constants that are exchanged while Python runs are not seen.
 
     >>> import snrmjax as sj
     >>> sj.use_compilation_cache()  # doctest: +SKIP

@@ -66,7 +66,7 @@ def keep_programs(folder: Path) -> None:
     if trace_context is None or _Store.forbidden or jax.default_backend() != "cpu":
         return
     if len(jax.devices()) == 1:
-        version = folder / _version()
+        version = folder / version_of(Path(__file__).resolve().parents[1])
         if not version.is_dir():
             _drop_old(folder)
         _Store.place = _Open(version, trace_context())
@@ -80,7 +80,9 @@ def keep_no_programs() -> None:
 def programs_are_kept() -> bool:
     """Whether programs are kept, under the settings of JAX that rule now."""
     place = _Store.place
-    return place is not None and trace_context() == place.context
+    if place is None or jax.config.jax_disable_jit:
+        return False
+    return trace_context() == place.context
 
 
 def kept_program(
@@ -98,8 +100,7 @@ def kept_program(
     place = _Store.place
     if place is None:
         raise NotKept
-    parts = _named(function), _described(arguments), settings
-    file = place.folder / hashlib.sha256(repr(parts).encode()).hexdigest()
+    file = place.folder / key_of(function, arguments, settings)
     found = _read(file)
     if found is None:
         lowered, like = build()
@@ -112,6 +113,12 @@ def kept_program(
     return found
 
 
+def key_of(function: Callable[..., Any], arguments: Any, settings: tuple = ()) -> str:
+    """The name of a program's file. Raises `NotKept` where code of others has a part in it."""
+    parts = _named(function), _described(arguments), settings
+    return hashlib.sha256(repr(parts).encode()).hexdigest()
+
+
 def processor_digest() -> str:
     """The kind of processor, for which programs are compiled."""
     listed = Path("/proc/cpuinfo")
@@ -120,12 +127,11 @@ def processor_digest() -> str:
     return hashlib.sha256("\n".join(kind or [text]).encode()).hexdigest()[:12]
 
 
-def _version() -> str:
+def version_of(package: Path) -> str:
     """All that is the same for the programs of a process, as the name of their folder."""
-    root = Path(__file__).resolve().parents[1]
     sources = hashlib.sha256()
-    for file in sorted(root.rglob("*.py")):
-        sources.update(f"{file.relative_to(root)}\0".encode() + file.read_bytes())
+    for file in sorted(package.rglob("*.py")):
+        sources.update(f"{file.relative_to(package)}\0".encode() + file.read_bytes())
     settings = {
         name: str(value)
         for name, value in jax.config.values.items()
@@ -224,7 +230,9 @@ def _write(file: Path, program: jax.stages.Compiled, like: Any, calls_lapack: bo
 
 def _drop_old(folder: Path) -> None:
     """Leave room for one more version beside the newest."""
-    if folder.is_dir():
-        versions = sorted(folder.iterdir(), key=lambda one: one.stat().st_mtime)
-        for version in versions[: max(len(versions) + 1 - _VERSIONS_KEPT, 0)]:
-            shutil.rmtree(version, ignore_errors=True)
+    try:
+        versions = sorted(os.scandir(folder), key=lambda one: one.stat().st_mtime)
+    except OSError:  # there is none, it is not ours, or another process has just dropped one
+        return
+    for version in versions[: max(len(versions) + 1 - _VERSIONS_KEPT, 0)]:
+        shutil.rmtree(version, ignore_errors=True)
