@@ -49,7 +49,7 @@ from snrmjax.model.library.stiffness import (
     QuinticStiffness,
     StaticPreload,
 )
-from snrmjax.numerics.program_store import keep_no_programs
+from snrmjax.numerics.kept_programs import keep_no_programs
 from snrmjax.numerics.rules import require
 
 

@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from snrmjax.numerics.program_store import NotKept, kept_program, programs_are_kept
+from snrmjax.numerics.kept_programs import NotKept, ProgramKeeper, program_keeper
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -52,7 +52,12 @@ def compiled(function: Callable[..., R], *, long_loops: bool = False) -> Callabl
         return jax.jit(run, static_argnums=(0, 1), compiler_options=_options(hurried, long_loops))
 
     def whole(
-        structure: Any, fixed: tuple, arrays: list, hurried: bool, *argued: Any
+        keeper: ProgramKeeper,
+        structure: Any,
+        fixed: tuple,
+        arrays: list,
+        hurried: bool,
+        *argued: Any,
     ) -> Callable[[list], R] | None:
         """The program as it is kept on disk, from which it is read or to which it is written."""
 
@@ -70,7 +75,7 @@ def compiled(function: Callable[..., R], *, long_loops: bool = False) -> Callabl
             return program, jax.tree.unflatten(trees[-1], range(trees[-1].num_leaves))
 
         try:
-            program, like = kept_program(function, argued, (hurried, long_loops), build)
+            program, like = keeper.program(function, argued, (hurried, long_loops), build)
         except NotKept:
             return None
         results = jax.tree.structure(like)
@@ -87,10 +92,12 @@ def compiled(function: Callable[..., R], *, long_loops: bool = False) -> Callabl
         if traced:
             return inside(structure, fixed, arrays)
         hurried = jax.config.values["jax_disable_most_optimizations"]
-        if programs_are_kept():
+        keeper = program_keeper()
+        if keeper is not None:
             shapes = tuple((a.shape, a.dtype, getattr(a, "weak_type", False)) for a in arrays)
             once = kept.setdefault((structure, fixed, shapes, hurried), _Once())
-            program = once.made(lambda: whole(structure, fixed, arrays, hurried, arguments, named))
+            made_of = keeper, structure, fixed, arrays, hurried, arguments, named
+            program = once.made(lambda: whole(*made_of))
             if program is not None:
                 return program(arrays)
         return outermost(hurried)(structure, fixed, arrays)
@@ -105,7 +112,7 @@ def value_of(array: Any) -> np.ndarray | None:
     return None if isinstance(array, jax.core.Tracer) else np.asarray(array)
 
 
-def on_host(array: Any) -> Any:
+def as_numpy(array: Any) -> Any:
     """An array as NumPy's, of which parts are taken without a program; a traced one as it is."""
     return array if isinstance(array, jax.core.Tracer) else np.asarray(array)
 

@@ -12,7 +12,7 @@ from snrmjax.identify.joint.free_unknowns import Unravel, corrected_residuals, p
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.numerics.compiled import compiled
 
-_SOLVER: optx.AbstractLeastSquaresSolver = optx.LevenbergMarquardt(
+SOLVER: optx.AbstractLeastSquaresSolver = optx.LevenbergMarquardt(
     rtol=1e-10, atol=1e-10, linear_solver=lx.QR()
 )
 _MOST_STEPS = 200  # of a refit
@@ -56,7 +56,7 @@ def _resampled(
         weighted = problem.with_data(weight=weight)
         solution: optx.Solution = optx.least_squares(
             lambda y, _: corrected_residuals(vector + y * unit, unravel, weighted),
-            *(_SOLVER, jnp.zeros_like(vector)),
+            *(SOLVER, jnp.zeros_like(vector)),
             max_steps=_MOST_STEPS,
             throw=False,
         )

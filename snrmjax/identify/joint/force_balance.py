@@ -24,7 +24,7 @@ from snrmjax.measure.states import SteadyStates, check_phases, relative_errors
 from snrmjax.model.modes import UNSTATED_MODAL_MASS_STD, LinearModes, residual_velocity
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import mapped
-from snrmjax.numerics.compiled import compiled, on_host
+from snrmjax.numerics.compiled import as_numpy, compiled
 
 STATE_ERRORS = ("force", "velocity", "phase", "stiffness")
 """What every state may err in at random, relative or in rad; stiffness is never stated."""
@@ -91,7 +91,7 @@ class BalanceProblem(eqx.Module):
     def modal_constant(self) -> Float[Array, ""]:
         """A = Φ_r Φᵀb in 1/kg of the model: 1/|A| is its modal mass, seen from force and sensor."""
         r, j = self.data.sensor, self.modes.mode_of_interest
-        return on_host(self.modes.mode_shape)[r, j] * on_host(self.modes.participation)[j]
+        return as_numpy(self.modes.mode_shape)[r, j] * as_numpy(self.modes.participation)[j]
 
     def modal_mass_of(self, unknowns: Unknowns) -> float:
         """The modal mass in kg, seen from force and sensor, that the fit found."""
@@ -106,7 +106,7 @@ class BalanceProblem(eqx.Module):
 
 def log_modal_mass(unknowns: Unknowns, linear_std: Float[Array, " deviation"]) -> Float[Array, ""]:
     """The logarithm of the fit's modal mass over the model's: the last of the deviations."""
-    return on_host(unknowns.linear)[-1] * on_host(linear_std)[-1]
+    return as_numpy(unknowns.linear)[-1] * as_numpy(linear_std)[-1]
 
 
 def stated_level_std(model: Structure | LinearModes) -> Float[np.ndarray, " error"]:

@@ -30,11 +30,13 @@ import jax
 import numpy as np
 from jax.experimental.serialize_executable import deserialize_and_load, serialize
 
+from snrmjax.numerics.kept_programs import NotKept, keep_programs_with
+
 try:  # what a trace depends on beside its arguments; from when on JAX keeps a program itself
+    from jax._src.config import disable_jit, trace_context
     from jax._src.config import persistent_cache_min_compile_time_secs as worth_keeping
-    from jax._src.config import trace_context
 except ImportError:  # JAX moves what is private to it: without these no program is kept
-    trace_context, worth_keeping = None, None  # type: ignore[assignment]
+    disable_jit = trace_context = worth_keeping = None  # type: ignore[assignment]
 
 _PACKAGE = __name__.partition(".")[0]
 _LIBRARIES = ("jax", "jaxlib", "equinox", "optimistix", "lineax", "interpax", "numpy")
@@ -45,72 +47,45 @@ _DIGEST = hashlib.sha256().digest_size
 _OF_NO_PROGRAM = ("jax_compilation_cache", "jax_persistent_cache", "jax_log", "jax_debug_log")
 
 
-class _Open(NamedTuple):
+class ProgramStore(NamedTuple):
+    """Programs in a folder, of one version of the package and of all that it stands on."""
+
     folder: Path
-    context: object  # settings of JAX under which the programs were compiled
+    context: object  # settings of JAX under which they were compiled
 
+    def in_use(self) -> bool:
+        """See `ProgramKeeper`."""
+        return trace_context() == self.context and not disable_jit.value
 
-class _Store:
-    """Where programs are kept; nowhere before `keep_programs`, and after `keep_no_programs`."""
-
-    place: _Open | None = None
-    forbidden = False
-
-
-class NotKept(Exception):
-    """What a program depends on is not of this package alone."""
+    def program(
+        self,
+        function: Callable[..., Any],
+        arguments: Any,
+        settings: tuple,
+        build: Callable[[], tuple[jax.stages.Lowered, Any]],
+    ) -> tuple[Callable[..., list[jax.Array]], Any]:
+        """See `ProgramKeeper`."""
+        file = self.folder / key_of(function, arguments, settings)
+        found = _read(file)
+        if found is None:
+            lowered, like = build()
+            # What XLA read from JAX's cache it cannot write again: there it must not be.
+            with worth_keeping(math.inf):
+                found = lowered.compile(), like
+            called = set(re.findall(r"custom_call @(\w+)", lowered.as_text()))
+            if all(name.startswith("lapack_") for name in called):
+                _write(file, *found, bool(called))
+        return found
 
 
 def keep_programs(folder: Path) -> None:
     """Keep programs in a folder, where JAX computes on one CPU."""
-    if trace_context is None or _Store.forbidden or jax.default_backend() != "cpu":
+    if trace_context is None or jax.default_backend() != "cpu" or len(jax.devices()) != 1:
         return
-    if len(jax.devices()) == 1:
-        version = folder / version_of(Path(__file__).resolve().parents[1])
-        if not version.is_dir():
-            _drop_old(folder)
-        _Store.place = _Open(version, trace_context())
-
-
-def keep_no_programs() -> None:
-    """From here on the package does what it does with code of others in it."""
-    _Store.forbidden, _Store.place = True, None
-
-
-def programs_are_kept() -> bool:
-    """Whether programs are kept, under the settings of JAX that rule now."""
-    place = _Store.place
-    if place is None or jax.config.jax_disable_jit:
-        return False
-    return trace_context() == place.context
-
-
-def kept_program(
-    function: Callable[..., Any],
-    arguments: Any,
-    settings: tuple,
-    build: Callable[[], tuple[jax.stages.Lowered, Any]],
-) -> tuple[Callable[..., list[jax.Array]], Any]:
-    """The program of flat arrays for a function's arguments, and a tree like its results.
-
-    Arguments: `settings` of the compiler; `build` lowers the program where none is kept, under a
-    name that no other has.
-    Raises `NotKept` where it could not be told from another.
-    """
-    place = _Store.place
-    if place is None:
-        raise NotKept
-    file = place.folder / key_of(function, arguments, settings)
-    found = _read(file)
-    if found is None:
-        lowered, like = build()
-        # What XLA read from JAX's cache it cannot write again: there it must not be.
-        with worth_keeping(math.inf):
-            found = lowered.compile(), like
-        called = set(re.findall(r"custom_call @(\w+)", lowered.as_text()))
-        if all(name.startswith("lapack_") for name in called):
-            _write(file, *found, bool(called))
-    return found
+    version = folder / version_of(Path(__file__).resolve().parents[1])
+    if not version.is_dir():
+        _drop_old(folder)
+    keep_programs_with(ProgramStore(version, trace_context()))
 
 
 def key_of(function: Callable[..., Any], arguments: Any, settings: tuple = ()) -> str:

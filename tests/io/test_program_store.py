@@ -14,10 +14,11 @@ import numpy as np
 import pytest
 
 import snrmjax as sj
+from snrmjax.io import program_store
+from snrmjax.io.program_store import key_of, version_of
 from snrmjax.model.modes import linear_response
 from snrmjax.model.structures import Structure, linear_terms_of
-from snrmjax.numerics import program_store
-from snrmjax.numerics.program_store import NotKept, key_of, version_of
+from snrmjax.numerics.kept_programs import NotKept
 
 linear_terms = linear_terms_of.__wrapped__
 response = linear_response.__wrapped__
