@@ -88,7 +88,7 @@ def linear_damping_note(fit: JointFit, model: Structure) -> tuple[Fact, ...]:
     j = modes.mode_of_interest
     linear, linear_std = modes.damping_ratio.item(j), modes.damping_ratio_std.item(j)
     at_rest = fitted_values(fit, displacement=np.zeros(1))
-    fitted, std = at_rest.damping_ratio.item(0), at_rest.damping_ratio_std.item(0)
+    fitted, std = float(at_rest.damping_ratio[0]), float(at_rest.damping_ratio_std[0])
     both = float(np.hypot(std, linear_std))
     if not linear_std > 0 or not abs(fitted - linear) > BAND * both:  # NaN says nothing
         return ()

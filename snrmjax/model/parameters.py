@@ -83,7 +83,7 @@ def stated_stds(model: Structure) -> dict[str, float]:
     stds = {}
     for name, (part, entry, field, _) in _places(model).items():
         std = getattr(getattr(model, part), f"{field}_std", None)
-        if std is not None and (stated := std.item(entry)) > 0:
+        if std is not None and (stated := float(np.asarray(std)[entry])) > 0:
             stds[name] = stated
     return stds
 
