@@ -13,7 +13,6 @@ from snrmjax.report.figures.identification import (
     force_velocity_figure,
     modal_damping_figure,
     response_figure,
-    save_figure,
 )
 from snrmjax.report.figures.joint_fit import (
     FitSeries,
@@ -38,6 +37,7 @@ from snrmjax.report.figures.uncertainty import (
     propagation_figure,
     sensitivity_figure,
 )
+from snrmjax.report.style import save_figure
 
 __all__ = [
     "DampingSeries",

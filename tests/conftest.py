@@ -59,6 +59,14 @@ def pytest_unconfigure(config: pytest.Config) -> None:
         del os.environ[_STORE]
 
 
+@pytest.fixture(autouse=True, scope="session")
+def no_kept_programs():
+    """Tests exchange functions of the package, of which programs that are kept know nothing."""
+    from snrmjax.numerics.kept_programs import keep_no_programs
+
+    keep_no_programs()
+
+
 @pytest.fixture(autouse=True, scope="module")
 def bounded_memory():
     """The programs of all modules together would fill gigabytes; the store has them on disk."""

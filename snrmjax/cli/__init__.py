@@ -3,6 +3,7 @@
 Each imports what it needs by itself: none waits for the imports of another.
 """
 
+import gc
 import inspect
 import sys
 from collections.abc import Callable
@@ -21,7 +22,6 @@ from snrmjax.cli.rom_command import rom
 from snrmjax.cli.simulate_commands import nnm, simulate
 from snrmjax.cli.study_commands import study_app
 from snrmjax.cli.whole_test_command import whole_test
-from snrmjax.io.compilation_cache import use_compilation_cache
 
 app = typer.Typer(
     name="snrmjax",
@@ -58,6 +58,7 @@ _EXAMPLES: dict[Callable[..., None], str] = {
     "snrmjax rom --tables load_cases --out reduced\n\n"
     "snrmjax rom --calculix deck.inp --modes 1,3,5 --out reduced",
 }
+_OBJECTS = 100_000  # made between two collections of rubbish, some 10 MB
 # What Python has another use for, or pytest.
 _NAMES = {whole_test: "test", import_: "import"}
 
@@ -79,7 +80,12 @@ app.add_typer(study_app)
 
 def main() -> None:
     """Run the commands; wrong input ends with exit code 2 and one sentence."""
-    use_compilation_cache()
+    # Imports and programs stay to the end: to look for rubbish in them takes a tenth of a command.
+    gc.set_threshold(_OBJECTS)
+    if sys.argv[1:] and "--help" not in sys.argv:  # help does not wait for the import of JAX
+        from snrmjax.io.compilation_cache import use_compilation_cache
+
+        use_compilation_cache()
     try:
         app()
     except ValueError as error:

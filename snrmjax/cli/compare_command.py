@@ -7,7 +7,6 @@ import typer
 
 from snrmjax.cli.console import tell, written
 from snrmjax.cli.options import Linear, Out
-from snrmjax.io.models import read_model
 from snrmjax.report.writing import staged
 
 
@@ -46,6 +45,7 @@ def compare(
 
     Writes compare.csv, summary.json, compare.png and report.html.
     """
+    from snrmjax.io.models import read_model
     from snrmjax.methods.comparison import compare_methods
     from snrmjax.model.structures import modes_of
     from snrmjax.pipelines.measured_files import read_measured_test

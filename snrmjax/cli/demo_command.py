@@ -1,14 +1,8 @@
 """The command `demo`."""
 
-import numpy as np
-
 import snrmjax as sj
 from snrmjax.cli.console import say, tell, written
 from snrmjax.cli.options import Out
-from snrmjax.io.models import write_model
-from snrmjax.io.tables import write_steady_states
-from snrmjax.io.units import HERTZ
-from snrmjax.model.beams import FLAT_BEAM_FORCES
 from snrmjax.report.writing import staged
 
 
@@ -18,11 +12,17 @@ def demo(out: Out) -> None:
     Writes the model, simulated responses, the nonlinear normal mode, a virtual test with noise,
     all that `identify` makes of it, figures and report.html. Takes about a minute.
     """
+    import numpy as np
+
     from snrmjax.io import results
+    from snrmjax.io.models import write_model
+    from snrmjax.io.tables import write_steady_states
+    from snrmjax.io.units import HERTZ
+    from snrmjax.model.beams import FLAT_BEAM_FORCES
     from snrmjax.pipelines.identify import identify_test
-    from snrmjax.report.figures.identification import save_figure
     from snrmjax.report.figures.simulation import simulated_response_figure
     from snrmjax.report.pages import identified_test as page
+    from snrmjax.report.style import save_figure
 
     with staged(out) as folder:
         model = sj.model.flat_beam()

@@ -7,8 +7,6 @@ import typer
 
 from snrmjax.cli.console import tell, written
 from snrmjax.cli.options import Linear, Out, asked_for, with_options
-from snrmjax.io.models import read_model
-from snrmjax.io.tables import read_steady_states
 from snrmjax.pipelines.options import IdentifyOptions
 from snrmjax.report.writing import staged
 
@@ -43,6 +41,8 @@ def identify(
     Writes points.csv, backbone.csv, summary.json, figures and report.html; with predictions
     also prediction.csv, with a joint fit fit.json, with --next also next.csv.
     """
+    from snrmjax.io.models import read_model
+    from snrmjax.io.tables import read_steady_states
     from snrmjax.pipelines.identify import identify_test
     from snrmjax.report.pages import identified_test as page
 

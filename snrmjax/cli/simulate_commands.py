@@ -6,7 +6,6 @@ import typer
 
 from snrmjax.cli.console import say, tell, written
 from snrmjax.cli.options import Harmonics, Model, Out, require_positive
-from snrmjax.io.models import read_model
 from snrmjax.report.writing import staged
 
 
@@ -45,6 +44,7 @@ def simulate(
 
     Harmonic balance with arclength continuation. Writes response.csv and response.png.
     """
+    from snrmjax.io.models import read_model
     from snrmjax.pipelines.simulate import simulate_responses
     from snrmjax.report.pages import simulation
 
@@ -91,6 +91,7 @@ def nnm(
 
     Writes nnm.csv (frequency, velocity, energy) and nnm.png.
     """
+    from snrmjax.io.models import read_model
     from snrmjax.pipelines.simulate import simulate_mode
     from snrmjax.report.pages import simulation
 

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Iterator
 from typing import NamedTuple
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -65,7 +65,7 @@ from snrmjax.measure.phase_convention import naming_wrong_phases
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.effect_base import AbstractLinearChange
 from snrmjax.model.effects import EFFECTS
-from snrmjax.model.structures import Structure
+from snrmjax.model.structures import Structure, linear_terms_of
 from snrmjax.numerics.blocks import on_one_core
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
@@ -363,6 +363,6 @@ def _frequency_shift(model: Structure, completed: Structure) -> float:
     j, added = model.modes.mode_of_interest, completed.effects[len(model.effects) :]
     linear = [effect for effect in added if isinstance(effect, AbstractLinearChange)]
     changed = dataclasses.replace(model, effects=(*model.effects, *linear))
-    before, after = model.linear_terms(), changed.linear_terms()
+    before, after = (jax.tree.map(np.asarray, linear_terms_of(one)) for one in (model, changed))
     square = after.stiffness[j] / before.stiffness[j] * (before.mass[j] / after.mass[j])
-    return float(jnp.sqrt(square)) - 1
+    return float(np.sqrt(square)) - 1

@@ -93,7 +93,7 @@ def predicted_levels(
     forces = level_forces(data, sensor)
     n, seen = len(forces), [level for level in forces if level in without_level]
     modes, j = model.modes, model.modes.mode_of_interest
-    mode = float(modes.natural_frequency[j]), float(modes.damping_ratio[j])
+    mode = modes.natural_frequency.item(j), modes.damping_ratio.item(j)
     idle = tuple(e.idle(*mode) for e in completed.effects[len(model.effects) :])
     given = dataclasses.replace(model, effects=(*model.effects, *idle))
     models = [given] * n + [completed] * n + [without_level[level] for level in seen]

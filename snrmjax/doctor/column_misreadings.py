@@ -66,7 +66,7 @@ def _far(points: BackbonePoints, model: Structure) -> tuple[Fact, ...]:
     found = np.array(sorted(map(tuple, medians))).reshape(-1, 3)[:, 1:]
     modes = model.modes
     j = modes.mode_of_interest
-    linear = np.array([modes.natural_frequency[j], modes.damping_ratio[j]], dtype=float)
+    linear = np.array([modes.natural_frequency.item(j), modes.damping_ratio.item(j)])
     if not len(found) or linear[1] <= 0 or found[:, 1].min() <= 0:
         return ()
     off = np.log(found / linear)
@@ -86,7 +86,7 @@ def linear_damping_note(fit: JointFit, model: Structure) -> tuple[Fact, ...]:
     """
     modes = model.modes
     j = modes.mode_of_interest
-    linear, linear_std = float(modes.damping_ratio[j]), float(modes.damping_ratio_std[j])
+    linear, linear_std = modes.damping_ratio.item(j), modes.damping_ratio_std.item(j)
     at_rest = fitted_values(fit, displacement=np.zeros(1))
     fitted, std = float(at_rest.damping_ratio[0]), float(at_rest.damping_ratio_std[0])
     both = float(np.hypot(std, linear_std))

@@ -110,8 +110,8 @@ def _of_force(
     else:
         modes = model.modes
         one = modes.mode_of_interest
-        natural_square = float(modes.natural_frequency[one]) ** 2
-        rate = 2 * float(modes.damping_ratio[one]) * natural_square**0.5
+        natural_square = modes.natural_frequency.item(one) ** 2
+        rate = 2 * modes.damping_ratio.item(one) * natural_square**0.5
         constant = states.constant
     mobility = 1j * w * constant / (natural_square - w**2 + 1j * rate * w)
     size = np.abs(seen.recorded[good])

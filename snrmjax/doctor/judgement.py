@@ -9,7 +9,6 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
@@ -256,13 +255,13 @@ def checked_states(
     if model is not None:
         modes = model.modes
         one = modes.mode_of_interest
-        constant = float(modes.mode_shape[sensor, one] * modes.participation[one])
+        constant = modes.mode_shape.item(sensor, one) * modes.participation.item(one)
         if not drive.any() and (modes.n_modes > 1 or modes.rigid_body_participation.size):
-            beside = np.asarray(residual_velocity(modes, jnp.asarray(omega), jnp.asarray(force)))[
-                :, sensor
-            ]
+            beside = np.asarray(residual_velocity(modes, omega, force))[:, sensor]
         gain, phase, frequency, damping = model.level_stds
-        natural, ratio = float(modes.natural_frequency[one]), float(modes.damping_ratio[one])
+        natural, ratio = (
+            float(np.asarray(a)[one]) for a in (modes.natural_frequency, modes.damping_ratio)
+        )
         stds = (gain, phase, 2 * frequency / natural, damping / max(ratio, 1e-6))
     sign = -1.0 if constant < 0 else 1.0
     errors, stated = state_errors(np.asarray(relative_errors(some))[:, sensor])

@@ -135,7 +135,7 @@ def _bend(states: TestStates, stiffness: np.ndarray, model: Structure) -> float 
     beta = 2 * np.pi * (np.arange(64) + 0.5) / 64
     x = q[:, None] * np.cos(beta)
     force = sum(degree * c * x ** (degree - 1) for degree, c in terms)
-    natural_square = float(modes.natural_frequency[one]) ** 2
+    natural_square = modes.natural_frequency.item(one) ** 2
     predicted = 2 * np.mean(force * np.cos(beta), axis=1) / q / natural_square
     measured = stiffness / natural_square - 1
     if np.ptp(measured) < 0.01 or np.ptp(predicted) < 1e-6:
@@ -153,8 +153,8 @@ def shaker_damping(fit: Judged, model: Structure, where: str) -> list[Finding]:
     """
     modes = model.modes
     one = modes.mode_of_interest
-    natural, ratio = float(modes.natural_frequency[one]), float(modes.damping_ratio[one])
-    std = float(modes.damping_ratio_std[one])
+    natural, ratio = modes.natural_frequency.item(one), modes.damping_ratio.item(one)
+    std = modes.damping_ratio_std.item(one)
     amplitude = fit.states.amplitude
     if not std > 0 or not ratio > 0 or np.ptp(np.log(amplitude)) < 1.0:
         return []

@@ -85,7 +85,7 @@ def summarise_fit(
             "scale": fit.noise.scale,
             "scale_std": fit.noise.scale_std,
             "correlation_of_neighbours": float(np.max(fit.noise.autocorrelation)),
-            "wandering_of_natural_frequency": 0.5 * float(fit.data.std[0, 3]),
+            "wandering_of_natural_frequency": 0.5 * fit.data.std.item(0, 3),
         },
         "levels": {
             "gain_std": level["gain"],
@@ -109,7 +109,7 @@ def summarise_fit(
 def _modal_mass(fit: JointFit) -> dict:
     """The modal mass that damping is relative to, in kg, and whether it is the model's."""
     mass = float(fit.problem.modal_mass_of(fit.unknowns))
-    prior = float(fit.prior.linear[-1])
+    prior = fit.prior.linear.item(-1)
     return {
         "value_kg": mass,
         "std_kg": mass * prior * float(np.sqrt(fit.covariance[-1, -1])),

@@ -235,17 +235,17 @@ def _entries(model: Structure) -> dict[str, object]:
     flexible: list[dict[str, object]] = []
     for k in range(modes.n_modes):
         stds = {
-            "frequency_std_hz": in_unit(float(modes.natural_frequency_std[k]), HERTZ),
-            "damping_ratio_std": float(modes.damping_ratio_std[k]),
+            "frequency_std_hz": in_unit(modes.natural_frequency_std.item(k), HERTZ),
+            "damping_ratio_std": modes.damping_ratio_std.item(k),
         }
         entry = {
-            "frequency_hz": in_unit(float(modes.natural_frequency[k]), HERTZ),
-            "damping_ratio": float(modes.damping_ratio[k]),
-            "participation": float(modes.participation[k]),
+            "frequency_hz": in_unit(modes.natural_frequency.item(k), HERTZ),
+            "damping_ratio": modes.damping_ratio.item(k),
+            "participation": modes.participation.item(k),
             **{key: value for key, value in stds.items() if value},
         }
         if modes.modal_mass_std is not None:
-            entry["modal_mass_std"] = float(modes.modal_mass_std[k])
+            entry["modal_mass_std"] = modes.modal_mass_std.item(k)
         flexible.append({**entry, "shape": shape(modes.mode_shape[:, k])})
     rigid = [
         {"participation": float(participation), "shape": shape(modes.rigid_body_shape[:, k])}

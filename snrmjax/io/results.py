@@ -1,22 +1,24 @@
 """Results as tables and as one summary: what the commands write."""
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
-import jax
 import numpy as np
 
-from snrmjax.identify.inference.identification import Identification
-from snrmjax.identify.pointwise.backbone import BackboneValues
 from snrmjax.identify.pointwise.inversion_result import PointStatus
-from snrmjax.identify.pointwise.prediction import PredictedResponse, Resonance
-from snrmjax.identify.prediction.resonance_distribution import QUANTILES, ResonanceDistribution
 from snrmjax.io.files import FilePath
 from snrmjax.io.tables import write_table
 from snrmjax.io.units import HERTZ
-from snrmjax.measure.signals import peak_amplitude
+from snrmjax.simulate.balance.labelled import velocity_peaks
 from snrmjax.simulate.continuation.response_curve import ResponseCurve
 from snrmjax.simulate.continuation.stability import Stability
 from snrmjax.simulate.solutions.normal_modes import NormalModeBranch
+
+if TYPE_CHECKING:  # a simulation does not wait for the imports of an identification
+    from snrmjax.identify.inference.identification import Identification
+    from snrmjax.identify.pointwise.backbone import BackboneValues
+    from snrmjax.identify.pointwise.prediction import PredictedResponse, Resonance
+    from snrmjax.identify.prediction.resonance_distribution import ResonanceDistribution
 
 BACKBONE_POINTS = 200
 # What other programs rely on: the columns of backbone.csv and points.csv, in their order.
@@ -43,16 +45,16 @@ def write_response(
     """
     r = _place(curves[0].sensors, sensor) if curves else 0
     force = np.concatenate([np.full(len(c.frequency), c.force) for c in curves])
-    fundamental = np.concatenate([c.velocity[:, 1, r] for c in curves])
+    velocity = np.concatenate([c.velocity[:, :, r] for c in curves])
     write_table(
         path,
         {
             "force_n": force,
             "point": _numbered(force),
             "frequency_hz": np.concatenate([c.frequency for c in curves]) / HERTZ,
-            "velocity_h1_re_m_s": fundamental.real,
-            "velocity_h1_im_m_s": fundamental.imag,
-            "velocity_peak_m_s": _peaks(np.concatenate([c.velocity[:, :, r] for c in curves])),
+            "velocity_h1_re_m_s": velocity[:, 1].real,
+            "velocity_h1_im_m_s": velocity[:, 1].imag,
+            "velocity_peak_m_s": velocity_peaks(velocity),
             "stable": np.concatenate([c.is_stable for c in curves]),
             "event": [event for c in curves for event in _events(c)],
         },
@@ -83,14 +85,14 @@ def write_normal_mode(
             "point": np.arange(len(branch.frequency)),
             "frequency_hz": branch.frequency / HERTZ,
             "velocity_h1_m_s": np.abs(branch.velocity[:, 1, r]),
-            "velocity_peak_m_s": _peaks(branch.velocity[:, :, r]),
+            "velocity_peak_m_s": velocity_peaks(branch.velocity[:, :, r]),
             "energy_j": branch.energy,
         },
     )
 
 
 def write_points(
-    path: FilePath, identification: Identification, *, added: tuple[str, int] | None = None
+    path: FilePath, identification: "Identification", *, added: tuple[str, int] | None = None
 ) -> None:
     """Write the identified points, one row a steady state.
 
@@ -102,7 +104,7 @@ def write_points(
 
 
 def write_backbone(
-    path: FilePath, identification: Identification, *, added: tuple[str, int] | None = None
+    path: FilePath, identification: "Identification", *, added: tuple[str, int] | None = None
 ) -> None:
     """Write the backbone with its 1σ between the smallest and the largest point used.
 
@@ -112,7 +114,7 @@ def write_backbone(
 
 
 def write_values(
-    path: FilePath, values: BackboneValues, *, added: tuple[str, int] | None = None
+    path: FilePath, values: "BackboneValues", *, added: tuple[str, int] | None = None
 ) -> None:
     """Write natural frequency and damping against velocity, with 1σ.
 
@@ -136,7 +138,7 @@ def _with_amplitude(
 
 def write_prediction(
     path: FilePath,
-    responses: Sequence[PredictedResponse],
+    responses: "Sequence[PredictedResponse]",
     *,
     drives: Sequence[float | None] = (),
     velocity_stds: Sequence[np.ndarray] = (),
@@ -166,14 +168,14 @@ def write_prediction(
     )
 
 
-def summarise(identification: Identification, values: BackboneValues) -> dict:
+def summarise(identification: "Identification", values: "BackboneValues") -> dict:
     """The headline numbers of an identification, by name, in the units of the files.
 
     Arguments: `values` of the curves from the smallest to the largest measured amplitude.
     """
     points, noise = identification.points, identification.fit.noise
     frequency = np.asarray(values.natural_frequency) / HERTZ
-    damping, velocity = values.damping_ratio, values.velocity
+    damping, velocity = np.asarray(values.damping_ratio), np.asarray(values.velocity)
     status = np.asarray(points.status)
     return {
         "sensor": points.sensor,
@@ -202,7 +204,7 @@ def summarise(identification: Identification, values: BackboneValues) -> dict:
     }
 
 
-def summarise_resonance(resonance: Resonance) -> dict:
+def summarise_resonance(resonance: "Resonance") -> dict:
     """A predicted resonance by name, in the units of the files."""
     return {
         "force_n": resonance.force,
@@ -213,8 +215,10 @@ def summarise_resonance(resonance: Resonance) -> dict:
     }
 
 
-def summarise_distribution(distribution: ResonanceDistribution) -> dict:
+def summarise_distribution(distribution: "ResonanceDistribution") -> dict:
     """Whether a further level has its resonance in a range, and where, in units of the files."""
+    from snrmjax.identify.prediction.resonance_distribution import QUANTILES
+
     return {
         "force_n": distribution.force,
         "largest_amplitude_ratio": distribution.largest_amplitude_ratio,
@@ -238,9 +242,3 @@ def _numbered(force: np.ndarray) -> np.ndarray:
     """Point numbers that start again at 0 with every force."""
     starts = np.flatnonzero(np.concatenate([[True], np.diff(force) != 0]))
     return np.arange(len(force)) - np.repeat(starts, np.diff(np.append(starts, len(force))))
-
-
-def _peaks(velocity: np.ndarray) -> np.ndarray:
-    """Peak of the time signal of every point, from its harmonics without the mean (which is 0)."""
-    orders = tuple(range(1, velocity.shape[1]))
-    return np.asarray(jax.jit(peak_amplitude, static_argnums=1)(velocity[:, 1:], orders))

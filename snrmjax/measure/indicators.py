@@ -8,6 +8,7 @@ from jaxtyping import Array, Complex, Float
 
 from snrmjax.measure.signals import require_orders
 from snrmjax.measure.states import SteadyStates
+from snrmjax.numerics.compiled import compiled
 
 
 def nnm_appropriation(
@@ -58,6 +59,7 @@ def _appropriation(
     return jnp.where(n_counted > 0, jnp.sum(ratio, axis=-1) / jnp.maximum(n_counted, 1), jnp.nan)
 
 
+@compiled
 def appropriation_of(data: SteadyStates) -> Float[Array, " state"]:
     """Appropriation indicator of every measured state, from all harmonics it was measured with.
 

@@ -71,7 +71,7 @@ def wrong_phases(data: SteadyStates, modes: LinearModes | Structure) -> tuple[Fa
     j = modes.mode_of_interest
     shape = np.asarray(modes.mode_shape)[:, j]
     r = int(np.argmax(np.abs(shape)))
-    constant = float(shape[r] * modes.participation[j])
+    constant = float(shape[r]) * modes.participation.item(j)
     near = _near_resonance(data, r, constant)
     if near is None:
         return ()

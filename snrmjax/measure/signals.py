@@ -9,6 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
+from snrmjax.numerics.compiled import compiled
+
 
 def synthesise(
     amplitudes: Complex[Array, "*batch harmonic"],
@@ -94,6 +96,7 @@ class ForceVelocityLoop(NamedTuple):
     mean_power: Float[Array, "*batch"]  # W
 
 
+@compiled
 def force_velocity_loop(
     force: float | Float[Array, "*batch"],
     velocity_amplitudes: Complex[Array, "*batch harmonic"],

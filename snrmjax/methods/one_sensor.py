@@ -91,7 +91,7 @@ def sensor_states(
 def signed_drive_point(modes: LinearModes) -> float:
     """Shape at the reference sensor times participation: 1 / modal mass there, 1/kg, signed."""
     k = modes.mode_of_interest
-    return float(modes.mode_shape[reference_sensor(modes), k] * modes.participation[k])
+    return modes.mode_shape.item(reference_sensor(modes), k) * modes.participation.item(k)
 
 
 def drive_point(modes: LinearModes) -> float:

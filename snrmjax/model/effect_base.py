@@ -124,7 +124,7 @@ class AbstractEffect(eqx.Module):
         """
         _, *others = cls.parameters().values()
         values = (0.0, *(parameter.typical for parameter in others))
-        return cls(*(jnp.asarray(value) for value in values))
+        return cls(*jax.device_put([np.asarray(value) for value in values]))
 
     def idle(self, natural_frequency: float, damping_ratio: float) -> Self:
         """An effect like this one, of the same structure, at zero strength.

@@ -49,6 +49,7 @@ from snrmjax.model.library.stiffness import (
     QuinticStiffness,
     StaticPreload,
 )
+from snrmjax.numerics.kept_programs import keep_no_programs
 from snrmjax.numerics.rules import require
 
 
@@ -151,6 +152,7 @@ def register_effect(effect: type[AbstractEffect]) -> type[AbstractEffect]:
         raise ValueError(f"there is an effect of the kind {effect.kind!r} already.")
     if not effect.parameters():
         raise ValueError(f"{effect.kind!r} must have a parameter: a field without a default.")
+    keep_no_programs()  # they would not tell this class from a later one of its name
     EFFECTS[effect.kind] = effect
     return effect
 

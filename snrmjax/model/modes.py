@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Shaped
 
+from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.rules import BELOW_ONE, POSITIVE, require
 from snrmjax.numerics.units import HERTZ
 
@@ -48,7 +49,7 @@ class LinearModes(eqx.Module):
         count = f"{self.n_modes} mode{'s' if self.n_modes > 1 else ''}"
         lines = [f"LinearModes: {count}{beside} at {', '.join(self.sensors)}"]
         for k in range(min(self.n_modes, _SHOWN)):
-            hertz, ratio = float(self.natural_frequency[k]) / HERTZ, self.damping_ratio[k]
+            hertz, ratio = self.natural_frequency.item(k) / HERTZ, self.damping_ratio[k]
             chosen = ", of interest" if k == self.mode_of_interest else ""
             lines.append(f"mode {k + 1}: {hertz:.6g} Hz, damping {100 * ratio:.3g} %{chosen}")
         if self.n_modes > _SHOWN:
@@ -184,6 +185,7 @@ def _vector(name: str, value: object, size: int | None = None) -> Any:
     return vector
 
 
+@compiled
 def residual_velocity(
     modes: LinearModes,
     frequency: Float[Array, "*batch"],
@@ -208,6 +210,7 @@ def residual_velocity(
     ) + _rigid_body_velocity(modes, frequency, force)
 
 
+@compiled
 def linear_response(
     modes: LinearModes,
     frequency: Float[Array, "*batch"],

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from functools import lru_cache
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -100,8 +101,8 @@ def polynomial_potential(
         raise ValueError(f"`coefficient_std` names {sorted(unknown)}, which have no coefficient.")
     monomials = tuple(sorted(values, key=lambda m: (len(m), m)))
     return PolynomialPotential(
-        coefficient=jnp.asarray([values[m] for m in monomials], dtype=jnp.float64),
-        coefficient_std=jnp.asarray([spread.get(m, 0.0) for m in monomials], dtype=jnp.float64),
+        coefficient=jax.device_put(np.array([values[m] for m in monomials], float)),
+        coefficient_std=jax.device_put(np.array([spread.get(m, 0.0) for m in monomials], float)),
         monomials=monomials,
         n_modes=n_modes,
     )

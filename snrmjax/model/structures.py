@@ -27,6 +27,10 @@ from snrmjax.model.potential import PolynomialPotential, polynomial_potential
 from snrmjax.numerics.compiled import compiled
 
 
+def _number(value: float = 0.0) -> Array:
+    return jax.device_put(np.asarray(value, dtype=float))  # by `jnp.asarray` it would compile
+
+
 class LinearTerms(NamedTuple):
     """The linear part m q̈ + d q̇ + k q of every modal equation, linear changes included."""
 
@@ -48,11 +52,11 @@ class Structure(eqx.Module):
     modes: LinearModes
     potential: PolynomialPotential
     effects: tuple[AbstractEffect, ...] = eqx.field(default=(), converter=checked_effects)
-    level_gain_std: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros(()))
-    level_phase_std: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros(()))
-    level_frequency_std: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros(()))
-    level_damping_std: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros(()))
-    test_order: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros(()))
+    level_gain_std: Float[Array, ""] = eqx.field(default_factory=_number)
+    level_phase_std: Float[Array, ""] = eqx.field(default_factory=_number)
+    level_frequency_std: Float[Array, ""] = eqx.field(default_factory=_number)
+    level_damping_std: Float[Array, ""] = eqx.field(default_factory=_number)
+    test_order: Float[Array, ""] = eqx.field(default_factory=_number)
     name: str = eqx.field(static=True, default="structure")
 
     def __repr__(self) -> str:
@@ -210,6 +214,12 @@ class Structure(eqx.Module):
         return tangent
 
 
+@compiled
+def linear_terms_of(model: Structure) -> LinearTerms:
+    """`Structure.linear_terms` as one program, for the host."""
+    return model.linear_terms()
+
+
 def modes_of(model: Structure | LinearModes) -> LinearModes:
     """The linear modes of a structure; linear modes themselves as they are."""
     return model.modes if isinstance(model, Structure) else model
@@ -248,10 +258,10 @@ def structure(
         modes=modes,
         potential=potential,
         effects=checked_effects(effects),
-        level_gain_std=jnp.asarray(float(level_gain_std)),
-        level_phase_std=jnp.asarray(float(level_phase_std)),
-        level_frequency_std=jnp.asarray(float(level_frequency_std)),
-        level_damping_std=jnp.asarray(float(level_damping_std)),
+        level_gain_std=_number(level_gain_std),
+        level_phase_std=_number(level_phase_std),
+        level_frequency_std=_number(level_frequency_std),
+        level_damping_std=_number(level_damping_std),
         name=name,
     )
 
@@ -292,7 +302,7 @@ def equilibria(model: Structure, *, n_starts: int = 512, seed: int = 0) -> list[
     Returns the distinct equilibria found, sorted by |q|.
     """
     n = model.n_modes
-    squared = np.asarray(model.linear_terms().stiffness)
+    squared = np.asarray(linear_terms_of(model).stiffness)
     if n == 1 and not model.memoryless:
         polynomial = np.zeros(max(model.potential.degree, 2))
         polynomial[1] = squared[0]
@@ -311,7 +321,7 @@ def equilibria(model: Structure, *, n_starts: int = 512, seed: int = 0) -> list[
     for q in sorted(candidates, key=lambda row: float(np.linalg.norm(row))):
         if any(np.linalg.norm(q - e.displacement) <= tolerance for e in distinct):
             continue
-        energy, tangent = _energy_and_tangent(model, jnp.asarray(q))
+        energy, tangent = _energy_and_tangent(model, q)
         stable = bool(np.all(np.linalg.eigvalsh(np.asarray(tangent)) > 0))
         distinct.append(Equilibrium(q, float(energy), stable))
     return distinct
@@ -347,7 +357,7 @@ def _newton(
     return ends, jax.vmap(lambda q: jnp.max(jnp.abs(balance(q)) / squared))(ends)
 
 
-@eqx.filter_jit
+@compiled
 def _energy_and_tangent(
     model: Structure, q: Float[Array, " mode"]
 ) -> tuple[Float[Array, ""], Float[Array, "mode mode"]]:
@@ -363,7 +373,7 @@ def displacement_scale(model: Structure) -> np.ndarray:
     that by a tenth. It is the scale of searches and continuations; modes without terms of their
     own take the median of the others.
     """
-    squared = np.asarray(model.linear_terms().stiffness)
+    squared = np.asarray(linear_terms_of(model).stiffness)
     scale = np.full(model.n_modes, np.nan)
     for monomial, value in zip(
         model.potential.monomials, np.asarray(model.potential.coefficient), strict=True

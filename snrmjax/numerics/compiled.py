@@ -2,11 +2,14 @@
 
 from collections.abc import Callable
 from functools import cache, wraps
+from threading import Lock
 from typing import Any, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
 import numpy as np
+
+from snrmjax.numerics.kept_programs import NotKept, ProgramKeeper, program_keeper
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -42,10 +45,41 @@ def compiled(function: Callable[..., R], *, long_loops: bool = False) -> Callabl
 
     run.__name__ = function.__name__
     inside = jax.jit(run, static_argnums=(0, 1))
+    kept: dict[tuple, _Once] = {}
 
     @cache
     def outermost(hurried: bool) -> Callable[..., R]:
         return jax.jit(run, static_argnums=(0, 1), compiler_options=_options(hurried, long_loops))
+
+    def whole(
+        keeper: ProgramKeeper,
+        structure: Any,
+        fixed: tuple,
+        arrays: list,
+        hurried: bool,
+        *argued: Any,
+    ) -> Callable[[list], R] | None:
+        """The program as it is kept on disk, from which it is read or to which it is written."""
+
+        def build() -> tuple[jax.stages.Lowered, Any]:
+            trees: list[Any] = []
+
+            def flat(*rows: Any) -> list:
+                leaves, tree = jax.tree.flatten(run(structure, fixed, list(rows)))
+                trees.append(tree)
+                return leaves
+
+            flat.__name__ = f"{function.__name__}_kept"
+            options = _options(hurried, long_loops)
+            program = jax.jit(flat, compiler_options=options).lower(*arrays)
+            return program, jax.tree.unflatten(trees[-1], range(trees[-1].num_leaves))
+
+        try:
+            program, like = keeper.program(function, argued, (hurried, long_loops), build)
+        except NotKept:
+            return None
+        results = jax.tree.structure(like)
+        return lambda rows: jax.tree.unflatten(results, program(*rows))
 
     @wraps(function)
     def call(*arguments: Any, **named: Any) -> R:
@@ -55,8 +89,18 @@ def compiled(function: Callable[..., R], *, long_loops: bool = False) -> Callabl
         fixed = tuple(_Array if known else a for a, known in zip(leaves, is_array, strict=True))
         arrays = [a for a, known in zip(leaves, is_array, strict=True) if known]
         traced = any(isinstance(a, jax.core.Tracer) for a in arrays)
+        if traced:
+            return inside(structure, fixed, arrays)
         hurried = jax.config.values["jax_disable_most_optimizations"]
-        return (inside if traced else outermost(hurried))(structure, fixed, arrays)
+        keeper = program_keeper()
+        if keeper is not None:
+            shapes = tuple((a.shape, a.dtype, getattr(a, "weak_type", False)) for a in arrays)
+            once = kept.setdefault((structure, fixed, shapes, hurried), _Once())
+            made_of = keeper, structure, fixed, arrays, hurried, arguments, named
+            program = once.made(lambda: whole(*made_of))
+            if program is not None:
+                return program(arrays)
+        return outermost(hurried)(structure, fixed, arrays)
 
     return call
 
@@ -66,6 +110,11 @@ def value_of(array: Any) -> np.ndarray | None:
     if isinstance(array, jax.core.Tracer):
         array = jax.lax.stop_gradient(array)
     return None if isinstance(array, jax.core.Tracer) else np.asarray(array)
+
+
+def as_numpy(array: Any) -> Any:
+    """An array as NumPy's, of which parts are taken without a program; a traced one as it is."""
+    return array if isinstance(array, jax.core.Tracer) else np.asarray(array)
 
 
 def numbers_as_arrays(tree: T) -> T:
@@ -95,6 +144,21 @@ def _number(leaf: Any) -> Any:
 
 class _Array:
     """Stands where an array was taken out."""
+
+
+class _Once:
+    """What is made at the first call, in whichever thread that is."""
+
+    def __init__(self) -> None:
+        self._lock = Lock()
+        self._made: list[Any] = []
+
+    def made(self, make: Callable[[], T]) -> T:
+        """What `make` made, now or before."""
+        with self._lock:
+            if not self._made:
+                self._made.append(make())
+        return self._made[0]
 
 
 @cache

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
 
@@ -40,6 +39,8 @@ def require(subject: str, value: Any, *rules: Rule) -> None:
 
     `subject` says what it is, with its backticks. Traced numbers have no value yet: they pass.
     """
+    import jax  # late: `snrmjax --help` does not wait for it
+
     if isinstance(value, jax.core.Tracer):
         return
     entries = np.asarray(value)

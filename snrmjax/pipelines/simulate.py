@@ -92,7 +92,7 @@ def simulate_mode(
 
     Raises `ValueError` as `nonlinear_normal_mode` does.
     """
-    linear = float(model.modes.natural_frequency[model.modes.mode_of_interest]) / HERTZ
+    linear = model.modes.natural_frequency.item(model.modes.mode_of_interest) / HERTZ
     if np.isclose(to_hz, linear, rtol=1e-12):
         raise ValueError(f"`--to-hz` must differ from the linear frequency, {linear:g} Hz.")
     branch = nonlinear_normal_mode(model, to_hz * HERTZ, harmonic_order=harmonics, tongues=tongues)

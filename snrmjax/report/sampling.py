@@ -1,20 +1,21 @@
 """What figures read off results: sampled curves, phasors and phases, in the figures' units."""
 
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from jax.typing import ArrayLike
 
-from snrmjax.identify.inference.fitted_curves import fitted_values
-from snrmjax.identify.joint.joint_fit import JointFit
-from snrmjax.identify.pointwise.backbone import Backbone, BackboneValues
-from snrmjax.identify.pointwise.backbone_points import BackbonePoints
-from snrmjax.identify.pointwise.prediction import PredictedResponse
+from snrmjax.identify.pointwise.prediction_result import PredictedResponse
 from snrmjax.io.units import DEGREE, HERTZ
 from snrmjax.measure.states import SteadyStates
 from snrmjax.simulate.solutions.controlled import DampedModeBranch
 from snrmjax.simulate.solutions.forced_response import ResponseCurve
 from snrmjax.simulate.solutions.normal_modes import NormalModeBranch
+
+if TYPE_CHECKING:  # figures of a simulation do not wait for the imports of an identification
+    from snrmjax.identify.joint.joint_fit import JointFit
+    from snrmjax.identify.pointwise.backbone import Backbone, BackboneValues
+    from snrmjax.identify.pointwise.backbone_points import BackbonePoints
 
 BAND = 1.96
 """Half the width of a 95 % band in standard deviations."""
@@ -58,7 +59,7 @@ class BackboneSamples(NamedTuple):
         return (self.frequency, self.damping), (self.frequency_error, self.damping_error)
 
 
-def sample_backbone(backbone: Backbone, *, reach: float = 1.0) -> BackboneSamples:
+def sample_backbone(backbone: "Backbone", *, reach: float = 1.0) -> BackboneSamples:
     """A backbone from its smallest amplitude to `reach` times its largest."""
     values = backbone.sampled(_CURVE_POINTS, reach=reach)
     ends = float(backbone.smallest), reach * float(backbone.largest)
@@ -66,16 +67,18 @@ def sample_backbone(backbone: Backbone, *, reach: float = 1.0) -> BackboneSample
 
 
 def sample_fit(
-    fit: JointFit, *, of_a_new_level: bool = False, reach: float = 1.0
+    fit: "JointFit", *, of_a_new_level: bool = False, reach: float = 1.0
 ) -> BackboneSamples:
     """The curves of a joint fit from zero to `reach` times the largest measured velocity."""
     largest = fit.largest[1]
     velocity = np.linspace(0.0, reach * largest, _CURVE_POINTS)
+    from snrmjax.identify.inference.fitted_curves import fitted_values
+
     values = fitted_values(fit, velocity, of_a_new_level=of_a_new_level)
     return _in_units(values, velocity > largest)
 
 
-def _in_units(values: BackboneValues, beyond: np.ndarray) -> BackboneSamples:
+def _in_units(values: "BackboneValues", beyond: np.ndarray) -> BackboneSamples:
     omega, omega_std, damping, damping_std, modal, modal_std = (
         np.asarray(of)
         for of in (
@@ -107,11 +110,10 @@ class FitResiduals(NamedTuple):
     rms: float
 
 
-def fit_residuals(fit: JointFit) -> FitResiduals:
+def fit_residuals(fit: "JointFit") -> FitResiduals:
     """The residuals of a joint fit, with the place of their states."""
-    modes, velocity = fit.modes, np.asarray(fit.motion().velocity)
-    j, r = modes.mode_of_interest, fit.data.sensor
-    sign = np.sign(float(modes.mode_shape[r, j] * modes.participation[j]))
+    velocity = np.asarray(fit.motion().velocity)
+    sign = np.sign(float(fit.problem.modal_constant))
     return FitResiduals(
         level=np.asarray(fit.data.level) + 1,
         velocity=np.abs(velocity),
@@ -144,7 +146,7 @@ SHOWN_AMPLITUDES = {
 
 
 def usable_damping(
-    points: BackbonePoints, shown: ShownAmplitude = VELOCITY
+    points: "BackbonePoints", shown: ShownAmplitude = VELOCITY
 ) -> tuple[np.ndarray, np.ndarray]:
     """Amplitude on the backbone and modal damping (1/s) of the points that curves use."""
     use = np.asarray(points.usable)
@@ -152,7 +154,7 @@ def usable_damping(
     return amplitude[use], np.asarray(points.modal_damping)[use]
 
 
-def phase_of(velocity: Any, backbone: Backbone) -> np.ndarray:
+def phase_of(velocity: Any, backbone: "Backbone") -> np.ndarray:
     """Velocity phase in degrees, 0 at resonance whatever the sign of the modal constant."""
     return np.angle(np.asarray(velocity) * np.sign(float(backbone.modal_constant))) / DEGREE
 

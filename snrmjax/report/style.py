@@ -6,6 +6,8 @@ as they are.
 """
 
 import io
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,6 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, MultipleLocator
 
+from snrmjax.io.files import FilePath, file_name, write_atomically
 from snrmjax.simulate.continuation.stability import Stability
 
 PAGE, COLUMN = 7.2, 4.8  # inches: a figure of several panels, and of one
@@ -90,6 +93,24 @@ class PrintedFigure(NamedTuple):
 def printed(figure: Figure) -> PrintedFigure:
     """A figure drawn once, for a file and for a report."""
     return PrintedFigure(png_bytes(figure), figure.get_figwidth())
+
+
+def save_figure(path: FilePath, figure: Figure, *, dots_per_inch: float = 220.0) -> None:
+    """Write a figure as a PNG, whole or not at all.
+
+    Raises `ValueError` when `path` does not end in .png or cannot be written.
+    """
+    if not file_name(path).lower().endswith(".png"):
+        raise ValueError(f"`path` must end in .png, but is {file_name(path)}.")
+    write_atomically(path, png_bytes(figure, dots_per_inch=dots_per_inch))
+
+
+def save_figures(folder: Path, figures: Mapping[str, Figure]) -> dict[str, PrintedFigure]:
+    """Write figures as PNG files into a folder, each under its name; as printed, for a report."""
+    drawn = {name: printed(figure) for name, figure in figures.items()}
+    for name, one in drawn.items():
+        write_atomically(folder / f"{name}.png", one.png)
+    return drawn
 
 
 def panels(width: float, height: float, rows: int, columns: int) -> tuple[Figure, np.ndarray]:

@@ -22,7 +22,7 @@ from snrmjax.report import style as drawing
 from snrmjax.report.figures import identification as plot
 from snrmjax.report.figures.simulation import normal_mode_figure, simulated_response_figure
 from snrmjax.report.sampling import SHOWN_AMPLITUDES
-from snrmjax.report.style import png_bytes
+from snrmjax.report.style import png_bytes, save_figure
 
 
 def named(axes, label):
@@ -399,7 +399,7 @@ def test_modal_damping_of_several_series(identification, backbone):
 
 def test_saved_figures_are_png_files(tmp_path, mode):
     figure = normal_mode_figure(mode)
-    plot.save_figure(tmp_path / "mode.png", figure, dots_per_inch=50)
+    save_figure(tmp_path / "mode.png", figure, dots_per_inch=50)
     image = mpl.image.imread(tmp_path / "mode.png")
     assert image.shape[:2] == (160, 360)
     assert np.ptp(image[..., :3]) == 1.0
@@ -411,16 +411,16 @@ def test_figures_are_saved_whole_or_not_at_all(tmp_path, mode, monkeypatch):
     target = tmp_path / "mode.png"
     target.write_bytes(b"before")
     with pytest.raises(ValueError, match=r"must end in \.png, but is mode\.pdf"):
-        plot.save_figure(tmp_path / "mode.pdf", figure)
+        save_figure(tmp_path / "mode.pdf", figure)
     with pytest.raises(ValueError, match="its folder does not exist"):
-        plot.save_figure(tmp_path / "no" / "mode.png", figure)
+        save_figure(tmp_path / "no" / "mode.png", figure)
 
     def fail(*_args, **_keywords):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("os.replace", fail)
     with pytest.raises(ValueError, match="No space left"):
-        plot.save_figure(target, figure)
+        save_figure(target, figure)
     assert target.read_bytes() == b"before"
     assert [file.name for file in tmp_path.iterdir()] == ["mode.png"]
 

@@ -194,7 +194,7 @@ def even_share(misfit: WeightedMisfit, fit: EffectFit, kind: str) -> tuple[float
     states, modes = misfit.predictions.chosen.states, misfit.predictions.model.modes
     j, sensors = modes.mode_of_interest, misfit.predictions.chosen.sensors
     shape = float(modes.mode_shape[sensors[0], j])
-    natural, ratio = float(modes.natural_frequency[j]), float(modes.damping_ratio[j])
+    natural, ratio = modes.natural_frequency.item(j), modes.damping_ratio.item(j)
     omega = np.asarray(states.frequency)
     measured = np.asarray(states.velocity)[:, 0]
     velocity = measured / shape

@@ -141,13 +141,13 @@ def scales_of_motions(
 ) -> MotionScales:
     """Typical sizes of motions, by velocity amplitudes at a sensor, frequencies and forces."""
     j = modes.mode_of_interest
-    amplitude = speed / omega / abs(float(modes.mode_shape[sensor, j]))
+    amplitude = speed / omega / abs(modes.mode_shape.item(sensor, j))
     return MotionScales(
         amplitude=float(np.median(amplitude)),
         largest=float(np.max(amplitude)),
-        frequency=float(modes.natural_frequency[j]),
-        stiffness=float(np.median(abs(float(modes.participation[j])) * force / amplitude)),
+        frequency=modes.natural_frequency.item(j),
+        stiffness=float(np.median(abs(modes.participation.item(j)) * force / amplitude)),
         receptance=float(np.median(speed / omega / force)),
         smallest_force=float(np.min(force)),
-        damping_ratio=float(modes.damping_ratio[j]),
+        damping_ratio=modes.damping_ratio.item(j),
     )

@@ -336,7 +336,7 @@ def _of_modal_mass(model: Structure, force_gain_std: float) -> dict[str, float]:
     modes, j = model.modes, model.modes.mode_of_interest
     if modes.modal_mass_std is None or force_gain_std > 0:
         return {}
-    std = abs(float(modes.participation[j])) * float(modes.modal_mass_std[j])
+    std = abs(modes.participation.item(j)) * modes.modal_mass_std.item(j)
     return {f"mode_{j + 1}.participation": std} if std > 0 else {}
 
 
@@ -365,7 +365,7 @@ def _all_effects(baseline: Structure, scales: MotionScales) -> Group:
 def with_idle_effects(model: Structure, kinds: Sequence[str]) -> Structure:
     """The model with further effects that have no strength: the same physics."""
     modes, j = model.modes, model.modes.mode_of_interest
-    mode = float(modes.natural_frequency[j]), float(modes.damping_ratio[j])
+    mode = modes.natural_frequency.item(j), modes.damping_ratio.item(j)
     added = tuple(EFFECTS[kind].without_strength(*mode) for kind in kinds)
     return dataclasses.replace(model, effects=(*model.effects, *added))
 

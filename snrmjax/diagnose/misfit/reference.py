@@ -71,16 +71,16 @@ def test_states_of(predictions: Predictions, rows: np.ndarray) -> TestStates:
     # Of few sizes: operations of JAX compile for every one.
     load: list[Any] = [padded(np.asarray(a)) for a in (states.frequency, states.force)]
     beside: Array = residual_velocity(modes, *load)
-    constant = float(modes.mode_shape[sensor, j] * modes.participation[j])
+    constant = modes.mode_shape.item(sensor, j) * modes.participation.item(j)
     n_sensors = states.velocity.shape[1]
     stated = np.asarray(states.error)[:, [0, 1, 1 + n_sensors]]
     errors, _ = state_errors(stated)
     if not chosen.noise_stated:
         errors = np.tile([errors[0, 0] / errors[0, 1], 1.0, 1.0], (len(rows), 1))
     gain, phase, frequency, damping = predictions.given.level_stds
-    natural = float(modes.natural_frequency[j])
-    ratio = float(modes.damping_ratio[j])
-    mass_std = 0.0 if modes.modal_mass_std is None else float(modes.modal_mass_std[j])
+    natural = modes.natural_frequency.item(j)
+    ratio = modes.damping_ratio.item(j)
+    mass_std = 0.0 if modes.modal_mass_std is None else modes.modal_mass_std.item(j)
     return TestStates(
         level=np.asarray(states.level),
         frequency=np.asarray(states.frequency),

@@ -265,23 +265,24 @@ def packed(family: AbstractFamily, room: int = 0) -> PackedCurve:
     def filled(rows: Any, *lengths: int) -> Array:
         rows = xp.asarray(rows)
         added = [(0, to - now) for to, now in zip(lengths, rows.shape, strict=True)]
-        return jnp.asarray(xp.pad(rows, added))
+        return xp.pad(rows, added)
 
     far = _FAR * np.arange(1.0, size + 3)[len(terms.knots) :]
     mix = [filled(terms.mix[:k], powers, size), filled(terms.mix[k : k + h], size, size)]
-    return PackedCurve(
+    curve = PackedCurve(
         parameters=filled(parameters, size),
-        scale=jnp.asarray(family.scale),
+        scale=xp.asarray(family.scale),
         made_of=Terms(
             exponents=filled(terms.exponents, powers),
             is_free=filled(terms.is_free, powers),
-            largest_exponent=jnp.asarray(terms.largest_exponent),
-            knots=jnp.asarray(xp.concatenate([terms.knots, far])),
-            mix=jnp.asarray(xp.concatenate(mix)),
+            largest_exponent=xp.asarray(terms.largest_exponent),
+            knots=xp.concatenate([terms.knots, far]),
+            mix=xp.concatenate(mix),
             prior=filled(terms.prior, size, size),
         ),
-        of_velocity=jnp.asarray(family.argument == "velocity"),
+        of_velocity=xp.asarray(family.argument == "velocity"),
     )
+    return curve if traced else jax.device_put(curve)
 
 
 def linear_start(

@@ -123,7 +123,7 @@ def contributions(fit: JointFit) -> Contributions:
         if np.any(by_state[:, :, k]):
             name = f"random error of {kind}"
             rows.append((name, name, by_state[:, :, k]))
-    n_linear = len(fit.unknowns.linear)
+    n_linear, linear_std = len(fit.unknowns.linear), np.asarray(fit.prior.linear)
     levels = inverse[:, p - n_linear - n_levels * len(LEVEL_ERRORS) : p - n_linear]
     levels = levels.reshape(p, n_levels, len(LEVEL_ERRORS))
     for k, kind in enumerate(LEVEL_ERRORS):
@@ -134,7 +134,7 @@ def contributions(fit: JointFit) -> Contributions:
             ]
     for k in range(n_linear):
         column = inverse[:, p - n_linear + k]
-        if fit.prior.linear[k] > 0:
+        if linear_std[k] > 0:
             name = "modal mass" if k == n_linear - 1 else f"linear parameter {k + 1}"
             kind = "modal mass" if k == n_linear - 1 else "linear parameters"
             rows.append((name, kind, column[:, None]))

@@ -55,14 +55,14 @@ class Identification(AbstractResult):
     def level_frequency_std(self) -> float:
         """1σ of the natural frequency (rad/s) that the states of a level share."""
         j = self.fit.modes.mode_of_interest
-        natural = float(self.fit.modes.natural_frequency[j])
+        natural = self.fit.modes.natural_frequency.item(j)
         return 0.5 * float(self.fit.noise.level_std[2]) * natural
 
     @property
     def level_damping_std(self) -> float:
         """The same of the damping ratio."""
         j = self.fit.modes.mode_of_interest
-        return float(self.fit.noise.level_std[3]) * float(self.fit.modes.damping_ratio[j])
+        return float(self.fit.noise.level_std[3]) * self.fit.modes.damping_ratio.item(j)
 
     def summary(self) -> tuple[str, ...]:
         """How many points, ranges of the curves, what states and levels scatter by, notes."""
@@ -176,7 +176,7 @@ def identification_of_fit(
     if not fit.noise.stated:
         gain, phase = map(float, fit.noise.level_std[:2])
         j = fit.modes.mode_of_interest
-        natural = float(fit.modes.natural_frequency[j])
+        natural = fit.modes.natural_frequency.item(j)
         frequency_jitter_std = 0.5 * natural * float(np.max(np.asarray(fit.data.std)[:, 3]))
         points = errors_from_scatter(
             points,

@@ -275,7 +275,7 @@ def _information(fit: JointFit, states: _States) -> Float[np.ndarray, "state par
         share=jnp.asarray(share),
         std=jnp.broadcast_to(jnp.asarray(std), (n, len(std))),
         weight=jnp.ones(n),
-        correction=no_errors(n),
+        correction=jax.device_put(no_errors(n)),
         n_levels=n_levels,
         sensor=fit.data.sensor,
     )

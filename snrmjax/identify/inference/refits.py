@@ -2,16 +2,19 @@
 
 import jax
 import jax.numpy as jnp
+import lineax as lx
 import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from snrmjax.identify.joint.family_fit import SOLVER
 from snrmjax.identify.joint.force_balance import BalanceProblem, filled
 from snrmjax.identify.joint.free_unknowns import Unravel, corrected_residuals, padded_problem
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.numerics.compiled import compiled
 
+SOLVER: optx.AbstractLeastSquaresSolver = optx.LevenbergMarquardt(
+    rtol=1e-10, atol=1e-10, linear_solver=lx.QR()
+)
 _MOST_STEPS = 200  # of a refit
 
 

@@ -1,13 +1,11 @@
 """Families of curves by name, fitted to the exact force balance by Levenberg–Marquardt."""
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import lineax as lx
 import numpy as np
-import optimistix as optx
 from jaxtyping import Array, Float
 
 from snrmjax.identify.checks.residual_autocorrelation import share_told_by
@@ -24,13 +22,6 @@ from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.least_squares import degrees_spent, root_of_inverse
 from snrmjax.numerics.status import Status
 
-SOLVER: optx.AbstractLeastSquaresSolver = optx.LevenbergMarquardt(
-    rtol=1e-10, atol=1e-10, linear_solver=lx.QR()
-)
-# A round starts near its end: cost to 1e-7, unknowns to 1 % of their 1σ.
-_ROUND: optx.AbstractLeastSquaresSolver = optx.LevenbergMarquardt(
-    rtol=1e-7, atol=1e-4, linear_solver=lx.QR()
-)
 MOST_STEPS = 200  # of Levenberg–Marquardt in a fit
 _ROUNDS = 6  # of fitting and estimating the noise anew, at most
 _SETTLED = 0.01  # relative change of the noise, in the last of them
@@ -140,9 +131,15 @@ def _solved(
     Every unknown counts in its own `unit`, so that the solver's damping treats all alike; states
     are corrected for their most likely errors at every step.
     """
+    with jax.ensure_compile_time_eval():  # late, as in `snrmjax.identify.pointwise.inversion`
+        import lineax as lx
+        import optimistix as optx
+
+    # A round starts near its end: cost to 1e-7, unknowns to 1 % of their 1σ.
+    solver: Any = optx.LevenbergMarquardt(rtol=1e-7, atol=1e-4, linear_solver=lx.QR())
     solution: optx.Solution = optx.least_squares(
         lambda y, _: corrected_residuals(y * unit, unravel, problem),
-        *(_ROUND, vector / unit),
+        *(solver, vector / unit),
         max_steps=MOST_STEPS,
         throw=False,
     )

@@ -24,7 +24,7 @@ from snrmjax.measure.states import SteadyStates, check_phases, relative_errors
 from snrmjax.model.modes import UNSTATED_MODAL_MASS_STD, LinearModes, residual_velocity
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import mapped
-from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.compiled import as_numpy, compiled
 
 STATE_ERRORS = ("force", "velocity", "phase", "stiffness")
 """What every state may err in at random, relative or in rad; stiffness is never stated."""
@@ -91,20 +91,22 @@ class BalanceProblem(eqx.Module):
     def modal_constant(self) -> Float[Array, ""]:
         """A = Φ_r Φᵀb in 1/kg of the model: 1/|A| is its modal mass, seen from force and sensor."""
         r, j = self.data.sensor, self.modes.mode_of_interest
-        return self.modes.mode_shape[r, j] * self.modes.participation[j]
+        return as_numpy(self.modes.mode_shape)[r, j] * as_numpy(self.modes.participation)[j]
 
-    def modal_mass_of(self, unknowns: Unknowns) -> Float[Array, ""]:
+    def modal_mass_of(self, unknowns: Unknowns) -> float:
         """The modal mass in kg, seen from force and sensor, that the fit found."""
-        return 1 / jnp.abs(self.constant_of(unknowns))
+        return 1 / abs(float(self.constant_of(unknowns)))
 
     def constant_of(self, unknowns: Unknowns) -> Float[Array, ""]:
         """`modal_constant` with the modal mass that the fit found."""
-        return self.modal_constant * jnp.exp(-log_modal_mass(unknowns, self.prior.linear))
+        logarithm = log_modal_mass(unknowns, self.prior.linear)
+        exp: Any = jnp.exp if isinstance(logarithm, jax.Array) else np.exp
+        return self.modal_constant * exp(-logarithm)
 
 
 def log_modal_mass(unknowns: Unknowns, linear_std: Float[Array, " deviation"]) -> Float[Array, ""]:
     """The logarithm of the fit's modal mass over the model's: the last of the deviations."""
-    return unknowns.linear[-1] * linear_std[-1]
+    return as_numpy(unknowns.linear)[-1] * as_numpy(linear_std)[-1]
 
 
 def stated_level_std(model: Structure | LinearModes) -> Float[np.ndarray, " error"]:
@@ -118,7 +120,7 @@ def stated_level_std(model: Structure | LinearModes) -> Float[np.ndarray, " erro
         return np.zeros(len(LEVEL_ERRORS))
     gain, phase, frequency, damping = model.level_stds
     j = model.modes.mode_of_interest
-    natural, ratio = float(model.modes.natural_frequency[j]), float(model.modes.damping_ratio[j])
+    natural, ratio = model.modes.natural_frequency.item(j), model.modes.damping_ratio.item(j)
     if damping > 0 and ratio <= 0:
         raise ValueError(
             "`level_damping_std` is stated, but the linear damping ratio that it is relative to "
@@ -136,11 +138,12 @@ def stated_prior(
     """
     keep = np.asarray(modes.residual_modes, dtype=int)
     stated = modes.modal_mass_std
-    mass = UNSTATED_MODAL_MASS_STD if stated is None else float(stated[modes.mode_of_interest])
+    mass = UNSTATED_MODAL_MASS_STD if stated is None else stated.item(modes.mode_of_interest)
     each = (modes.natural_frequency_std, modes.damping_ratio_std)
     linear = [*(np.asarray(std)[keep] for std in each), [0.0 if "force_gain" in free else mass]]
-    of_force = jnp.asarray(float("force_gain" in free))
-    return PriorStd(jnp.asarray(level_std), jnp.asarray(np.concatenate(linear)), of_force)
+    of_force = float("force_gain" in free)
+    values = map(np.asarray, (level_std, np.concatenate(linear), of_force))
+    return PriorStd(*jax.device_put(list(values)))
 
 
 def balance_data(
@@ -171,22 +174,19 @@ def balance_data(
     of_force = np.where(errors[:, 0] > 0, errors[:, 0], FORCE_TO_VELOCITY * errors[:, 1])
     errors = np.column_stack([of_force, errors[:, 1:], np.zeros(len(errors))])  # no stiffness yet
     levels, index = np.unique(np.asarray(data.level)[keep], return_inverse=True)
-    return (
-        BalanceData(
-            level=jnp.asarray(index),
-            frequency=jnp.asarray(np.asarray(data.frequency)[keep]),
-            force=jnp.asarray(force[keep]),
-            velocity=jnp.asarray(velocity[keep]),
-            share=jnp.asarray(share[keep]),
-            std=jnp.asarray(errors[keep]),
-            weight=jnp.asarray(np.ones(int(keep.sum()))),
-            correction=no_errors(int(keep.sum())),
-            n_levels=len(levels),
-            sensor=r,
-        ),
-        known,
-        tuple(levels.tolist()),
-    )
+    columns: dict[str, Any] = {
+        "level": index,
+        "frequency": np.asarray(data.frequency)[keep],
+        "force": force[keep],
+        "velocity": velocity[keep],
+        "share": share[keep],
+        "std": errors[keep],
+        "weight": np.ones(int(keep.sum())),
+        "correction": no_errors(int(keep.sum())),
+    }
+    # All at once: one by one they compile, a copy of every shape.
+    measured = BalanceData(**jax.device_put(columns), n_levels=len(levels), sensor=r)
+    return measured, known, tuple(levels.tolist())
 
 
 _one_sensor = compiled(modal_filter)
@@ -219,20 +219,30 @@ class Motion(eqx.Module):
 
 
 @compiled
-def _velocity_of_others(modes: LinearModes, frequency: Array, load: Array, share: Array) -> Array:
+def _velocity_of_others(
+    modes: LinearModes,
+    change: tuple[Array, Array],
+    frequency: Array,
+    load: Array,
+    share: Array,
+) -> Array:
+    modes = with_deviations(modes, *change)
     return jnp.sum(share * residual_velocity(modes, frequency, load), axis=1)
 
 
 def velocity_of_others(
-    modes: LinearModes, data: BalanceData, force: Float[np.ndarray, " state"]
+    problem: BalanceProblem,
+    deviation: Float[np.ndarray | Array, " deviation"],
+    force: Float[np.ndarray, " state"],
 ) -> Complex[np.ndarray, " state"]:
     """Velocity of all but the mode of interest under forces in N, by the sensors' shares.
 
-    One program serves many numbers of states.
+    The linear modes deviate by so many of their 1σ. One program serves many numbers of states.
     """
+    data, change = problem.data, (deviation, problem.prior.linear)
     n, size = len(force), with_room(len(force))
     rows = (filled(rows, size, None) for rows in (data.frequency, force, data.share))
-    return np.asarray(_velocity_of_others(modes, *rows))[:n]
+    return np.asarray(_velocity_of_others(problem.modes, change, *rows))[:n]
 
 
 def recorded_motion(unknowns: Unknowns, problem: BalanceProblem) -> Motion:
@@ -243,8 +253,8 @@ def recorded_motion(unknowns: Unknowns, problem: BalanceProblem) -> Motion:
     force = np.asarray(data.force) * np.exp(float(unknowns.log_force_gain) + of_force)
     force = force + float(unknowns.force_offset) * np.min(np.asarray(data.force))
     turned = of_force - level[:, 0] - 1j * (level[:, 1] + float(unknowns.instrument_phase))
-    linear = with_deviations(problem.modes, unknowns.linear, prior.linear)
-    of_mode = np.asarray(data.velocity) * np.exp(turned) - velocity_of_others(linear, data, force)
+    others = velocity_of_others(problem, unknowns.linear, force)
+    of_mode = np.asarray(data.velocity) * np.exp(turned) - others
     return Motion(of_mode, np.abs(of_mode) / np.asarray(data.frequency), force)
 
 
@@ -307,9 +317,9 @@ def filled(rows: Array | np.ndarray, size: int, spare: float | None) -> np.ndarr
     return np.concatenate([known, missing if spare is None else np.full_like(missing, spare)])
 
 
-def no_errors(n_states: int) -> Float[Array, "state input"]:
+def no_errors(n_states: int) -> Float[np.ndarray, "state input"]:
     """States as they were recorded."""
-    return jnp.asarray(np.zeros((n_states, len(STATE_ERRORS))))
+    return np.zeros((n_states, len(STATE_ERRORS)))
 
 
 class Weighting(NamedTuple):

@@ -43,7 +43,7 @@ class Unravel(eqx.Module):
         if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
             return ravel_pytree(moving)[0]
         # On the host nothing compiles for one more size.
-        return jnp.asarray(np.concatenate([np.ravel(np.asarray(leaf)) for leaf in leaves]))
+        return jax.device_put(np.concatenate([np.ravel(np.asarray(leaf)) for leaf in leaves]))
 
     def __call__(self, vector: Float[Array, " unknown"]) -> Unknowns:
         """All unknowns, the free ones from the vector."""
@@ -53,10 +53,8 @@ class Unravel(eqx.Module):
         leaves, structure = jax.tree.flatten(moving)
         ends = np.cumsum([leaf.size for leaf in leaves])
         pieces = np.split(np.asarray(vector), ends[:-1])
-        parts = [
-            jnp.asarray(part.reshape(leaf.shape)) for part, leaf in zip(pieces, leaves, strict=True)
-        ]
-        return eqx.combine(jax.tree.unflatten(structure, parts), fixed)
+        parts = [part.reshape(leaf.shape) for part, leaf in zip(pieces, leaves, strict=True)]
+        return eqx.combine(jax.tree.unflatten(structure, jax.device_put(parts)), fixed)
 
 
 class PackedUnknowns(NamedTuple):

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Sequence
 
 import equinox as eqx
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
@@ -127,13 +127,14 @@ class JointFit(AbstractResult):
         """
         share = self.problem.constant_of(self.unknowns) / self.problem.modal_constant
         j, modes = self.modes.mode_of_interest, self.modes
-        scaled = eqx.tree_at(
-            lambda m: m.participation, modes, modes.participation.at[j].multiply(share)
-        )
+        participation = np.array(modes.participation)
+        participation[j] *= share
+        scaled = eqx.tree_at(lambda m: m.participation, modes, jax.device_put(participation))
         if modes.modal_mass_std is None:
             return scaled
-        left = self.prior.linear[-1] * jnp.sqrt(jnp.asarray(self.covariance)[-1, -1])
-        return eqx.tree_at(lambda m: m.modal_mass_std, scaled, modes.modal_mass_std.at[j].set(left))
+        std = np.array(modes.modal_mass_std)
+        std[j] = np.asarray(self.prior.linear)[-1] * np.sqrt(self.covariance[-1, -1])
+        return eqx.tree_at(lambda m: m.modal_mass_std, scaled, jax.device_put(std))
 
     def motion(self) -> Motion:
         """The nonlinear mode's motion in the states as the fit sees it."""
@@ -150,9 +151,9 @@ class JointFit(AbstractResult):
         return np.asarray(drive) * gain + offset
 
     def _force_line(self) -> tuple[float, float]:
-        smallest = float(jnp.min(self.data.force))
+        smallest = float(np.min(np.asarray(self.data.force)))
         offset = float(self.unknowns.force_offset) * smallest
-        return float(jnp.exp(self.unknowns.log_force_gain)), offset
+        return float(np.exp(float(self.unknowns.log_force_gain))), offset
 
     def vector(self) -> tuple[Float[Array, " unknown"], Unravel]:
         """The free unknowns as a vector, and the way back to all of them."""
@@ -337,16 +338,13 @@ def corrected_states(data: SteadyStates, fit: JointFit) -> SteadyStates:
     Where only a drive voltage is known, the force in N is that voltage times the fitted gain.
     """
     unknowns = fit.unknowns
-    nominal = data.drive if fit.drive_known_only else data.force
-    offset = unknowns.force_offset * jnp.min(fit.data.force)
-    return eqx.tree_at(
-        lambda d: (d.force, d.velocity),
-        data,
-        (
-            nominal * jnp.exp(unknowns.log_force_gain) + offset,
-            data.velocity * jnp.exp(-1j * unknowns.instrument_phase),
-        ),
+    nominal = np.asarray(data.drive if fit.drive_known_only else data.force)
+    offset = float(unknowns.force_offset) * np.min(np.asarray(fit.data.force))
+    found = (
+        nominal * np.exp(float(unknowns.log_force_gain)) + offset,
+        np.asarray(data.velocity) * np.exp(-1j * float(unknowns.instrument_phase)),
     )
+    return eqx.tree_at(lambda d: (d.force, d.velocity), data, jax.device_put(found))
 
 
 def _notes(

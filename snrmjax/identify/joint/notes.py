@@ -93,7 +93,7 @@ def notes_on_modal_mass(
     covariance: Float[np.ndarray, "unknown unknown"],
 ) -> list[Fact]:
     """Which modal mass the damping is relative to: the model's, or one that the data ask for."""
-    prior = float(problem.prior.linear[-1])
+    prior = problem.prior.linear.item(-1)
     model = 1 / abs(float(problem.modal_constant))
     mass = float(problem.modal_mass_of(unknowns))
     std = mass * prior * float(np.sqrt(covariance[-1, -1]))

@@ -17,7 +17,6 @@ from snrmjax.identify.joint.force_balance import (
     BalanceProblem,
     Unknowns,
     velocity_of_others,
-    with_deviations,
 )
 from snrmjax.identify.joint.notes import NoiseEstimate
 from snrmjax.identify.test_model.curve_basis import MOST_KNOTS
@@ -81,7 +80,8 @@ def view_of(
     mass, std = posterior.modal_mass
     assumed = "force_gain" not in free and problem.modes.modal_mass_std is None
     if assumed and abs(mass - 1) < _ASKED * std:
-        known = dataclasses.replace(problem.prior, linear=problem.prior.linear.at[-1].set(0.0))
+        linear = np.append(np.asarray(problem.prior.linear)[:-1], 0.0)
+        known = dataclasses.replace(problem.prior, linear=jax.device_put(linear))
         problem = dataclasses.replace(problem, prior=known)
         states = states._replace(mass_std=0.0)
         posterior = fit(states, compare_levels=False, rounds=rounds._replace(start=posterior))
@@ -141,8 +141,7 @@ def _test_states(
     spread = np.asarray(prior.linear)
 
     def beside(deviation: np.ndarray) -> Complex[np.ndarray, " state"]:
-        modes = with_deviations(problem.modes, jax.device_put(deviation), prior.linear[:-1])
-        return velocity_of_others(modes, data, force)
+        return velocity_of_others(problem, np.append(deviation, 0.0), force)
 
     constant = float(problem.modal_constant)
     sign = np.sign(constant)

@@ -6,61 +6,15 @@ paper's Eq. (17) reads (ω̃² − Ω²) = 2ζ̃ω̃Ω tan φ, and is used multi
 resonance (φ = 0) and at ±90° alike.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import lineax as lx
-import optimistix as optx
 from jaxtyping import Array, Bool, Complex, Float
 
 from snrmjax.identify.pointwise.inversion_result import PointStatus, SnrmPoints
 
-
-class CramersRule(lx.AbstractLinearSolver[Any]):
-    """Solves a 2×2 linear system by Cramer's rule: the whole cost of a small Newton step.
-
-    With `zero_stays_zero` a zero right side has a zero answer even of a singular matrix: on the
-    way back of a derivative a failed member of a batch then adds nothing to the others.
-    """
-
-    zero_stays_zero: bool = False
-
-    def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]) -> Array:
-        """See `lineax.AbstractLinearSolver.init`."""
-        if operator.in_size() != 2 or operator.out_size() != 2:
-            raise ValueError("`CramersRule` solves systems of two equations for two unknowns only.")
-        return operator.as_matrix()
-
-    def compute(
-        self, state: Array, vector: Array, options: dict[str, Any]
-    ) -> tuple[Array, lx.RESULTS, dict[str, Any]]:
-        """See `lineax.AbstractLinearSolver.compute`."""
-        (a, b), (c, d) = state
-        x = (d * vector[0] - b * vector[1]) / (a * d - b * c)
-        y = (a * vector[1] - c * vector[0]) / (a * d - b * c)
-        answer = jnp.stack([x, y])
-        if self.zero_stays_zero:
-            answer = jnp.where(jnp.all(vector == 0), 0.0, answer)
-        return answer, lx.RESULTS.successful, {}
-
-    def transpose(self, state: Array, options: dict[str, Any]) -> tuple[Array, dict[str, Any]]:
-        """See `lineax.AbstractLinearSolver.transpose`."""
-        return state.T, {}
-
-    def conj(self, state: Array, options: dict[str, Any]) -> tuple[Array, dict[str, Any]]:
-        """See `lineax.AbstractLinearSolver.conj`."""
-        return state.conj(), {}
-
-    def assume_full_rank(self) -> bool:
-        """See `lineax.AbstractLinearSolver.assume_full_rank`."""
-        return True
-
-
-_NEWTON: optx.AbstractRootFinder = optx.Newton(rtol=1e-11, atol=1e-12, linear_solver=CramersRule())
-_STEPS = 8  # from the closed form one step is enough, two where the two roots nearly meet
 _CHUNK = 1 << 14  # members that are solved at a time on a CPU: they stay in its cache
-_ADJOINT = optx.ImplicitAdjoint(linear_solver=CramersRule(zero_stays_zero=True))
 
 
 def closed_form(
@@ -221,6 +175,11 @@ def _equations(unknowns: Array, args: tuple) -> Array:
 
 def _newton(member: _Member) -> tuple[Array, Array, Array]:
     """One member: the Newton solve from the closed form at |V_nl| = `length`."""
+    # Who finds the program on disk does not wait for the import of its solver, which must not see
+    # that a program is being traced.
+    with jax.ensure_compile_time_eval():
+        from snrmjax.identify.pointwise.two_equations import root_of_two
+
     modal_constant, frequency, amplitude, cosine, sine, residual, length = member
     # The unknown is D = scale·((x² − 1) + 2iζ̃x), x = ω̃/Ω, of length one at the closed form: x
     # itself would resolve a lightly damped resonance no finer than rounding of Ω allows.
@@ -237,16 +196,13 @@ def _newton(member: _Member) -> tuple[Array, Array, Array]:
         residual.imag * unit,
         amplitude * unit,
     )
-    solution: optx.Solution = optx.root_find(
-        _equations, _NEWTON, start, args, max_steps=_STEPS, adjoint=_ADJOINT, throw=False
-    )
-    good = jnp.asarray(solution.result == optx.RESULTS.successful)
-    squared = 1.0 + solution.value[0] / scale
+    value, good = root_of_two(_equations, start, args)
+    squared = 1.0 + value[0] / scale
     real = squared > 0
     # NaN only at the end: inside it would pass every `where` on a derivative's way back.
     x = jnp.sqrt(jnp.where(real, squared, 1.0))
     natural = jnp.where(real, x * frequency, jnp.nan)
-    damping = jnp.where(real, solution.value[1] / (2.0 * scale * x), jnp.nan)
+    damping = jnp.where(real, value[1] / (2.0 * scale * x), jnp.nan)
     return natural, damping, good
 
 

@@ -8,6 +8,7 @@ from jaxtyping import Array, Complex, Float, Int
 
 from snrmjax.identify.curves.family_base import Argument
 from snrmjax.identify.pointwise.inversion_result import PointStatus
+from snrmjax.numerics.compiled import as_numpy
 from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
 
 
@@ -64,9 +65,9 @@ class BackbonePoints(AbstractResult):
     @property
     def modal_damping(self) -> Float[Array, " state"]:
         """2ζ̃ω̃ in 1/s."""
-        return 2 * self.damping_ratio * self.natural_frequency
+        return 2 * as_numpy(self.damping_ratio) * as_numpy(self.natural_frequency)
 
     @property
     def usable(self) -> Array:
         """Points that enter curves: solved, and solved without doubt."""
-        return self.status == int(PointStatus.OK)
+        return as_numpy(self.status) == int(PointStatus.OK)

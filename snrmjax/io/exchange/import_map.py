@@ -3,16 +3,18 @@
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import tomli_w
 
 from snrmjax.io.files import FilePath, file_name, read_text, shown
-from snrmjax.io.laboratory.contents import TextFormat
 from snrmjax.io.toml_table import TomlTable, parsed_toml
 from snrmjax.measure.recordings.step_counts import StepCounts
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.names import suggestion
+
+if TYPE_CHECKING:
+    from snrmjax.io.laboratory.contents import TextFormat
 
 _MOTIONS = ("displacement", "velocity", "acceleration")
 _CHANNELS, _NUMBERS, _TEXTS = "Channels and columns", "What the numbers are", "Text files"
@@ -146,8 +148,10 @@ class ImportMap(NamedTuple):
         return self._replace(separator="", decimal="", header_row=0, dataset="") == ImportMap()
 
     @property
-    def text_format(self) -> TextFormat:
+    def text_format(self) -> "TextFormat":
         """How texts are written."""
+        from snrmjax.io.laboratory.contents import TextFormat
+
         return TextFormat(self.separator or None, self.decimal or None, self.header_row or None)
 
 

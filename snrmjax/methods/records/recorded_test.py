@@ -84,7 +84,7 @@ def recorded_test(recording: TimeRecording, modes: LinearModes) -> RecordedTest:
     are no seconds, another structure), a single tone, and a record of no known kind.
     """
     channels = _channels(recording, modes)
-    rest = float(modes.natural_frequency[modes.mode_of_interest])
+    rest = modes.natural_frequency.item(modes.mode_of_interest)
     motion = recording.values([channels.reference], 0, _LOOKED_AT)[0]
     if not np.isfinite(motion).all():
         raise ValueError(

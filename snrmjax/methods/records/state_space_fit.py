@@ -178,7 +178,7 @@ def _mode_frequency(linear: MultisineResponses, modes: LinearModes | None) -> fl
     frequency = linear.responses.frequency
     if modes is None:
         return float(frequency[np.argmax(np.abs(linear.responses.values[0, 0]))])
-    natural = float(modes.natural_frequency[modes.mode_of_interest])
+    natural = modes.natural_frequency.item(modes.mode_of_interest)
     if not frequency[0] <= natural <= frequency[-1]:
         raise ValueError(
             f"lines around the mode at {natural / (2 * np.pi):.4g} Hz are needed, but the records "

@@ -8,7 +8,7 @@ power of x, dry friction and a contact are all smooth.
 
 from typing import Any, ClassVar, Self
 
-import interpax
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -37,6 +37,9 @@ def secant_at(size: Scalar, knots: Knots, secant: Knots) -> Scalar:
     >>> secant_at(jnp.array([0.5, 2.0, 4.0]), knots, force / knots)
     Array([1., 2., 4.], dtype=float64)
     """
+    with jax.ensure_compile_time_eval():  # late, for those who draw no law, and outside a trace
+        import interpax
+
     place, last = jnp.log(knots), knots[-1]
     # The first slope makes the secant level below the first knot.
     slope = interpax.approx_df(place, secant, method="cubic2").at[0].set(0.0)

@@ -307,7 +307,7 @@ class CoulombFriction(AbstractHysteresis):
     force: Scalar = parameter(
         "kg^1/2 m/s²", "friction force", rules=(NOT_NEGATIVE,), prior=NOT_BELOW_ZERO
     )
-    smoothing_velocity: Scalar = eqx.field(default_factory=lambda: jnp.zeros(()))
+    smoothing_velocity: Scalar = eqx.field(default_factory=lambda: jax.device_put(np.zeros(())))
 
     def cycle_force(self, displacement: Samples, velocity: Samples) -> Samples:
         mean_square = jnp.mean(velocity**2)

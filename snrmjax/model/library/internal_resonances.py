@@ -3,6 +3,7 @@
 import dataclasses
 from typing import ClassVar, Self
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -72,7 +73,7 @@ class AbstractInternalResonance(AbstractAddedMode):
     def without_strength(cls, natural_frequency: float, damping_ratio: float) -> Self:
         """The further mode a tenth above n times ω₀."""
         hz = 1.1 * cls.order * natural_frequency / HERTZ
-        return cls(*(jnp.asarray(value) for value in (0.0, hz, damping_ratio)))
+        return cls(*jax.device_put([np.asarray(value) for value in (0.0, hz, damping_ratio)]))
 
     def expanded(
         self, modes: LinearModes, potential: PolynomialPotential

@@ -2,6 +2,7 @@
 
 from typing import Any, ClassVar, Self
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
@@ -239,7 +240,7 @@ class CloseMode(AbstractMeasurementEffect):
     @classmethod
     def without_strength(cls, natural_frequency: float, damping_ratio: float) -> Self:
         hz = 1.1 * natural_frequency / HERTZ
-        return cls(*(jnp.asarray(value) for value in (0.0, hz, damping_ratio)))
+        return cls(*jax.device_put([np.asarray(value) for value in (0.0, hz, damping_ratio)]))
 
     def recorded(
         self, frequency: Amplitude, force: Amplitude, velocity: Velocity, displacement: Amplitude

@@ -326,10 +326,10 @@ class _Motion:
     def __init__(self, model: Structure, data: SteadyStates, sensor: int) -> None:
         """Levels in order of their displacement at a sensor."""
         modes, j = model.modes, model.modes.mode_of_interest
-        self.natural_frequency = float(modes.natural_frequency[j])
-        self.damping_ratio = float(modes.damping_ratio[j])
-        self.shape = abs(float(modes.mode_shape[sensor, j]))  # m per kg^1/2 m
-        self.newtons = 1.0 / abs(float(modes.participation[j]))
+        self.natural_frequency = modes.natural_frequency.item(j)
+        self.damping_ratio = modes.damping_ratio.item(j)
+        self.shape = abs(modes.mode_shape.item(sensor, j))  # m per kg^1/2 m
+        self.newtons = 1.0 / abs(modes.participation.item(j))
         omega, level = np.asarray(data.frequency), np.asarray(data.level)
         moved = np.nan_to_num(np.abs(np.asarray(data.velocity))[:, sensor] / omega)
         farthest = [int(np.argmax(np.where(level == one, moved, -1.0))) for one in np.unique(level)]
@@ -399,7 +399,7 @@ def _recorded_change(
     speed = np.asarray(data.velocity)[:, sensor]
     good = np.isfinite(force) & np.isfinite(np.abs(speed))
     force, omega, speed = force[good], omega[good], speed[good]
-    shape = float(model.modes.mode_shape[sensor, model.modes.mode_of_interest])
+    shape = model.modes.mode_shape.item(sensor, model.modes.mode_of_interest)
     phasors = np.zeros((len(force), 2, len(model.modes.sensors)), dtype=complex)
     phasors[:, 1, sensor] = speed
     known = map(jnp.asarray, (omega, force, phasors, np.abs(speed / omega / shape)))

@@ -6,11 +6,9 @@ are in Hz, degrees and per cent of critical damping. Figures need no display and
 matplotlib's settings.
 """
 
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -21,7 +19,6 @@ from snrmjax.identify.pointwise.prediction import (
     PredictedResponse,
     Resonance,
 )
-from snrmjax.io.files import FilePath, file_name, write_atomically
 from snrmjax.io.units import DEGREE, HERTZ
 from snrmjax.measure.indicators import appropriation_of
 from snrmjax.measure.signals import force_velocity_loop
@@ -54,7 +51,6 @@ from snrmjax.report.style import (
     SERIES,
     SIMULATED,
     STAR,
-    PrintedFigure,
     banded,
     dress,
     explain_lines,
@@ -65,8 +61,6 @@ from snrmjax.report.style import (
     panels,
     phase_axis,
     plain,
-    png_bytes,
-    printed,
     response_line,
     share_frequencies,
     stars,
@@ -85,24 +79,6 @@ class DampingSeries(NamedTuple):
     label: str
     points: BackbonePoints | None = None
     backbone: Backbone | None = None
-
-
-def save_figure(path: FilePath, figure: Figure, *, dots_per_inch: float = 220.0) -> None:
-    """Write a figure as a PNG, whole or not at all.
-
-    Raises `ValueError` when `path` does not end in .png or cannot be written.
-    """
-    if not file_name(path).lower().endswith(".png"):
-        raise ValueError(f"`path` must end in .png, but is {file_name(path)}.")
-    write_atomically(path, png_bytes(figure, dots_per_inch=dots_per_inch))
-
-
-def save_figures(folder: Path, figures: Mapping[str, Figure]) -> dict[str, PrintedFigure]:
-    """Write figures as PNG files into a folder, each under its name; as printed, for a report."""
-    drawn = {name: printed(figure) for name, figure in figures.items()}
-    for name, one in drawn.items():
-        write_atomically(folder / f"{name}.png", one.png)
-    return drawn
 
 
 def _named_with_bars(*axes: tuple[np.ndarray, np.ndarray]) -> str:
@@ -181,7 +157,7 @@ def backbone_figure(
         seen += [*inside]
     if modes is not None:
         j = modes.mode_of_interest
-        linear = float(modes.natural_frequency[j]) / HERTZ, 100 * float(modes.damping_ratio[j])
+        linear = modes.natural_frequency.item(j) / HERTZ, 100 * modes.damping_ratio.item(j)
         diamond = {**HOLLOW, "marker": "D"}
         marks(speeds, linear[0], 0.0, diamond, "linear mode")
         marks(dampings, 0.0, linear[1], diamond)
@@ -293,32 +269,31 @@ def force_velocity_figure(
     """
     name = sensor or data.sensors[0]
     r = sensor_index(data.sensors, name)
-    good = np.flatnonzero(np.asarray(data.measured[:, r]) & np.isfinite(np.asarray(data.force)))
+    good = np.flatnonzero(np.asarray(data.measured)[:, r] & np.isfinite(np.asarray(data.force)))
     wrong = [k for k in states if k not in good]
     if wrong or not len(states):
         raise ValueError(
             f"`states` must be rows measured at {name!r} under a known force, of which there are "
             f"{len(good)}, but {f'has {wrong[0]}' if wrong else 'is empty'}."
         )
-    phasors = np.concatenate([data.velocity[:, r, None], data.harmonics[:, r]], axis=1)
+    velocity, higher = np.asarray(data.velocity), np.asarray(data.harmonics)
+    phasors = np.concatenate([velocity[:, r, None], higher[:, r]], axis=1)
     phasors = np.where(np.isfinite(phasors), phasors, 0.0)[list(states)]
     forces = np.asarray(data.force)[list(states)]
-    loops = force_velocity_loop(
-        jnp.asarray(forces), jnp.asarray(phasors), (1, *data.harmonic_order)
-    )
+    loops = force_velocity_loop(forces, phasors, (1, *data.harmonic_order))
     frequency, indicator = np.asarray(data.frequency) / HERTZ, np.asarray(appropriation_of(data))
     columns = min(3, len(states))
     height = -(-len(states) // columns)
     figure, grid = panels(PAGE / 3 * columns, 0.2 + 2.4 * height, height, columns)
     for number, (axes, k) in enumerate(zip(grid.flat, states, strict=False)):
-        force, velocity = np.asarray(loops.force[number]), np.asarray(loops.velocity[number])
+        force, velocity = np.asarray(loops.force)[number], np.asarray(loops.velocity)[number]
         force_unit, unit = unit_for(force, "N"), unit_for(velocity, "m/s")
         ends, phasor = np.array([-1.0, 1.0]), phasors[number, 0]
         in_phase = ends * forces[number] / force_unit.size, ends * phasor.real / unit.size
         axes.plot(*in_phase, "--", color=SIMULATED, linewidth=0.8)
         axes.plot(force / force_unit.size, velocity / unit.size, color=MEASURED, **CURVE)
         turn = f"{np.angle(phasor) / DEGREE:+.0f}°".replace("-", "−")
-        title = f"level {int(data.level[k])}, {frequency[k]:.4g} Hz\n"
+        title = f"level {int(np.asarray(data.level)[k])}, {frequency[k]:.4g} Hz\n"
         title += f"phase {turn}, indicator {indicator[k]:.2f}"
         name_axes(axes, title, f"Force ({force_unit.name})", f"Velocity ({unit.name})")
     for axes in grid.flat[len(states) :]:

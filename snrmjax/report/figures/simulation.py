@@ -3,14 +3,12 @@
 from collections.abc import Sequence
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from matplotlib import colormaps
 from matplotlib.figure import Figure
 
 from snrmjax.io.units import DEGREE, HERTZ
-from snrmjax.measure.signals import peak_amplitude
 from snrmjax.report.sampling import BAND, velocity_of
 from snrmjax.report.style import (
     BACKGROUND,
@@ -41,6 +39,7 @@ from snrmjax.report.style import (
     unit_for,
     with_unit,
 )
+from snrmjax.simulate.balance.labelled import velocity_peaks
 from snrmjax.simulate.solutions.controlled import DampedModeBranch
 from snrmjax.simulate.solutions.forced_response import ResponseBatch, ResponseCurve
 from snrmjax.simulate.solutions.normal_modes import NormalModeBranch
@@ -102,8 +101,7 @@ def normal_mode_figure(branch: NormalModeBranch, *, sensor: str | None = None) -
         raise ValueError("there is no normal mode to show: the branch has no point.")
     name = sensor or branch.sensors[0]
     fundamental = np.abs(velocity_of(branch, name))
-    signal = branch.velocity[:, 1:, branch.sensors.index(name)]
-    peak = np.asarray(peak_amplitude(jnp.asarray(signal), tuple(range(1, signal.shape[1] + 1))))
+    peak = velocity_peaks(branch.velocity[:, :, branch.sensors.index(name)])
     unit, omega = unit_for(peak, "m/s"), branch.frequency / HERTZ
     figure, ((speeds, energies),) = panels(PAGE, 3.2, 1, 2)
     speeds.plot(omega, peak / unit.size, color=SERIES[5], **CURVE, label="peak of the signal")

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 
+import jax
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -35,7 +36,6 @@ from snrmjax.report.figures.diagnosis import (
     misfit_figure,
 )
 from snrmjax.report.figures.drawn_laws import LAW_CAPTION, drawn_laws_figure, law_tables
-from snrmjax.report.figures.identification import save_figures
 from snrmjax.report.html import (
     Report,
     ReportFigure,
@@ -53,7 +53,7 @@ from snrmjax.report.pages.resonance_table import (
 )
 from snrmjax.report.sentences.diagnose import effect_name, kinds_in_words
 from snrmjax.report.sentences.diagnose import probability_in_words as in_words
-from snrmjax.report.style import PrintedFigure, unit_for, with_unit
+from snrmjax.report.style import PrintedFigure, save_figures, unit_for, with_unit
 
 _SHOWN = 10  # candidates
 _LEAST_P_VALUE = 1e-12  # smaller ones are not told apart
@@ -206,7 +206,7 @@ def _key_numbers(diagnosis: Diagnosis, predicted: Sequence[LevelResponse]) -> li
     if diagnosis.effects and gap.after > AS_NOISE:
         misfit += "; the ± above holds only if the noise is as stated"
     rows.append(("misfit of the force (rms), errors of levels and laws in it", misfit))
-    if np.isfinite(np.asarray(relative_errors(diagnosis.data))).any():
+    if np.isfinite(np.asarray(relative_errors(jax.tree.map(np.asarray, diagnosis.data)))).any():
         rows.append(
             (
                 "random part of it, by neighbouring states",
@@ -310,7 +310,7 @@ def _limits_section(diagnosis: Diagnosis) -> Section:
     rows, misfit, scales = [], diagnosis.force_misfit, None
     if diagnosis.completed is not None:
         modes, data = diagnosis.completed.modes, diagnosis.data
-        columns = (np.abs(data.velocity[:, misfit.sensor]), data.frequency, data.force)
+        columns = (np.abs(np.asarray(data.velocity)[:, misfit.sensor]), data.frequency, data.force)
         of_states = (np.asarray(column)[misfit.rows] for column in columns)
         scales = scales_of_motions(modes, misfit.sensor, *of_states)
     for name, limit in sorted(diagnosis.detection_limits.items()):

@@ -240,7 +240,7 @@ def identification_summary(
     def extremes(course: _Course) -> str:
         return " to ".join(f"{course.values[k]:.4g} {at(course, k)}" for k in course.extreme())
 
-    linear = float(modes.natural_frequency[modes.mode_of_interest]) / HERTZ
+    linear = modes.natural_frequency.item(modes.mode_of_interest) / HERTZ
     change = frequency.values[-1] - frequency.values[0]
     used, every = int(np.sum(np.asarray(points.usable))), len(np.asarray(points.status))
     rows = [

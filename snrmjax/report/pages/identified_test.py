@@ -24,7 +24,7 @@ from snrmjax.report.pages.joint_fit import (
     words_of_fit,
 )
 from snrmjax.report.sampling import SHOWN_AMPLITUDES, VELOCITY, ShownAmplitude
-from snrmjax.report.style import PrintedFigure
+from snrmjax.report.style import PrintedFigure, save_figures
 
 
 def settings_in_words(found: IdentifiedTest) -> dict[str, str]:
@@ -98,7 +98,7 @@ def identification_figures(
 
 def _linear_modal_damping(model: Structure) -> float:
     j = model.modes.mode_of_interest
-    return 2 * float(model.modes.damping_ratio[j] * model.modes.natural_frequency[j])
+    return 2 * model.modes.damping_ratio.item(j) * model.modes.natural_frequency.item(j)
 
 
 def _typical_states(found: IdentifiedTest) -> list[int]:
@@ -211,7 +211,7 @@ def write(
     ]
     summary["notes"] = [str(note) for note in found.notes]
     write_summary(folder / "summary.json", summary)
-    figures = plot.save_figures(folder, identification_figures(found, shown))
+    figures = save_figures(folder, identification_figures(found, shown))
     if found.joint is not None:
         done = done | {"curves": curves_in_words(found.joint.fit)}
     report = findings_report(found, title, done, figures)

@@ -7,8 +7,8 @@ import numpy as np
 from snrmjax.io import results
 from snrmjax.io.units import HERTZ
 from snrmjax.pipelines.simulate import SimulatedMode, SimulatedResponses
-from snrmjax.report.figures.identification import save_figure
 from snrmjax.report.figures.simulation import normal_mode_figure, simulated_response_figure
+from snrmjax.report.style import save_figure
 from snrmjax.simulate.continuation.response_curve import Branch, ResponseCurve
 
 

@@ -69,7 +69,7 @@ def _linear_mode(found: WholeTest) -> str:
         return modes.modes_sentence(found.modes.scaled)
     linear = found.model.modes
     j = linear.mode_of_interest
-    hertz, ratio = float(linear.natural_frequency[j]) / HERTZ, float(linear.damping_ratio[j])
+    hertz, ratio = linear.natural_frequency.item(j) / HERTZ, linear.damping_ratio.item(j)
     file = found.files.model_file
     return f"linear mode of {file}: {hertz:.5g} Hz, damping {100 * ratio:.3g} %"
 

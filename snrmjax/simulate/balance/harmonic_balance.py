@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from snrmjax.model.averaging import AveragedForce, averaged_effect
 from snrmjax.model.effect_base import AbstractForce, AbstractKinked
-from snrmjax.model.structures import LinearTerms, Structure
+from snrmjax.model.structures import Structure, linear_terms_of
 from snrmjax.numerics.compiled import compiled
 from snrmjax.simulate.balance.harmonics import (
     alias_free_samples,
@@ -261,7 +261,7 @@ def resonance_displacement(model: Structure, force: float) -> float:
     at least the static displacement of every mode, so that no motion is small beside it.
     """
     modes, j = model.modes, model.modes.mode_of_interest
-    mass, damping, stiffness = (np.asarray(part) for part in _linear_terms(model))
+    mass, damping, stiffness = (np.asarray(part) for part in linear_terms_of(model))
     participation = np.asarray(modes.participation)
     omega = np.sqrt(stiffness[j] / mass[j])
     least_damping = 1e-4 * omega
@@ -284,11 +284,6 @@ def resonance_displacement(model: Structure, force: float) -> float:
         viscous = viscous + np.asarray(added.damping)
     needed = np.maximum(viscous, least_damping) * np.sqrt(needed_stiffness) * amplitude
     return float(np.maximum(static, np.interp(load, np.maximum.accumulate(needed), amplitude)))
-
-
-@compiled
-def _linear_terms(model: Structure) -> LinearTerms:
-    return model.linear_terms()
 
 
 @compiled

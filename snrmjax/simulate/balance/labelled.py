@@ -1,10 +1,11 @@
 """Quantities of periodic motions as results label them."""
 
 import numpy as np
-from jaxtyping import Array, Complex
+from jaxtyping import Array, Complex, Float
 
 from snrmjax.measure.signals import peak_amplitude
 from snrmjax.numerics.blocks import by_blocks
+from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.result import Variable
 
 HERTZ = 2 * np.pi
@@ -24,7 +25,7 @@ def fundamental_variables(
         "velocity_h1_im_m_s": Variable(
             at, fundamental.imag, "m/s", f"velocity fundamental, {_AHEAD}"
         ),
-        "velocity_peak_m_s": Variable(at, _peaks(velocity), "m/s", "largest over a period"),
+        "velocity_peak_m_s": Variable(at, velocity_peaks(velocity), "m/s", "largest over a period"),
     }
 
 
@@ -46,9 +47,14 @@ def batch_variables(
     }
 
 
-def _peaks(velocity: Complex[np.ndarray, "point harmonic sensor"]) -> np.ndarray:
+def velocity_peaks(
+    velocity: Complex[np.ndarray, "point harmonic *sensor"],
+) -> Float[np.ndarray, "point *sensor"]:
     """Peak of the time signal at every point and sensor, without the mean (which is 0)."""
     orders = tuple(range(1, velocity.shape[1]))
-    harmonics = np.moveaxis(velocity[:, 1:], 1, 2)
-    (peaks,) = by_blocks(lambda rows: (peak_amplitude(rows, orders),), _BLOCK, harmonics)
+    harmonics = np.moveaxis(velocity[:, 1:], 1, -1)
+    (peaks,) = by_blocks(lambda rows: (_peaks(rows, orders),), _BLOCK, harmonics)
     return peaks
+
+
+_peaks = compiled(peak_amplitude)

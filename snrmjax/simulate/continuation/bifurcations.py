@@ -4,7 +4,6 @@ import itertools
 
 import numpy as np
 from jaxtyping import Bool, Complex
-from scipy.optimize import elementwise
 
 from snrmjax.numerics.blocks import taken
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance
@@ -118,6 +117,8 @@ def _located_bifurcations(
             # A point that is not found counts as one before the crossing.
             values[inner] = np.where(ok, heights(rows, which[inner]), begin[which[inner]])
         return values
+
+    from scipy.optimize import elementwise  # slow to import
 
     found = elementwise.find_root(
         *(height, (np.zeros(len(numbers)), np.ones(len(numbers)))),

@@ -76,7 +76,7 @@ def damped_normal_mode(
     positive("largest_velocity", largest_velocity)
     model = simulated_structure(model)
     j = model.modes.mode_of_interest
-    omega = float(model.modes.natural_frequency[j])
+    omega = model.modes.natural_frequency.item(j)
     scale = largest_velocity / (omega * float(np.max(np.abs(model.modes.mode_shape[:, j]))))
     balance = harmonic_balance(
         model, 0.0, scale, harmonic_order=harmonic_order, n_samples=n_samples

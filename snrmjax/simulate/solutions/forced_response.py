@@ -268,9 +268,9 @@ def _ends_near_rest(balances: HarmonicBalance, member: int, curve: TracedCurve) 
     """Whether a curve's last point is about the linear response there: then it is alone."""
     model, j = balances.model, balances.model.modes.mode_of_interest
     omega = float(curve.points[-1, -1])  # over the natural frequency
-    damping = float(np.asarray(model.modes.damping_ratio)[member, j])
-    natural = float(np.asarray(model.modes.natural_frequency)[member, j])
-    load = float(balances.force[member]) * float(np.asarray(model.modes.participation)[member, j])
+    damping = model.modes.damping_ratio.item(member, j)
+    natural = model.modes.natural_frequency.item(member, j)
+    load = float(balances.force[member]) * model.modes.participation.item(member, j)
     linear = load / (natural**2 * (1 - omega**2 + 2j * damping * omega))
     x = curve.points[-1, :-1].reshape(balances.n_coefficients, -1)[1:3, j]
     last = complex(x[0], -x[1]) * float(balances.displacement_scale[member])

@@ -8,7 +8,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from snrmjax.model.effect_base import AbstractHysteresis
-from snrmjax.model.structures import Structure, displacement_scale, simulated_structure
+from snrmjax.model.structures import (
+    Structure,
+    displacement_scale,
+    linear_terms_of,
+    simulated_structure,
+)
 from snrmjax.numerics.blocks import by_blocks
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.result import quantity
@@ -79,7 +84,7 @@ def nonlinear_normal_mode(
     doi:10.1016/j.ymssp.2008.04.002.
     """
     j = model.modes.mode_of_interest
-    omega = float(model.modes.natural_frequency[j])
+    omega = model.modes.natural_frequency.item(j)
     if not to_frequency > 0 or to_frequency == omega:
         raise ValueError(
             "`to_frequency` must be positive and differ from the linear frequency "
@@ -95,7 +100,7 @@ def nonlinear_normal_mode(
     upward = to_frequency > omega
     lower, upper = (omega / 10, to_frequency) if upward else (to_frequency, omega * 10)
     limit = 30.0 if largest_amplitude is None else largest_amplitude / scale
-    ends = jnp.asarray([lower, upper, limit])
+    ends = np.array([lower, upper, limit])
     curve = on_host(_trace(balance, ends, steps))
     cosines, frequency = balance.motions(curve.points)
     at_rest = np.sum(cosines, axis=1)  # q(0), where the velocity vanishes
@@ -132,7 +137,7 @@ def _tongues(
     balance: HarmonicBalance, frequency: np.ndarray, coefficients: np.ndarray
 ) -> tuple[Tongue, ...]:
     """Stretches with more than `_TONGUE_SHARE` of the kinetic energy in one other pair."""
-    j, mass = balance.model.modes.mode_of_interest, np.asarray(balance.model.linear_terms().mass)
+    j, mass = balance.model.modes.mode_of_interest, np.asarray(linear_terms_of(balance.model).mass)
     order = np.arange(coefficients.shape[1])[:, None]
     energy = mass * (order * coefficients) ** 2  # twice the mean kinetic energy, over Ω²
     share = energy / np.maximum(energy.sum(axis=(1, 2), keepdims=True), np.finfo(float).tiny)

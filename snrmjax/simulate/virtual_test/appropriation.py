@@ -34,7 +34,7 @@ def mode_phase(
     """Phase of the velocity fundamental of the mode of interest, 0 at phase resonance."""
     j = model.modes.mode_of_interest
     cosine, sine = coefficients[:, 1, j], coefficients[:, 2, j]
-    return np.angle(1j * (cosine - 1j * sine) * np.sign(float(model.modes.participation[j])))
+    return np.angle(1j * (cosine - 1j * sine) * np.sign(model.modes.participation.item(j)))
 
 
 def around(phase: Float[np.ndarray, " point"], centre: int, largest: float) -> np.ndarray:

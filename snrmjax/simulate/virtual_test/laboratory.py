@@ -151,13 +151,13 @@ class Laboratory(eqx.Module):
     def frequency(self) -> float:
         """Natural frequency of the mode of interest, rad/s."""
         modes = self.structure.modes
-        return float(modes.natural_frequency[modes.mode_of_interest])
+        return modes.natural_frequency.item(modes.mode_of_interest)
 
     @property
     def decay(self) -> float:
         """ζω of the mode of interest, 1/s."""
         modes = self.structure.modes
-        return float(modes.damping_ratio[modes.mode_of_interest]) * self.frequency
+        return modes.damping_ratio.item(modes.mode_of_interest) * self.frequency
 
     def samples(self, cycles: float) -> int:
         """How many samples so many cycles of the mode of interest have."""

@@ -10,7 +10,8 @@ from truths.exact_states import OMEGA, PARTICIPATION, SHAPE, noisy
 
 import snrmjax as sj
 from snrmjax.identify.curves.families import Polynomial, ViscousQuadratic
-from snrmjax.identify.joint.family_fit import MOST_STEPS, SOLVER
+from snrmjax.identify.inference.refits import SOLVER
+from snrmjax.identify.joint.family_fit import MOST_STEPS
 from snrmjax.identify.joint.force_balance import (
     BalanceProblem,
     PriorStd,

@@ -15,12 +15,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from snrmjax.identify.pointwise.inversion import (
-    CramersRule,
     closed_form,
     invert_amplitude_phase,
     invert_phasor,
 )
 from snrmjax.identify.pointwise.inversion_result import PointStatus, SnrmPoints
+from snrmjax.identify.pointwise.two_equations import CramersRule
 from snrmjax.model.modes import LinearModes, residual_velocity
 
 N = 20500  # more than the package solves at a time
