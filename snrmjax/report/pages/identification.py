@@ -217,7 +217,7 @@ def identification_sentence(identification: Identification, modes: LinearModes) 
 def linear_mode_row(modes: LinearModes) -> tuple[str, str]:
     """The mode of interest as the model has it."""
     j = modes.mode_of_interest
-    linear, damping = float(modes.natural_frequency[j]) / HERTZ, float(modes.damping_ratio[j])
+    linear, damping = modes.natural_frequency.item(j) / HERTZ, modes.damping_ratio.item(j)
     return "linear mode", f"{linear:.5g} Hz, {100 * damping:.3g} % damping"
 
 

@@ -1,11 +1,12 @@
 """Bifurcations along curves of periodic motions: where a multiplier crosses the unit circle."""
 
 import itertools
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Complex
+from jaxtyping import Complex, Float
 
-from snrmjax.numerics.blocks import taken
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance
 from snrmjax.simulate.continuation.continuation import CurveEvent, StepControl, TracedCurve
 from snrmjax.simulate.continuation.events import (
@@ -13,7 +14,7 @@ from snrmjax.simulate.continuation.events import (
     inserted,
     points_between,
 )
-from snrmjax.simulate.continuation.stability import MARGIN, floquet_multipliers
+from snrmjax.simulate.continuation.stability import MARGIN, many_multipliers
 
 BIFURCATIONS = (
     CurveEvent.BRANCH_POINT,
@@ -22,22 +23,40 @@ BIFURCATIONS = (
 )
 _FOLDS_OWN = 12  # points from a fold at which its multiplier may cross
 _CROSSING = 5e-7  # of a step, to which the crossing of the circle is located
+_SHARES = 16  # of the way through an interval that are looked at side by side
+_ROUNDS = 12  # of looking closer, at most; two or three do
+
+
+class _Crossing(NamedTuple):
+    """An interval of a curve in which a multiplier crosses the unit circle."""
+
+    owner: int  # which curve
+    position: int  # the point before it
+    without_one: bool  # crossings of +1 do not count: they are a fold's own
 
 
 def with_bifurcations(
-    balance: HarmonicBalance,
-    curve: TracedCurve,
-    multipliers: Complex[np.ndarray, "point multiplier"],
-    steps: StepControl,
-) -> TracedCurve:
-    """The curve with the points inserted where a multiplier crosses the unit circle.
+    balances: HarmonicBalance, curves: Sequence[TracedCurve], steps: StepControl
+) -> list[TracedCurve]:
+    """The curves with the points inserted where a multiplier crosses the unit circle.
 
     A real multiplier through −1 is a period doubling, a complex pair a Neimark-Sacker
     bifurcation, and +1 away from a fold a branch point; "bifurcation" in `not_located` stands for
-    one that could not be located. Returns the curve with the multipliers of all its points.
-    `balance` is stacked, of one member.
+    one that could not be located. Arguments: `balances` stacked, one for every curve, whose
+    multipliers are known.
     """
-    curve = curve._replace(multipliers=multipliers)
+    crossings = [
+        _Crossing(owner, *place)
+        for owner, curve in enumerate(curves)
+        for place in _crossings(curve, np.asarray(curve.multipliers))
+    ]
+    return _located_bifurcations(balances, list(curves), crossings, steps)
+
+
+def _crossings(
+    curve: TracedCurve, multipliers: Complex[np.ndarray, "point multiplier"]
+) -> list[tuple[int, bool]]:
+    """The points before crossings, and whether crossings of +1 do not count there."""
     regular = np.flatnonzero([event != CurveEvent.FOLD for event in curve.events])
     outside, beyond_one = _outside(multipliers), _beyond_one(multipliers)
     rest = outside - beyond_one
@@ -61,10 +80,7 @@ def with_bifurcations(
         near = [k for k in crossings if abs(k - fold) <= _FOLDS_OWN and _real_plus(multipliers, k)]
         if near:
             crossings.remove(min(near, key=lambda k: abs(k - fold)))
-    if not crossings:
-        return curve
-    without_one = np.isin(crossings, beside_fold)
-    return _located_bifurcations(balance, curve, crossings, without_one, steps)
+    return [(k, k in beside_fold) for k in crossings]
 
 
 def _real_plus(multipliers: np.ndarray, k: int) -> bool:
@@ -76,64 +92,115 @@ def _real_plus(multipliers: np.ndarray, k: int) -> bool:
 
 
 def _located_bifurcations(
-    balance: HarmonicBalance,
-    curve: TracedCurve,
-    crossings: list[int],
-    without_one: Bool[np.ndarray, " crossing"],
+    balances: HarmonicBalance,
+    curves: list[TracedCurve],
+    crossings: list[_Crossing],
     steps: StepControl,
-) -> TracedCurve:
+) -> list[TracedCurve]:
     """Where the last multiplier that crosses is on the circle, to a millionth of a step.
 
-    Where it is to be found `without_one`, crossings of +1 do not count.
-    Reference: T. R. Chandrupatla, Adv. Eng. Softw. 28 (1997) 145,
-    doi:10.1016/S0965-9978(96)00051-8.
+    All crossings are looked for at once: each at several shares of its way side by side, equal
+    ones first, then ever closer ones around the root of the cubic through the nearest four.
     """
-    member, known = taken(balance, 0), np.asarray(curve.multipliers)
-    ends = np.stack([known[crossings], known[np.array(crossings) + 1]])
-    counts = _outside(ends) - np.where(without_one, _beyond_one(ends), 0)
-    last = np.max(counts, axis=0)
-
-    def heights(rows: np.ndarray, which: np.ndarray) -> np.ndarray:
-        """Modulus beyond the circle, of the multiplier that is outside at one end only."""
-        free = without_one[which][:, None] & _is_beyond_one(rows)
-        radius = np.sort(np.where(free, 0.0, np.abs(rows)), axis=1)
-        return radius[np.arange(len(rows)), -last[which]] - (1.0 + MARGIN)
-
-    numbers = np.arange(len(crossings))
-    begin, end = (heights(rows, numbers) for rows in ends)
-
-    def motions(share: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, ...]:
-        position = [crossings[e] for e in which.tolist()]
-        points, tangents, ok = points_between(
-            balance, [curve], [0] * len(position), position, share.tolist(), steps
-        )
-        rows = floquet_multipliers(member.model, *member.motions(points))
-        return points, tangents, rows, ok & np.all(np.isfinite(rows), axis=1)
-
-    def height(share: np.ndarray, which: np.ndarray) -> np.ndarray:
-        values, inner = np.where(share > 0, end[which], begin[which]), (share > 0) & (share < 1)
-        if inner.any():
-            *_, rows, ok = motions(share[inner], which[inner])
-            # A point that is not found counts as one before the crossing.
-            values[inner] = np.where(ok, heights(rows, which[inner]), begin[which[inner]])
-        return values
-
-    from scipy.optimize import elementwise  # slow to import
-
-    found = elementwise.find_root(
-        *(height, (np.zeros(len(numbers)), np.ones(len(numbers)))),
-        args=(numbers,),
-        tolerances={"xatol": _CROSSING, "xrtol": 0.0, "fatol": 0.0, "frtol": 0.0},
+    if not crossings:
+        return curves
+    owner, before, without_one = (np.array(column) for column in zip(*crossings, strict=True))
+    ends = [
+        np.stack([np.asarray(curves[o].multipliers)[k + ahead] for o, k, _ in crossings])
+        for ahead in (0, 1)
+    ]
+    last = np.max(
+        [_outside(rows) - np.where(without_one, _beyond_one(rows), 0) for rows in ends], axis=0
     )
-    points, tangents, rows, ok = motions(found.x, numbers)
-    new = []
-    for e, k in enumerate(crossings):
-        if ok[e] and found.success[e]:
-            kind = _crossing_kind(rows[e])
-            new.append(NewPoint(0, k, points[e], tangents[e], kind, rows[e]))
-        else:
-            curve = curve._replace(not_located=(*curve.not_located, "bifurcation"))
-    return inserted([curve], new)[0]
+
+    def heights(rows: np.ndarray) -> Float[np.ndarray, "crossing share"]:
+        """Modulus beyond the circle, of the multiplier that is outside at one end only."""
+        free = without_one[:, None, None] & _is_beyond_one(rows)
+        radius = np.sort(np.where(free, 0.0, np.abs(rows)), axis=-1)
+        place = np.broadcast_to(-last[:, None, None], (*radius.shape[:2], 1))
+        return np.take_along_axis(radius, place, axis=-1)[..., 0] - (1.0 + MARGIN)
+
+    known = heights(np.stack(ends, axis=1))
+    sense = np.sign(known[:, 1] - known[:, 0])[:, None]
+    numbers, count = np.arange(len(owner)), len(owner)
+    share = np.broadcast_to(np.linspace(0.0, 1.0, _SHARES + 2), (count, _SHARES + 2))
+    low, high = np.zeros(count), np.ones(count)
+    value_low, value_high = (sense * known).T
+    # Where the crossing is known to be passed: at first the neighbours behind it.
+    point, tangent = (
+        np.stack([rows[k + 1] for rows, k in zip(column, before.tolist(), strict=True)])
+        for column in zip(*((curves[o].points, curves[o].tangents) for o in owner), strict=True)
+    )
+    passed, inside, missed = ends[1], np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
+    for _ in range(_ROUNDS):
+        shares = np.sort(share[:, 1:-1], axis=1)
+        points, tangents, found = points_between(
+            balances,
+            curves,
+            *(np.repeat(part, _SHARES).tolist() for part in (owner, before)),
+            shares.ravel().tolist(),
+            steps,
+        )
+        shape = (count, _SHARES)
+        points, tangents = (part.reshape(*shape, -1) for part in (points, tangents))
+        rows = many_multipliers(balances, owner, points)
+        found = found.reshape(shape) & np.all(np.isfinite(rows), axis=-1)
+        missed |= ~np.all(found, axis=1)
+        # A point that is not found counts as one before the crossing.
+        values = np.where(found, sense * heights(rows), value_low[:, None])
+        whole = np.concatenate([low[:, None], shares, high[:, None]], axis=1)
+        height = np.concatenate([value_low[:, None], values, value_high[:, None]], axis=1)
+        behind = np.argmax(height[:, 1:] > 0, axis=1) + 1
+        new = behind <= _SHARES
+        inside |= new
+        for kept, fresh in ((point, points), (tangent, tangents), (passed, rows)):
+            kept[new] = fresh[new, behind[new] - 1]
+        guess = _root(whole, height, behind)
+        low, high = whole[numbers, behind - 1], whole[numbers, behind]
+        value_low, value_high = height[numbers, behind - 1], height[numbers, behind]
+        if np.all(high - low <= _CROSSING):
+            break
+        share = _closer(low, high, guess)
+    located = (high - low <= _CROSSING) & (inside | ~missed)
+    new_points = [
+        NewPoint(int(o), int(k), point[e], tangent[e], _crossing_kind(passed[e]), passed[e])
+        for e, (o, k, _) in enumerate(crossings)
+        if located[e]
+    ]
+    for o in owner[~located].tolist():
+        curves[o] = curves[o]._replace(not_located=(*curves[o].not_located, "bifurcation"))
+    return inserted(curves, new_points)
+
+
+def _closer(low: np.ndarray, high: np.ndarray, guess: np.ndarray) -> np.ndarray:
+    """Shares between two ends: at distances from a guess that grow in equal ratios."""
+    half = _SHARES // 2
+    ratio = np.maximum(high - low, _CROSSING) / _CROSSING
+    distance = 0.45 * _CROSSING * ratio[:, None] ** np.linspace(0.0, 1.0, half)
+    around = guess[:, None] + np.concatenate([-distance[:, ::-1], distance], axis=1)
+    inner = np.clip(around, low[:, None], high[:, None])
+    return np.concatenate([low[:, None], inner, high[:, None]], axis=1)
+
+
+def _root(share: np.ndarray, height: np.ndarray, behind: np.ndarray) -> np.ndarray:
+    """Where the height vanishes before `behind`: by the share as a cubic of the height.
+
+    Through the two points on either side; by the chord between the nearest where that leads out.
+    """
+    rows = np.arange(len(share))
+    low, high = share[rows, behind - 1], share[rows, behind]
+    first, last = height[rows, behind - 1], height[rows, behind]
+    chord = low - first * (high - low) / np.where(last > first, last - first, 1.0)
+    nodes = np.clip(behind[:, None] + np.arange(-2, 2), 0, share.shape[1] - 1)
+    x, y = (np.take_along_axis(part, nodes, axis=1) for part in (share, height))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        weight = [
+            np.prod([y[:, j] / (y[:, j] - y[:, i]) for j in range(4) if j != i], axis=0)
+            for i in range(4)
+        ]
+        cubic = sum(w * x[:, i] for i, w in enumerate(weight))
+    good = np.isfinite(cubic) & (cubic >= low) & (cubic <= high)
+    return np.where(good, cubic, np.clip(chord, low, high))
 
 
 def _outside(multipliers: np.ndarray) -> np.ndarray:

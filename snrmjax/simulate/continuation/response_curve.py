@@ -5,8 +5,6 @@ from collections.abc import Iterable, Sequence
 from enum import StrEnum
 from typing import ClassVar
 
-import equinox as eqx
-import jax
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
@@ -166,17 +164,22 @@ def assembled(
         balances, [c._replace(events=(CurveEvent.NONE,) * len(c.points)) for c in curves], steps
     )
 
+    def followed(number: int) -> TracedCurve:
+        balance, curve = taken(balances, number), labelled[number]
+        multipliers = floquet_multipliers(balance.model, *balance.motions(curve.points))
+        return curve._replace(multipliers=multipliers)
+
+    if stability:
+        followed_curves = over_cores(followed, range(len(curves)))
+        labelled = with_bifurcations(balances, followed_curves, steps)
+
     def finished(number: int) -> ResponseCurve:
         balance, curve, truncation = taken(balances, number), labelled[number], None
-        if stability:
-            multipliers = floquet_multipliers(balance.model, *balance.motions(curve.points))
-            stacked = jax.tree.map(lambda a: np.asarray(a)[None] if eqx.is_array(a) else a, balance)
-            curve = with_bifurcations(stacked, curve, multipliers, steps)
         motions = motions_of(balance, curve.points)
         if stability:
             (truncation,) = by_blocks(
                 lambda x, w: (_truncation(balance, x, w),),
-                *(32, motions["coefficients"], motions["frequency"]),
+                *(256, motions["coefficients"], motions["frequency"]),
             )
         return ResponseCurve(
             **motions,

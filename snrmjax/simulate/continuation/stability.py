@@ -1,15 +1,22 @@
 """Stability of periodic motions from the monodromy matrix of the linearised equations."""
 
 from enum import IntEnum
+from functools import partial
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
 from snrmjax.model.structures import Structure
-from snrmjax.numerics.blocks import over_cores, padded
+from snrmjax.numerics.blocks import mapped, over_cores, padded, taken
+from snrmjax.numerics.compiled import compiled
+from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance
 from snrmjax.simulate.continuation.monodromy import monodromy
 
-_BLOCK = 32  # points whose linearised motions are integrated side by side
+_BLOCKS = ((1, 128), (2, 64))  # modes, and points whose linearised motions are side by side
+_BLOCK = 32  # of more modes
+_ROWS = 4  # of points of different structures, in one program
+STEPS_PER_CYCLE = 6  # of the fastest tangent frequency
 MARGIN = 1e-6  # beyond the unit circle: what the multipliers of a conservative motion may err by
 
 
@@ -26,7 +33,7 @@ def floquet_multipliers(
     coefficients: Float[Array | np.ndarray, "point coefficient mode"],
     frequency: Float[Array | np.ndarray, " point"],
     *,
-    steps_per_cycle: int = 6,
+    steps_per_cycle: int = STEPS_PER_CYCLE,
 ) -> Complex[np.ndarray, "point multiplier"]:
     """Floquet multipliers of periodic motions: eigenvalues of the map over one period.
 
@@ -46,17 +53,53 @@ def floquet_multipliers(
     if not len(values):
         return np.zeros((0, 2 * model.n_modes), dtype=np.complex128)
 
+    size = dict(_BLOCKS).get(model.n_modes, _BLOCK)
+
     def block(begin: int) -> np.ndarray:
-        here = slice(begin, begin + _BLOCK)
-        rows = padded(values[here], _BLOCK)
-        speed = padded(omega[here], _BLOCK)
+        here = slice(begin, begin + size)
+        rows, speed = padded(values[here], size), padded(omega[here], size)
         found = monodromy(model, rows, speed, float(steps_per_cycle))
         maps = np.asarray(found)[: len(values[here])]
-        finite = np.all(np.isfinite(maps), axis=(1, 2))[:, None]
-        finite &= np.all(np.isfinite(values[here]), axis=(1, 2))[:, None]
-        return np.where(finite, np.linalg.eigvals(np.where(finite[:, :, None], maps, 0.0)), np.nan)
+        known = np.all(np.isfinite(values[here]), axis=(1, 2))[:, None, None]
+        return _eigenvalues(np.where(known, maps, np.nan))
 
-    return np.concatenate(over_cores(block, range(0, len(values), _BLOCK)))
+    return np.concatenate(over_cores(block, range(0, len(values), size)))
+
+
+def many_multipliers(
+    balances: HarmonicBalance, owner: np.ndarray, points: Float[np.ndarray, "row point unknown"]
+) -> Complex[np.ndarray, "row point multiplier"]:
+    """Floquet multipliers of as many points of every row, each row of another of the balances."""
+    n, size = len(owner), _ROWS if len(owner) > 1 else 1
+
+    def block(begin: int) -> np.ndarray:
+        rows = np.minimum(np.arange(begin, begin + size), n - 1)
+        motions = [taken(balances, int(owner[k])).motions(points[k]) for k in rows]
+        columns = (np.stack(column) for column in zip(*motions, strict=True))
+        maps = _monodromies(taken(balances.model, owner[rows]), *columns)
+        return _eigenvalues(np.asarray(maps)[: n - begin])
+
+    return np.concatenate(over_cores(block, range(0, n, size)))
+
+
+@partial(compiled, long_loops=True)
+def _monodromies(
+    models: Structure,
+    coefficients: Float[Array, "row point coefficient mode"],
+    frequency: Float[Array, "row point"],
+) -> Float[Array, "row point state state"]:
+    def of_row(model: Structure, coefficients: Array, frequency: Array) -> Array:
+        return monodromy(model, coefficients, frequency, jnp.array(float(STEPS_PER_CYCLE)))
+
+    return mapped(of_row, models, coefficients, frequency)
+
+
+def _eigenvalues(
+    maps: Float[np.ndarray, "*batch state state"],
+) -> Complex[np.ndarray, "*batch state"]:
+    """Eigenvalues of maps, NaN of those that are not finite."""
+    finite = np.all(np.isfinite(maps), axis=(-2, -1))[..., None]
+    return np.where(finite, np.linalg.eigvals(np.where(finite[..., None], maps, 0.0)), np.nan)
 
 
 def stability_of(

@@ -272,7 +272,7 @@ def test_flat_beam_folds_at_all_forces_are_as_many_as_its_turns():
 
 
 def line_with_a_crossing(monkeypatch, between):
-    """A curve of six points whose one multiplier leaves the circle just behind the third.
+    """A curve of six points whose one multiplier has left the circle at the fourth.
 
     `between` are the points that are found between neighbours, from the exact ones.
     """
@@ -281,7 +281,7 @@ def line_with_a_crossing(monkeypatch, between):
     points = np.outer(np.arange(6.0), [0, 0, 0, 1.0])
 
     def multipliers_at(_, __, frequency):
-        crossed = 0.5 + 1.0 * (frequency > 2.0)
+        crossed = 0.5 + 1.0 * (frequency >= 3.0)
         return (-crossed - 1e-3 * frequency)[:, None].astype(complex)
 
     def points_between(_, curves, owner, position, share, __):
@@ -290,20 +290,23 @@ def line_with_a_crossing(monkeypatch, between):
         along = np.outer(np.ones(len(here)), [0, 0, 0, 1.0])
         return np.outer(found, [0, 0, 0, 1.0]), along, ok
 
-    monkeypatch.setattr(bifurcations, "floquet_multipliers", multipliers_at)
+    def many_multipliers(_, __, points):
+        return multipliers_at(None, None, points[..., -1].ravel()).reshape(*points.shape[:2], 1)
+
+    monkeypatch.setattr(bifurcations, "many_multipliers", many_multipliers)
     monkeypatch.setattr(bifurcations, "points_between", points_between)
     curve = TracedCurve(points, np.outer(np.ones(6), [0, 0, 0, 1.0]), events=(CurveEvent.NONE,) * 6)
-    multipliers = multipliers_at(None, None, points[:, -1])
-    return with_bifurcations(balance, curve, multipliers, StepControl()), multipliers_at
+    curve = curve._replace(multipliers=multipliers_at(None, None, points[:, -1]))
+    return with_bifurcations(balance, [curve], StepControl())[0], multipliers_at
 
 
 def test_multipliers_stay_with_their_points_where_two_points_are_one(monkeypatch):
-    # The crossing lies so near to the third point that both are the same numbers.
+    # The crossing is at the fourth point itself: both are the same numbers.
     found, multipliers_at = line_with_a_crossing(
-        monkeypatch, lambda exact: (np.floor(1e5 * exact) / 1e5, np.ones(len(exact), dtype=bool))
+        monkeypatch, lambda exact: (exact, np.ones(len(exact), dtype=bool))
     )
-    assert found.points[:, -1].tolist() == [0, 1, 2, 2, 3, 4, 5]
-    assert found.events.index("period_doubling") in (2, 3)
+    assert found.points[:, -1].tolist() == [0, 1, 2, 3, 3, 4, 5]
+    assert found.events.index("period_doubling") in (3, 4)
     wanted = multipliers_at(None, None, found.points[:, -1])
     np.testing.assert_array_equal(found.multipliers, wanted)
 
