@@ -12,9 +12,7 @@ from snrmjax.identify.pointwise.backbone_points import BackbonePoints
 from snrmjax.identify.pointwise.prediction import PredictedResponse
 from snrmjax.io.units import DEGREE, HERTZ
 from snrmjax.measure.states import SteadyStates
-from snrmjax.simulate.solutions.controlled import DampedModeBranch
-from snrmjax.simulate.solutions.forced_response import ResponseCurve
-from snrmjax.simulate.solutions.normal_modes import NormalModeBranch
+from snrmjax.simulate.continuation.response_curve import MotionCurve, ResponseCurve
 
 BAND = 1.96
 """Half the width of a 95 % band in standard deviations."""
@@ -122,9 +120,7 @@ def fit_residuals(fit: JointFit) -> FitResiduals:
     )
 
 
-def velocity_of(
-    curve: PredictedResponse | ResponseCurve | NormalModeBranch | DampedModeBranch, sensor: str
-) -> np.ndarray:
+def velocity_of(curve: PredictedResponse | MotionCurve, sensor: str) -> np.ndarray:
     """Phasors (m/s) of the velocity fundamental along a curve, at one sensor.
 
     A `PredictedResponse` has only its backbone's sensor. Raises `ValueError` for an unknown one.
