@@ -193,23 +193,30 @@ class EventEquations(eqx.Module):
 def bordered(matrix: Inexact[Array, "size size"]) -> Bordered:
     """g of a matrix with borders near its null vectors, for which nothing grows large.
 
-    The first borders are by chance, the second what they give: they change g by a factor only,
-    which an equation g = 0 does not see.
+    The first borders are by chance. The second are b along A⁻ᵀ of the first row and c along A⁻¹b:
+    then g = −1/|A⁻¹b| has no poles, to which Newton's method would converge as to zeros. Other
+    borders change g by a factor, which an equation g = 0 does not see.
     """
     size = matrix.shape[0]
     draw = np.random.default_rng(size).normal(size=(2, size)) / np.sqrt(size)
-    first = _solved(matrix, *jnp.asarray(draw, dtype=matrix.dtype))
-    # Their own derivatives multiply g, which vanishes.
-    row, column = (
-        jax.lax.stop_gradient(v.conj() / jnp.linalg.norm(v)) for v in (first.right, first.left)
-    )
-    return _solved(matrix, column, row)
+    column, row = jnp.asarray(draw, dtype=matrix.dtype)
+    factors = _factorised(matrix, column, row)
+    first = _null(factors)
+    length = jnp.linalg.norm(first.left)
+    column = first.left.conj() / length
+    inside = jax.scipy.linalg.lu_solve(factors, jnp.append(column, 0.0))[:-1]
+    row = first.g * inside - length * first.right
+    return _null(_factorised(matrix, column, row.conj() / jnp.linalg.norm(row)))
 
 
-def _solved(matrix: Array, column: Array, row: Array) -> Bordered:
-    whole = jnp.block([[matrix, column[:, None]], [row[None], jnp.zeros((1, 1))]])
-    last = jnp.zeros(whole.shape[0], dtype=matrix.dtype).at[-1].set(1.0)
-    factors = jax.scipy.linalg.lu_factor(whole)
+def _factorised(matrix: Array, column: Array, row: Array) -> tuple[Array, Array]:
+    corner = jnp.zeros((1, 1), dtype=matrix.dtype)
+    whole = jnp.block([[matrix, column[:, None]], [row[None], corner]])
+    return jax.scipy.linalg.lu_factor(whole)
+
+
+def _null(factors: tuple[Array, Array]) -> Bordered:
+    last = jnp.zeros(factors[0].shape[0], dtype=factors[0].dtype).at[-1].set(1.0)
     right = jax.scipy.linalg.lu_solve(factors, last)
     left = jax.scipy.linalg.lu_solve(factors, last, trans=1)
     return Bordered(right[-1], right[:-1], left[:-1])

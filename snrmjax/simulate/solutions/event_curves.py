@@ -1,15 +1,13 @@
 """Events of forced responses followed in a second parameter: folds, resonances, bifurcations."""
 
-from typing import NamedTuple, get_args
+from typing import get_args
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from snrmjax.model.parameters import checked_names, parameter_unit, parameter_value
 from snrmjax.model.structures import Structure, simulated_structure
-from snrmjax.numerics.blocks import mapped, padded, taken
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.result import Variable, quantity, setting
 from snrmjax.numerics.status import Status
@@ -32,12 +30,11 @@ from snrmjax.simulate.continuation.event_equations import (
     EventKind,
     bordered,
 )
-from snrmjax.simulate.continuation.event_location import locate_event
+from snrmjax.simulate.continuation.parameter_turns import with_turns
 from snrmjax.simulate.continuation.response_curve import MotionCurve, motions_of
 from snrmjax.simulate.continuation.stability import floquet_multipliers
 
 DEFAULT_STEPS = StepControl(max_points=2000)
-_BLOCK = 4  # turns that one call locates
 _BESIDE = 0.02  # distance from a fold, in scaled unknowns, of a start on its response
 _SAME = 1e-10  # distance in scaled unknowns below which two points are one
 _SHOWN = 6  # turns that a summary lists
@@ -187,7 +184,7 @@ def follow_event(
     curve = _joined(*ways)
     closed = curve.status == CurveStatus.CLOSED
     sides = (ways[0], ways[0]) if closed else (ways[1], ways[0])
-    points, events, missed = _with_turns(equations, curve, steps)
+    points, events, missed = with_turns(equations, curve, steps)
     balance = equations.balance
     value, second = points[:, -1] * scale, None
     if kind == "neimark_sacker":
@@ -340,102 +337,6 @@ def _joined(up: TracedCurve, down: TracedCurve) -> TracedCurve:
     ends = (CurveStatus.UPPER_END, CurveStatus.LOWER_END)
     stopped = [way.status for way in (up, down) if way.status not in ends]
     return TracedCurve(points[keep], tangents[keep], (*stopped, up.status)[0], solves)
-
-
-class _Turn(NamedTuple):
-    """A turn in the parameter, and by what kinds of it differ."""
-
-    point: Array
-    resolved: Array
-    missed: Array
-    faster: Array  # slope of the frequency in arclength
-    crossing: Array  # share of ∂R/∂λ that the singular matrix does not reach
-    curvature: Array  # above zero where the responses near it are closed
-
-
-def _with_turns(
-    equations: EventEquations, curve: TracedCurve, steps: StepControl
-) -> tuple[np.ndarray, np.ndarray, int]:
-    """The points with those inserted at which the parameter turns, their names, and how many more
-    turns were not located."""
-    points, ahead = curve.points, curve.tangents
-    events = np.array([""] * len(points), dtype=object)
-    where = np.flatnonzero(np.signbit(ahead[1:, -1]) != np.signbit(ahead[:-1, -1]))
-    if not where.size:
-        return points, events, 0
-    rows = [padded(r, _BLOCK) for r in (points[where], ahead[where], points[where + 1])]
-    wanted = np.arange(len(rows[0])) < len(where)
-    turn = taken(_turns(equations, *rows, wanted, steps), np.arange(len(where)))
-    good = np.flatnonzero(turn.resolved)
-    names = [_turn_kind(equations.kind, *(float(part[k]) for part in turn[-3:])) for k in good]
-    place = where[good] + 1
-    return (
-        np.insert(points, place, turn.point[good], axis=0),
-        np.insert(events, place, names),
-        int(np.sum(turn.missed)),
-    )
-
-
-def _turn_kind(kind: EventKind, faster: float, crossing: float, curvature: float) -> str:
-    if kind != "fold":
-        return "turn"
-    # wᵀ∂R/∂λ dλ vanishes at the turn: at a cusp by dλ, at a response that begins by the other.
-    if abs(faster) < abs(crossing):
-        return "cusp"
-    return "isola_birth" if curvature > 0 else "isola_merging"
-
-
-@compiled
-def _turns(
-    equations: EventEquations,
-    here: Array,
-    tangent: Array,
-    there: Array,
-    wanted: Array,
-    steps: StepControl,
-) -> _Turn:
-    def located(here: Array, tangent: Array, there: Array, wanted: Array) -> _Turn:
-        found = locate_event(
-            *(equations.linearised, lambda _, along: along[-1], here, tangent, there, steps),
-            wanted,
-        )
-        crossing, curvature = _unfolding(equations, found.point)
-        return _Turn(
-            *(found.point, found.resolved, found.missed),
-            *(found.tangent[equations.balance.size], crossing, curvature),
-        )
-
-    return mapped(located, here, tangent, there, wanted)
-
-
-def _unfolding(equations: EventEquations, point: Array) -> tuple[Array, Array]:
-    """How near ∂R/∂λ is to the range of the singular matrix, and the quadratic form's determinant.
-
-    With both null vectors n of [∂R/∂x ∂R/∂λ] responses near a simple bifurcation obey
-    Σ (wᵀ∂²R n_i n_j) s_i s_j + 2 wᵀ∂R/∂μ dμ = 0: ellipses, or branches that cross.
-    Reference: Golubitsky & Schaeffer, Singularities and Groups in Bifurcation Theory I (1985),
-    chapter I.3, doi:10.1007/978-1-4612-5034-0.
-    """
-    if equations.kind != "fold":
-        return jnp.zeros(()), jnp.zeros(())
-    size = equations.balance.size
-    motion, balance = point[: size + 1], equations.at(point[-1])
-    jacobian = balance.linearised(motion)[1]
-    column = jacobian[:, size]
-    null = bordered(jacobian[:, :size])
-    crossing = null.left @ column / (jnp.linalg.norm(null.left) * jnp.linalg.norm(column))
-    right = null.right / jnp.linalg.norm(null.right)
-    along = jnp.linalg.pinv(jacobian[:, :size], rtol=1e-6) @ -column
-    basis = (jnp.append(right, 0.0), jnp.append(along, 1.0))
-
-    def form(first: Array, second: Array) -> Array:
-        def slope(motion: Array) -> Array:
-            return jax.jvp(balance.residual, (motion,), (first,))[1]
-
-        return null.left @ jax.jvp(slope, (motion,), (second,))[1]
-
-    (a, b), (_, c) = [[form(one, two) for two in basis] for one in basis]
-    return crossing, a * c - b**2
 
 
 @compiled
