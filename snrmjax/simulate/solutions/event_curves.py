@@ -35,7 +35,7 @@ from snrmjax.simulate.continuation.response_curve import MotionCurve, motions_of
 from snrmjax.simulate.continuation.stability import floquet_multipliers
 
 DEFAULT_STEPS = StepControl(max_points=2000)
-_BESIDE = 0.02  # distance from a fold, in scaled unknowns, of a start on its response
+_BESIDE = (0.02, 4e-3, 8e-4)  # distances from a fold, in scaled unknowns, of starts on its response
 _SAME = 1e-10  # distance in scaled unknowns below which two points are one
 _SHOWN = 6  # turns that a summary lists
 _RESONANT = 1e-2  # second frequency, over the first, below which a curve that stops counts as ended
@@ -224,10 +224,12 @@ def starts_beside_folds(model: Structure, folds: EventCurve, value: float) -> li
         force = value if folds.parameter == FORCE else float(folds.force[0])
         equations, point = _problem(model, force, start, "fold", ends, folds.parameter, None)
         at = value / float(equations.parameter_scale)
-        beside, ok = _beside(equations, point.at[-1].set(at), _BESIDE)
-        if bool(ok):
-            x, frequency = equations.balance.motions(np.asarray(beside)[None])
-            found.append((x[0], float(frequency[0])))
+        for distance in _BESIDE:  # a loop that has just begun is shorter than the first
+            beside, ok = _beside(equations, point.at[-1].set(at), distance)
+            if bool(ok):
+                x, frequency = equations.balance.motions(np.asarray(beside)[None])
+                found.append((x[0], float(frequency[0])))
+                break
     return found
 
 
@@ -350,4 +352,5 @@ def _beside(equations: EventEquations, point: Array, distance: Array | float) ->
     null = bordered(balance.linearised(motion)[1][:, :size]).right
     across = jnp.append(null / jnp.linalg.norm(null), 0.0)
     found = correct(balance.linearised, motion + distance * across, across, 1e-10, 30)
-    return found.point, fold.converged & found.converged
+    moved = jnp.linalg.norm(found.point - motion)
+    return found.point, fold.converged & found.converged & (moved < 2 * distance)

@@ -246,16 +246,24 @@ def test_an_isolated_response_begins_where_the_closed_form_says():
         found = displacement(folds)[k], folds.frequency[k], folds.value[k]
         # |sin|sin of the drag by 512 samples: its harmonics fall with the third power.
         np.testing.assert_allclose(found, exact[:3], rtol=3e-7)
-    # Two per cent above its birth the loop is small, and found from its folds.
-    just = 1.02 * birth[2]
-    starts = starts_beside_folds(model, folds, just)
-    assert len(starts) == 2
-    found = sj.simulate.isolated_responses(
-        *(model, just, *ends),
-        search=sj.simulate.IsolatedSearch(starts=starts, n_starts=0),
-        settings=SINGLE,
-    )
-    assert [loop.status.name for loop in found] == ["CLOSED"]
+    # Just above its birth the loop is small, and found from its folds.
+    for above in (0.02, 1e-4):
+        load = (1 + above) * birth[2]
+        starts = starts_beside_folds(model, folds, load)
+        assert len(starts) == 2
+        for (x, omega), fold in zip(starts, folds.near(load), strict=True):
+            tip = sj.simulate.periodic_motion(model, load, fold, condition="fold")
+            off = np.linalg.norm(x - np.asarray(tip.coefficients)) / np.abs(x).max()
+            assert 5e-4 < off < 0.05
+            assert omega != pytest.approx(float(tip.frequency), rel=1e-10)
+        found = sj.simulate.isolated_responses(
+            *(model, load, *ends),
+            known=[],
+            search=sj.simulate.IsolatedSearch(starts=starts, n_starts=0),
+            settings=SINGLE,
+        )
+        (loop,) = [c for c in found if c.branch.name == "GIVEN_START"]
+        assert loop.status.name == "CLOSED"
     assert not starts_beside_folds(model, folds, 0.98 * birth[2])
 
 
@@ -356,10 +364,11 @@ def test_further_modes_of_an_effect_are_followed():
 # ---------------------------------------------------------------------------- bifurcations
 
 
-def coupled(second=4.0):
+def coupled(*effects):
     """A second mode at twice the first one's frequency: their energy goes to and fro."""
-    modes = sj.model.linear_modes([2.0, second], [0.01, 0.01], [[1.0, 0.0]], [1.0, 0.0])
-    return sj.model.structure(modes, sj.model.polynomial_potential({"112": 0.5}, 2))
+    modes = sj.model.linear_modes([2.0, 4.0], [0.01, 0.01], [[1.0, 0.0]], [1.0, 0.0])
+    potential = sj.model.polynomial_potential({"112": 0.5}, 2)
+    return sj.model.structure(modes, potential, effects=effects)
 
 
 @pytest.fixture(scope="module")
@@ -402,6 +411,27 @@ def test_neimark_sacker_points_lie_where_responses_have_them(tori):
     for force, number in ((0.995 * least, 0), (1.005 * least, 2)):
         (response,) = sj.forced_response(coupled(), [force], 1.7, 2.3, harmonic_order=5)
         assert response.at_events("neimark_sacker").size == number
+
+
+def test_neimark_sacker_points_feel_damping_that_depends_on_the_velocity():
+    name, ends = "cubic_damping.coefficient", (1.7, 2.3)
+    model = coupled(make_effect("cubic_damping", {"coefficient": 1e-3}))
+    start = event_of(model, 0.4, ends, "neimark_sacker", order=5, stability=True)
+    settings = {"kind": "neimark_sacker", "parameter": name}
+    curve = follow_event(model, 0.4, start, to=(1e-3, 1.0), **settings)
+    ((k, _),) = [(k, e) for k, e in enumerate(curve.event) if e]  # the strongest with tori
+    for share, number in ((0.9, 2), (1.01, 0)):
+        value = 1e-3 + share * (curve.value[k] - 1e-3)
+        changed = sj.model.with_parameters(model, [name], np.array([value]))
+        (response,) = sj.forced_response(changed, [0.4], *ends, harmonic_order=5)
+        located = response.frequency[response.at_events("neimark_sacker")]
+        assert len(located) == number
+        found = []
+        for near in curve.near(value):
+            again = follow_event(changed, 0.4, near, to=(value, 1.01 * value), **settings)
+            found.append(again.frequency[np.argmin(np.abs(again.value - value))])
+        # The response's multiplier is 1e-6 beyond the circle.
+        np.testing.assert_allclose(np.sort(found), np.sort(located), rtol=2e-6)
 
 
 def test_neimark_sacker_curves_close_and_end_in_a_strong_resonance(tori):
@@ -456,8 +486,7 @@ def published_cantilever(n_modes):
     potential = {}
     for monomial in itertools.combinations_with_replacement(range(n_modes), 4):
         ways = math.factorial(4) / math.prod(math.factorial(monomial.count(i)) for i in range(4))
-        key = "".join(str(i + 1) for i in monomial)
-        potential[key] = 60.0 / 4 * ways * np.prod(tip[list(monomial)])
+        potential[monomial] = 60.0 / 4 * ways * np.prod(tip[list(monomial)])
     force = shapes.T @ masses @ shapes[:, 0] * 2e-3 * square[0]
     modes = sj.model.linear_modes(list(omega), list(ratio), [list(tip)], list(force))
     return sj.model.structure(modes, sj.model.polynomial_potential(potential, n_modes))
