@@ -37,6 +37,7 @@ from snrmjax.simulate.continuation.stability import floquet_multipliers
 DEFAULT_STEPS = StepControl(max_points=2000)
 _BESIDE = (0.02, 4e-3, 8e-4)  # distances from a fold, in scaled unknowns, of starts on its response
 _SAME = 1e-10  # distance in scaled unknowns below which two points are one
+_ROUNDING = 1e-12  # relative, of a parameter's value
 _SHOWN = 6  # turns that a summary lists
 _RESONANT = 1e-2  # second frequency, over the first, below which a curve that stops counts as ended
 Start = tuple[Float[np.ndarray, "coefficient mode"], float]
@@ -121,19 +122,26 @@ class EventCurve(MotionCurve):
 
         Starts for `periodic_motion`, which solves for the motions themselves.
         """
-        ahead = self.value > value
-        where = np.flatnonzero(ahead[1:] != ahead[:-1])
-        share = (value - self.value[where]) / np.diff(self.value)[where]
+        off = self.value - value
+        off = np.where(np.abs(off) <= _ROUNDING * abs(value), 0.0, off)
+        # At the points themselves, and between two on either side.
+        at = np.flatnonzero(off == 0)
+        between = np.flatnonzero(off[1:] * off[:-1] < 0)
         x, omega = self.coefficients, self.frequency
-        between = x[where] + share[:, None, None] * np.diff(x, axis=0)[where]
-        frequency = omega[where] + share * np.diff(omega)[where]
-        return list(zip(between, frequency.tolist(), strict=True))
+        found = [(int(k), x[k], float(omega[k])) for k in at]
+        for k in between.tolist():
+            share = off[k] / (off[k] - off[k + 1])
+            motion = x[k] + share * (x[k + 1] - x[k])
+            found.append((k, motion, float(omega[k] + share * (omega[k + 1] - omega[k]))))
+        return [
+            (motion, frequency) for _, motion, frequency in sorted(found, key=lambda row: row[0])
+        ]
 
 
 def follow_event(
     model: Structure,
     force: float,
-    start: tuple[Float[ArrayLike, "coefficient mode"], float],
+    start: tuple[Float[ArrayLike, "coefficient mode"], float | Float[ArrayLike, ""]],
     *,
     kind: EventKind,
     to: tuple[float, float],
@@ -236,7 +244,7 @@ def starts_beside_folds(model: Structure, folds: EventCurve, value: float) -> li
 def _problem(
     model: Structure,
     force: float,
-    start: tuple[ArrayLike, float],
+    start: tuple[ArrayLike, float | ArrayLike],
     kind: EventKind,
     to: tuple[float, float],
     parameter: str,
@@ -263,7 +271,8 @@ def _problem(
     if kind == "neimark_sacker" and expanded.hysteretic:
         names = ", ".join(effect.kind for effect in expanded.hysteretic)
         raise ValueError(f"a Neimark-Sacker point is not followed with friction ({names}).")
-    coefficients, frequency = np.asarray(start[0], dtype=np.float64), float(start[1])
+    coefficients = np.asarray(start[0], dtype=np.float64)
+    frequency = float(np.asarray(start[1]))
     largest = max(load, upper) if parameter == FORCE else load
     scale = max(resonance_displacement(expanded, largest), float(np.abs(coefficients).max()))
     balance = harmonic_balance(
