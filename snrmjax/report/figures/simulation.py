@@ -119,9 +119,7 @@ def event_curve_figure(curves: Sequence[EventCurve], *, sensor: str | None = Non
         speed = np.abs(velocity_of(curve, name)) / unit.size
         for axes, y in ((frequencies, curve.frequency / HERTZ), (speeds, speed)):
             axes.plot(x, y, color=colour, **CURVE, label=curve.kind.replace("_", " "))
-            marks(
-                axes, x[turns], y[turns], {**HOLLOW, "marker": "s"}, "turn" if len(turns) else None
-            )
+            marks(axes, x[turns], y[turns], {**HOLLOW, "marker": "s"}, "turn of the parameter")
     level = f"Velocity amplitude ({unit.name})"
     name_axes(frequencies, "(a) frequency", below, "Frequency (Hz)")
     name_axes(speeds, f"(b) amplitude at {plain(name)}", below, level)

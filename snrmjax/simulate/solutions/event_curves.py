@@ -174,9 +174,9 @@ def follow_event(
     >>> from snrmjax import forced_response
     >>> from snrmjax.model import flat_beam
     >>> beam = flat_beam()
-    >>> curve = forced_response(beam, [2e-3], 480.0, 560.0, harmonic_order=1)[0]
+    >>> curve = forced_response(beam, [0.01], 480.0, 660.0, harmonic_order=1)[0]
     >>> start = curve.point(curve.at_events("fold")[0])
-    >>> folds = follow_event(beam, 2e-3, start, kind="fold", to=(1e-4, 2e-3))
+    >>> folds = follow_event(beam, 0.01, start, kind="fold", to=(1e-3, 0.01))
     >>> [name for name in folds.event if name]
     ['cusp']
     """
