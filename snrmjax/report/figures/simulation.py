@@ -103,9 +103,7 @@ def event_curve_figure(curves: Sequence[EventCurve], *, sensor: str | None = Non
     parameters = sorted({(c.parameter, c.unit) for c in drawn})
     if len(parameters) > 1:
         listed = ", ".join(parameter for parameter, _ in parameters)
-        raise ValueError(
-            f"curves over one parameter can be shown together, but these have {listed}."
-        )
+        raise ValueError(f"the curves must be over one parameter, but are over {listed}.")
     ((parameter, base),) = parameters
     of = unit_for(np.concatenate([c.value for c in drawn]), "N") if base == "N" else None
     size, label = (of.size, of.name) if of else (1.0, base)
