@@ -6,7 +6,7 @@ singular. Bordered by a row and a column it is regular, and the last entry g of
 the gradient ∂g = −wᵀ(∂A)v of v and of w from the transposed system.
 Reference: Govaerts, Numerical Methods for Bifurcations of Dynamical Equilibria (2000), chapters 3
 and 4, doi:10.1137/1.9780898719543; of harmonic balance: Detroux et al., Comput. Methods Appl. Mech.
-Eng. 296 (2015) 18, doi:10.1016/j.cma.2015.07.017; Xie et al., Mech. Syst. Signal Process. 88 (2017),
+Eng. 296 (2015) 18, doi:10.1016/j.cma.2015.07.017; Xie et al., Mech. Syst. Signal Process. (2017),
 doi:10.1016/j.ymssp.2016.09.037.
 """
 
