@@ -29,6 +29,7 @@ from snrmjax.report.figures.modes import (
 from snrmjax.report.figures.simulation import (
     batch_figure,
     damped_mode_figure,
+    event_curve_figure,
     motions_figure,
     normal_mode_figure,
     simulated_response_figure,
@@ -50,6 +51,7 @@ __all__ = [
     "damped_mode_figure",
     "decay_figure",
     "effect_laws_figure",
+    "event_curve_figure",
     "fitted_curves_figure",
     "force_velocity_figure",
     "misfit_figure",

@@ -11,7 +11,7 @@ import subprocess
 import sys
 from contextlib import redirect_stderr
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 from unittest import mock
 
 import numpy as np
@@ -21,10 +21,11 @@ from matplotlib.figure import Figure
 from truths.exact_states import CONSTANT, TRUE, damping, exact, modes, noisy, squared
 
 import snrmjax as sj
-from snrmjax.cli import app, main
+from snrmjax.cli import app, main, simulate_commands
 from snrmjax.io import tables
 from snrmjax.io.units import HERTZ
 from snrmjax.report.style import png_bytes
+from snrmjax.simulate.continuation import event_equations
 
 COMMANDS = ("demo", "simulate", "nnm", "identify", "diagnose")
 FAMILIES = f"{TRUE['backbone']},{TRUE['damping']}"
@@ -174,6 +175,20 @@ def test_simulate_and_nnm_write_what_the_contract_says(files, tmp_path):
         "stable",
         "event",
     ]
+    assert not (out / "events.csv").exists()
+    assert get_args(simulate_commands.EventKind) == get_args(event_equations.EventKind)
+    done = run(
+        *("simulate", str(model), "--force", "1e-4", "--from-hz", "50", "--to-hz", "80"),
+        *("--follow", "peak", "--to", "2e-4"),
+        *("--harmonics", "3", "--out", str(out)),
+    )
+    assert done.code == 0, done.stderr
+    assert "peak over force: " in done.stderr
+    assert columns(out / "events.csv") == [
+        *("curve", "kind", "parameter", "value", "force_n", "frequency_hz"),
+        *("velocity_h1_re_m_s", "velocity_h1_im_m_s", "velocity_peak_m_s", "event"),
+    ]
+    assert (out / "events.png").read_bytes()[:4] == b"\x89PNG"
     done = run(
         *("nnm", str(model), "--to-hz", "60", "--harmonics", "3", "--out", str(out)),
     )
@@ -226,6 +241,10 @@ def test_a_wrong_model_ends_with_two(files, tmp_path):
     [
         (("simulate", "--force", 1, "--from-hz", 80, "--to-hz", 50), ("--from-hz", "80 and 50 Hz")),
         (("simulate", "--force", -1, "--from-hz", 50, "--to-hz", 80), ("--force", "-1 N")),
+        (
+            ("simulate", "--force", 1, "--from-hz", 50, "--to-hz", 80, "--follow", "fold"),
+            ("--follow", "--to"),
+        ),
         (("nnm", "--to-hz", -5), ("--to-hz", "-5 Hz")),
         (("nnm", "--to-hz", 64.78), ("--to-hz", "64.78 Hz")),
         (("identify", "--predict-force", 0), ("--predict-force", "0 N")),

@@ -8,6 +8,9 @@ from snrmjax.cli.console import say, tell, written
 from snrmjax.cli.options import Harmonics, Model, Out, require_positive
 from snrmjax.report.writing import staged
 
+EventKind = Literal["fold", "peak", "phase_resonance", "period_doubling", "neimark_sacker"]
+_FOLLOWED = "Events over a parameter"
+
 
 def simulate(
     model: Model,
@@ -39,6 +42,33 @@ def simulate(
             "(takes longer).",
         ),
     ] = False,
+    follow: Annotated[
+        EventKind | None,
+        typer.Option(
+            help="Also follow events of the responses as a parameter changes (events.csv and "
+            "events.png).",
+            rich_help_panel=_FOLLOWED,
+            show_default=False,
+        ),
+    ] = None,
+    parameter: Annotated[
+        str,
+        typer.Option(
+            help="The parameter: the force, or a number of the model such as "
+            "mode_1.damping_ratio or potential.1111.",
+            metavar="NAME",
+            rich_help_panel=_FOLLOWED,
+        ),
+    ] = "force",
+    to: Annotated[
+        float | None,
+        typer.Option(
+            help="Value that the parameter goes to from its own, in N, rad/s or the unit of the "
+            "effect; a curve that turns before comes back.",
+            rich_help_panel=_FOLLOWED,
+            show_default=False,
+        ),
+    ] = None,
 ) -> None:
     """Simulate responses to a harmonic force, around their folds and with unstable parts.
 
@@ -54,11 +84,16 @@ def simulate(
             f"{from_hz:g} and {to_hz:g} Hz."
         )
     require_positive("--force", force, "N")
+    if follow and to is None:
+        raise ValueError("`--follow` needs `--to`, the value that the parameter goes to.")
     with staged(out) as folder:
         found = simulate_responses(
             *(read_model(model), force, from_hz, to_hz),
             harmonics=harmonics,
             isolated=isolated,
+            follow=[] if follow is None else [follow],
+            parameter=parameter,
+            to=to,
             progress=lambda load: say(f"force {load:g} N"),
         )
         simulation.write(folder, found)

@@ -12,6 +12,7 @@ from snrmjax.io.units import HERTZ
 from snrmjax.simulate.balance.labelled import velocity_peaks
 from snrmjax.simulate.continuation.response_curve import ResponseCurve
 from snrmjax.simulate.continuation.stability import Stability
+from snrmjax.simulate.solutions.event_curves import EventCurve
 from snrmjax.simulate.solutions.normal_modes import NormalModeBranch
 
 if TYPE_CHECKING:  # a simulation does not wait for the imports of an identification
@@ -57,6 +58,38 @@ def write_response(
             "velocity_peak_m_s": velocity_peaks(velocity),
             "stable": np.concatenate([c.is_stable for c in curves]),
             "event": [event for c in curves for event in _events(c)],
+        },
+    )
+
+
+def write_event_curves(
+    path: FilePath, curves: Sequence[EventCurve], *, sensor: str | None = None
+) -> None:
+    """Write events followed over a parameter: its values, frequency and velocity at one sensor.
+
+    Arguments: `sensor` is the name of one, by default the first.
+    Raises `ValueError` without a curve, when there is no such sensor or the file cannot be written.
+    """
+    if not curves:
+        raise ValueError("there is no curve of events to write.")
+    r = _place(curves[0].sensors, sensor)
+    sizes = [len(c.frequency) for c in curves]
+    fundamental = np.concatenate([c.velocity[:, 1, r] for c in curves])
+    write_table(
+        path,
+        {
+            "curve": np.repeat(np.arange(len(curves)), sizes),
+            "kind": [c.kind for c, n in zip(curves, sizes, strict=True) for _ in range(n)],
+            "parameter": [
+                c.parameter for c, n in zip(curves, sizes, strict=True) for _ in range(n)
+            ],
+            "value": np.concatenate([c.value for c in curves]),
+            "force_n": np.concatenate([c.force for c in curves]),
+            "frequency_hz": np.concatenate([c.frequency for c in curves]) / HERTZ,
+            "velocity_h1_re_m_s": fundamental.real,
+            "velocity_h1_im_m_s": fundamental.imag,
+            "velocity_peak_m_s": _peaks(np.concatenate([c.velocity[:, :, r] for c in curves])),
+            "event": [event for c in curves for event in c.event],
         },
     )
 

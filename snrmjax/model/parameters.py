@@ -20,6 +20,7 @@ _MODE_RULES = {
     "damping_ratio": (BELOW_ONE,),
     "participation": (NOT_ZERO,),
 }
+_MODE_UNITS = {"natural_frequency": "rad/s", "damping_ratio": "1", "participation": "kg^-1/2"}
 _MODE_FIELDS = tuple(_MODE_RULES)
 
 
@@ -65,6 +66,16 @@ def parameter_rules(model: Structure, name: str) -> tuple[Rule, ...]:
     if part == "effects":
         return model.effects[entry].parameters()[field].rules
     return _MODE_RULES.get(field, ())
+
+
+def parameter_unit(model: Structure, name: str) -> str:
+    """The unit of the number that a name of `parameter_names` stands for; "1" for none."""
+    part, entry, field, _ = _places(model)[name]
+    if part == "effects":
+        return model.effects[entry].parameters()[field].unit
+    if part == "potential":
+        return f"J/(kg^1/2 m)^{len(model.potential.monomials[entry])}"
+    return _MODE_UNITS[field]
 
 
 def parameter_value(model: Structure, name: str) -> Float[Array, ""]:

@@ -7,16 +7,20 @@ import numpy as np
 
 from snrmjax.identify.pointwise.snrm import reference_sensor
 from snrmjax.io.units import HERTZ
+from snrmjax.model.parameters import checked_names, parameter_values
 from snrmjax.model.structures import Structure, equilibria
 from snrmjax.numerics.facts import Fact
 from snrmjax.simulate.continuation.continuation import CurveStatus
+from snrmjax.simulate.continuation.event_equations import FORCE, EventKind
 from snrmjax.simulate.continuation.response_curve import Branch, ResponseCurve
 from snrmjax.simulate.continuation.stability import Stability
+from snrmjax.simulate.solutions.event_curves import EventCurve, follow_event
 from snrmjax.simulate.solutions.forced_response import ResponseSettings, forced_response
 from snrmjax.simulate.solutions.isolated_responses import isolated_responses
 from snrmjax.simulate.solutions.normal_modes import NormalModeBranch, nonlinear_normal_mode
 
 _TRUNCATED = 0.02  # share of the velocity that harmonics left out may have, without a note
+_SAME_EVENT = 1e-6  # of the frequency, between an event of a response and a curve of events
 _ENDS = (CurveStatus.UPPER_END, CurveStatus.LOWER_END)
 
 
@@ -26,6 +30,7 @@ class SimulatedResponses(NamedTuple):
     curves: tuple[ResponseCurve, ...]
     sensor: str  # that figures and tables show
     notes: tuple[Fact, ...]
+    events: tuple[EventCurve, ...] = ()  # followed over a parameter
 
 
 class SimulatedMode(NamedTuple):
@@ -44,14 +49,24 @@ def simulate_responses(
     *,
     harmonics: int = 9,
     isolated: bool = False,
+    follow: Sequence[EventKind] = (),
+    parameter: str = FORCE,
+    to: float | None = None,
     progress: Callable[[float], None] = lambda force: None,
 ) -> SimulatedResponses:
     """Responses to harmonic forces, around folds and with unstable parts.
 
     Arguments: `forces` in N; `harmonics` that are balanced; `isolated` also searches for curves
-    that are not connected to the one from rest; `progress` is told each force when it begins.
-    Raises `ValueError` as `forced_response` does, and where no curve has a point.
+    that are not connected to the one from rest; `follow` kinds of events that are followed as the
+    `parameter` goes from its value to `to`, and back where it turns (see `follow_event`);
+    `progress` is told each force when it begins.
+    Raises `ValueError` as `forced_response` and `follow_event` do, where no curve has a point, and
+    for events to follow without `to`.
     """
+    if follow and to is None:
+        raise ValueError("`to` must be given with `follow`: the value that the parameter goes to.")
+    if follow and parameter != FORCE:
+        checked_names(model, [parameter])
     ends, settings = (from_hz * HERTZ, to_hz * HERTZ), ResponseSettings(harmonic_order=harmonics)
     curves: list[ResponseCurve] = []
     notes = list(_notes_on_equilibria(model))
@@ -78,7 +93,33 @@ def simulate_responses(
     share = float(max(estimates, default=0.0))
     if share > _TRUNCATED:
         notes.append(Fact("harmonics_left_out", harmonics=harmonics, share=share))
-    return SimulatedResponses(tuple(curves), _sensor(model), tuple(notes))
+    events: list[EventCurve] = []
+    if to is not None:
+        for kind in follow:
+            found = _followed(model, curves, kind, parameter, to)
+            notes += [] if found else [Fact("no_event_to_follow", event=kind)]
+            events += found
+    return SimulatedResponses(tuple(curves), _sensor(model), tuple(notes), tuple(events))
+
+
+def _followed(
+    model: Structure, curves: Sequence[ResponseCurve], kind: EventKind, parameter: str, to: float
+) -> list[EventCurve]:
+    """The curves of an event through all that the responses have of it, each once."""
+    found: list[EventCurve] = []
+    for curve in curves:
+        begin = curve.force if parameter == FORCE else parameter_values(model)[parameter]
+        for k in curve.at_events(kind):
+            motion = curve.point(k)
+            known = [c for c in found if parameter == FORCE or c.force[0] == curve.force]
+            passed = [frequency for c in known for _, frequency in c.near(begin)]
+            if np.any(np.abs(np.array(passed) / motion[1] - 1) < _SAME_EVENT):
+                continue
+            between = (min(begin, to), max(begin, to))
+            found.append(
+                follow_event(model, curve.force, motion, kind=kind, parameter=parameter, to=between)
+            )
+    return found
 
 
 def simulate_mode(

@@ -111,6 +111,7 @@ _FIGURES: dict[str, Callable[..., Figure]] = {
     "DecayModes": decay_figure,
     "Diagnosis": diagnosis_figures.misfit_figure,
     "EquivalentForce": lambda one: _force_over_drive(one.drive, one.force, one.force_std),
+    "EventCurve": lambda one, **settings: simulation_figures.event_curve_figure([one], **settings),
     "FittedResponse": lambda one: joint_figures.next_measurements_figure(
         [one], [], sensor=one.sensor
     ),

@@ -8,9 +8,7 @@ from jax.typing import ArrayLike
 from snrmjax.identify.pointwise.prediction_result import PredictedResponse
 from snrmjax.io.units import DEGREE, HERTZ
 from snrmjax.measure.states import SteadyStates
-from snrmjax.simulate.solutions.controlled import DampedModeBranch
-from snrmjax.simulate.solutions.forced_response import ResponseCurve
-from snrmjax.simulate.solutions.normal_modes import NormalModeBranch
+from snrmjax.simulate.continuation.response_curve import MotionCurve, ResponseCurve
 
 if TYPE_CHECKING:  # figures of a simulation do not wait for the imports of an identification
     from snrmjax.identify.joint.joint_fit import JointFit
@@ -124,9 +122,7 @@ def fit_residuals(fit: "JointFit") -> FitResiduals:
     )
 
 
-def velocity_of(
-    curve: PredictedResponse | ResponseCurve | NormalModeBranch | DampedModeBranch, sensor: str
-) -> np.ndarray:
+def velocity_of(curve: PredictedResponse | MotionCurve, sensor: str) -> np.ndarray:
     """Phasors (m/s) of the velocity fundamental along a curve, at one sensor.
 
     A `PredictedResponse` has only its backbone's sensor. Raises `ValueError` for an unknown one.

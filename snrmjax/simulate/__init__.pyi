@@ -3,6 +3,7 @@ from .continuation.continuation import CurveStatus, StepControl
 from .continuation.response_curve import ResponseCurve
 from .continuation.stability import Stability, floquet_multipliers
 from .solutions.controlled import damped_normal_mode, phase_controlled, response_controlled
+from .solutions.event_curves import EventCurve, follow_event, starts_beside_folds
 from .solutions.forced_response import (
     ResponseSettings,
     forced_response,
@@ -38,6 +39,7 @@ __all__ = [
     "AbstractController",
     "AmplitudeGains",
     "CurveStatus",
+    "EventCurve",
     "FeedbackSettings",
     "Instruments",
     "IntegrationAccuracy",
@@ -57,6 +59,7 @@ __all__ = [
     "damped_normal_mode",
     "decay_test",
     "floquet_multipliers",
+    "follow_event",
     "forced_response",
     "forced_response_batch",
     "isolated_responses",
@@ -72,6 +75,7 @@ __all__ = [
     "s_curve",
     "settled_motion",
     "solve_at_frequency",
+    "starts_beside_folds",
     "steady_states_of",
     "stepped_motions",
     "stepped_sine_test",

@@ -59,6 +59,30 @@ def test_simulation(files, tmp_path):
     modes = given.modes
     peak = modes.mode_shape[0, 0] ** 2 / (2 * modes.damping_ratio[0] * modes.natural_frequency[0])
     assert np.abs(curve.velocity[:, 1, 0]).max() == pytest.approx(float(peak), rel=1e-3)
+    # Both events of one curve, and of the second force too.
+    found = sj.pipelines.simulate_responses(
+        given, [1.0, 2.0], 55, 65, follow=["peak", "phase_resonance", "fold"], to=3.0
+    )
+    assert [note.kind for note in found.notes] == ["no_event_to_follow"]
+    assert [events.kind for events in found.events] == ["peak", "phase_resonance"]
+    # The second force is on the curve from the first.
+    np.testing.assert_allclose([events.force.min() for events in found.events], 1.0)
+    assert written(found, tmp_path / "events") == {
+        *("response.csv", "response.png", "events.csv", "events.png"),
+    }
+    damped = sj.pipelines.simulate_responses(
+        *(given, [1.0, 2.0], 55, 65),
+        follow=["peak"],
+        parameter="mode_1.damping_ratio",
+        to=2 * float(given.modes.damping_ratio[0]),
+    )
+    assert [events.force[0] for events in damped.events] == [1.0, 2.0]
+    with pytest.raises(ValueError, match="which the model does not have"):
+        sj.pipelines.simulate_responses(
+            given, [1.0], 55, 65, follow=["fold"], parameter="mode_9.damping_ratio", to=1.0
+        )
+    with pytest.raises(ValueError, match="`to` must be given"):
+        sj.pipelines.simulate_responses(given, [1.0], 55, 65, follow=["fold"])
     with pytest.raises(ValueError, match="must differ from the linear frequency"):
         sj.pipelines.simulate_mode(given, 60.0)
 

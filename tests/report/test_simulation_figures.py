@@ -8,6 +8,7 @@ import pytest
 from truths.beam_forces import FORCES
 from truths.printed_page import unreadable
 
+import snrmjax as sj
 from snrmjax.io.units import HERTZ
 from snrmjax.report.figures import simulation as plot
 
@@ -68,6 +69,31 @@ def test_normal_mode_against_frequency_and_energy(mode):
     np.testing.assert_allclose(peak[small], fundamental.get_ydata()[small], rtol=0.01)
     with pytest.raises(ValueError, match="the branch has no point"):
         plot.normal_mode_figure(dataclasses.replace(mode, frequency=np.zeros(0)))
+
+
+def test_events_are_drawn_over_their_parameter():
+    modes = sj.model.linear_modes([1.0], [0.025], [[1.0]], [1.0])
+    model = sj.model.structure(modes, sj.model.polynomial_potential({"1111": 0.025}, 1))
+    (response,) = sj.forced_response(model, [0.18], 0.5, 1.6, harmonic_order=1, stability=False)
+
+    def followed(kind, parameter, to):
+        start = response.point(response.at_events(kind)[0])
+        return sj.simulate.follow_event(model, 0.18, start, kind=kind, parameter=parameter, to=to)
+
+    folds = followed("fold", "force", (0.01, 0.2))
+    figure = plot.event_curve_figure([folds, followed("peak", "force", (0.01, 0.2))])
+    frequencies, speeds = figure.axes
+    assert frequencies.get_xlabel() == "Force (N)"
+    assert speeds.get_ylabel() == "Velocity amplitude (m/s)"
+    assert legend_names(figure) == {"fold", "peak", "turn of the parameter"}
+    np.testing.assert_allclose(named(frequencies, "fold").get_ydata(), folds.frequency / HERTZ)
+    (k,) = folds.at_events("cusp")
+    turn = named(speeds, "turn of the parameter")
+    np.testing.assert_allclose(turn.get_xydata(), [[folds.value[k], folds.amplitude[k]]])
+    damped = followed("peak", "mode_1.damping_ratio", (0.02, 0.05))
+    assert damped.plot().axes[0].get_xlabel() == "mode_1.damping_ratio"
+    with pytest.raises(ValueError, match=r"must be over one parameter, but are over force, mode_1"):
+        plot.event_curve_figure([folds, damped])
 
 
 def test_results_are_drawn_with_their_errors_and_stability(identification, backbone, predicted):

@@ -43,6 +43,13 @@ VERBS = {
     "periodic_motion": lambda k: sj.simulate.periodic_motion(
         oscillator(0.02 + 0.001 * k), 0.02 + 0.001 * k, motion(k), value=1.5 + 0.01 * k
     ),
+    "follow_event": lambda k: sj.simulate.follow_event(
+        *(oscillator(0.02 + 0.001 * k), 0.1 + 0.01 * k, motion(k)),
+        kind="phase_resonance",
+        parameter="mode_1.damping_ratio",
+        to=(0.01 + 0.001 * k, 0.04 + 0.001 * k),
+        steps=CONTROL(largest=0.05 + 0.01 * k),
+    ),
     "solve_at_frequency": lambda k: sj.simulate.solve_at_frequency(
         oscillator(0.02 + 0.001 * k), 0.02 + 0.001 * k, 1.5 + 0.01 * k, motion(k)[0][None]
     ),

@@ -28,6 +28,8 @@ def curve():
     return found
 
 
+# Near a peak at `FORCE`: coefficients and rad/s.
+PEAK = (np.array([0.0, 0.0, 1.0, 0.0, 0.0])[:, None], 2.22)
 SETTINGS = sj.simulate.ResponseSettings(harmonic_order=3, stability=False)
 # What computes a result, what its first line says, and a variable with its unit.
 RESULTS = {
@@ -40,6 +42,14 @@ RESULTS = {
             oscillator(), FORCE, *ENDS, known=[], settings=SETTINGS
         ),
         ("IsolatedResponses: 1 curve", "velocity_m_s", "m/s"),
+    ),
+    "event curve": (
+        lambda: sj.simulate.follow_event(
+            *(oscillator(), FORCE, PEAK),
+            kind="peak",
+            to=(0.5 * FORCE, FORCE),
+        ),
+        ("peak over force: ", "parameter", "N"),
     ),
     "batch": (
         lambda: sj.simulate.forced_response_batch(

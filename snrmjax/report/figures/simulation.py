@@ -41,6 +41,7 @@ from snrmjax.report.style import (
 )
 from snrmjax.simulate.balance.labelled import velocity_peaks
 from snrmjax.simulate.solutions.controlled import DampedModeBranch
+from snrmjax.simulate.solutions.event_curves import EventCurve
 from snrmjax.simulate.solutions.forced_response import ResponseBatch, ResponseCurve
 from snrmjax.simulate.solutions.normal_modes import NormalModeBranch
 
@@ -81,6 +82,45 @@ def simulated_response_figure(
     speeds.set_ylim(bottom=0.0)
     phase_axis(phases)
     explain_lines(figure)
+    legend(figure)
+    return figure
+
+
+def event_curve_figure(curves: Sequence[EventCurve], *, sensor: str | None = None) -> Figure:
+    """Events of forced responses over a parameter: their frequency and their velocity amplitude.
+
+    Squares mark where the parameter turns: cusps, births and mergings of isolated responses.
+
+    Arguments: `curves` over one parameter; `sensor` by default the first of the curves.
+    Returns the figure. Raises `ValueError` when no curve has a point, the curves have several
+    parameters, or the sensor is missing.
+    """
+    drawn = [c for c in curves if len(c.frequency)]
+    if not drawn:
+        raise ValueError("there is no curve of events to show: no curve has a point.")
+    name = sensor or drawn[0].sensors[0]
+    parameters = sorted({(c.parameter, c.unit) for c in drawn})
+    if len(parameters) > 1:
+        listed = ", ".join(parameter for parameter, _ in parameters)
+        raise ValueError(f"the curves must be over one parameter, but are over {listed}.")
+    ((parameter, base),) = parameters
+    of = unit_for(np.concatenate([c.value for c in drawn]), "N") if base == "N" else None
+    size, label = (of.size, of.name) if of else (1.0, base)
+    below = parameter.replace("_", " ").capitalize() if of else parameter
+    below += "" if label == "1" else f" ({label})"
+    unit = unit_for(np.concatenate([np.abs(velocity_of(c, name)) for c in drawn]), "m/s")
+    figure, ((frequencies, speeds),) = panels(PAGE, 3.2, 1, 2)
+    for number, curve in enumerate(drawn):
+        x, colour = curve.value / size, SERIES[number % len(SERIES)]
+        turns = np.flatnonzero([bool(event) for event in curve.event])
+        speed = np.abs(velocity_of(curve, name)) / unit.size
+        for axes, y in ((frequencies, curve.frequency / HERTZ), (speeds, speed)):
+            axes.plot(x, y, color=colour, **CURVE, label=curve.kind.replace("_", " "))
+            marks(axes, x[turns], y[turns], {**HOLLOW, "marker": "s"}, "turn of the parameter")
+    level = f"Velocity amplitude ({unit.name})"
+    name_axes(frequencies, "(a) frequency", below, "Frequency (Hz)")
+    name_axes(speeds, f"(b) amplitude at {plain(name)}", below, level)
+    speeds.set_ylim(bottom=0.0)
     legend(figure)
     return figure
 

@@ -7,13 +7,17 @@ import numpy as np
 from snrmjax.io import results
 from snrmjax.io.units import HERTZ
 from snrmjax.pipelines.simulate import SimulatedMode, SimulatedResponses
-from snrmjax.report.figures.simulation import normal_mode_figure, simulated_response_figure
+from snrmjax.report.figures.simulation import (
+    event_curve_figure,
+    normal_mode_figure,
+    simulated_response_figure,
+)
 from snrmjax.report.style import save_figure
 from snrmjax.simulate.continuation.response_curve import Branch, ResponseCurve
 
 
 def write(folder: Path, found: SimulatedResponses | SimulatedMode) -> None:
-    """Write response.csv and response.png, or nnm.csv and nnm.png."""
+    """Write response.csv and response.png, or nnm.csv and nnm.png; events.csv and events.png."""
     sensor = found.sensor
     if isinstance(found, SimulatedMode):
         results.write_normal_mode(folder / "nnm.csv", found.branch, sensor=sensor)
@@ -22,6 +26,9 @@ def write(folder: Path, found: SimulatedResponses | SimulatedMode) -> None:
     results.write_response(folder / "response.csv", found.curves, sensor=sensor)
     figure = simulated_response_figure(found.curves, sensor=sensor)
     save_figure(folder / "response.png", figure)
+    if any(len(curve.frequency) for curve in found.events):
+        results.write_event_curves(folder / "events.csv", found.events, sensor=sensor)
+        save_figure(folder / "events.png", event_curve_figure(found.events, sensor=sensor))
 
 
 def headline(found: SimulatedResponses | SimulatedMode) -> list[str]:
@@ -31,7 +38,8 @@ def headline(found: SimulatedResponses | SimulatedMode) -> list[str]:
         speed = np.abs(branch.velocity[-1, 1, branch.sensors.index(found.sensor)])
         place = f"{branch.frequency[-1] / HERTZ:.5g} Hz, {speed:.3g} m/s at {found.sensor}"
         return [f"the mode ends at {place}"]
-    return [_largest(curve, found.sensor) for curve in found.curves]
+    events = ["; ".join(curve.summary()) for curve in found.events]
+    return [*(_largest(curve, found.sensor) for curve in found.curves), *events]
 
 
 def _largest(curve: ResponseCurve, sensor: str) -> str:

@@ -74,6 +74,7 @@ SENTENCES: dict[str, Wording] = {
     "isolated_searched": (
         "{n} further branches found at {force:g} N, of {n_starts} starts ({n_failed} failed)"
     ),
+    "no_event_to_follow": "no response has a {event} to follow.",
     "harmonics_left_out": (
         "the harmonics above {harmonics} would change the velocity by up to about {share:%.2g} "
         "somewhere; use more --harmonics."

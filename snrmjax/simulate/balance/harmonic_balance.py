@@ -63,10 +63,14 @@ class HarmonicBalance(eqx.Module):
     def motions(
         self, points: Float[np.ndarray, "point unknown"]
     ) -> tuple[Float[np.ndarray, "point coefficient mode"], Float[np.ndarray, " point"]]:
-        """Coefficients (kg^1/2 m) and frequencies (rad/s) of scaled points (x, λ), on the host."""
+        """Coefficients (kg^1/2 m) and frequencies (rad/s) of scaled points (x, λ), on the host.
+
+        Of a stacked balance: one point of each.
+        """
+        scale, unit = np.asarray(self.displacement_scale), np.asarray(self.frequency_scale)
+        rows = points[:, :-1] * scale[..., None]
         shape = (len(points), self.n_coefficients, self.model.n_modes)
-        coefficients = points[:, :-1].reshape(shape) * np.asarray(self.displacement_scale)
-        return coefficients, points[:, -1] * np.asarray(self.frequency_scale)
+        return rows.reshape(shape), points[:, -1] * unit
 
     def load(self) -> Float[Array, " equation"]:
         """Scaled force of one newton: the right-hand side for `force` = 1."""

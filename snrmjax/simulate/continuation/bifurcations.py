@@ -1,6 +1,5 @@
 """Bifurcations along curves of periodic motions: where a multiplier crosses the unit circle."""
 
-import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -23,8 +22,8 @@ BIFURCATIONS = (
 )
 _FOLDS_OWN = 12  # points from a fold at which its multiplier may cross
 _CROSSING = 5e-7  # of a step, to which the crossing of the circle is located
-_SHARES = 16  # of the way through an interval that are looked at side by side
-_ROUNDS = 12  # of looking closer, at most; two or three do
+_SHARES = 4  # of the way through an interval that are looked at side by side
+_ROUNDS = 24  # of looking closer, at most; three or four do
 
 
 class _Crossing(NamedTuple):
@@ -60,13 +59,13 @@ def _crossings(
     regular = np.flatnonzero([event != CurveEvent.FOLD for event in curve.events])
     outside, beyond_one = _outside(multipliers), _beyond_one(multipliers)
     rest = outside - beyond_one
-    crossings, beside_fold, quiet_folds = [], [], []
-    for k, following in itertools.pairwise(regular.tolist()):
-        if not np.all(np.isfinite(multipliers[[k, following]])):
-            continue
-        if following == k + 1:
-            crossings += [k] if outside[k] != outside[following] else []
-            continue
+    finite = np.all(np.isfinite(multipliers), axis=1)
+    first, second = regular[:-1], regular[1:]
+    known, plain = finite[first] & finite[second], second == first + 1
+    crossings = first[known & plain & (outside[first] != outside[second])].tolist()
+    beside_fold, quiet_folds = [], []
+    passing = np.flatnonzero(known & ~plain)
+    for k, following in zip(first[passing].tolist(), second[passing].tolist(), strict=True):
         # At a fold one multiplier crosses +1 anyway; others may cross elsewhere beside it.
         of_the_fold = abs(int(beyond_one[following]) - int(beyond_one[k]))
         if of_the_fold == 0:
@@ -99,8 +98,7 @@ def _located_bifurcations(
 ) -> list[TracedCurve]:
     """Where the last multiplier that crosses is on the circle, to a millionth of a step.
 
-    All crossings are looked for at once: each at several shares of its way side by side, equal
-    ones first, then ever closer ones around the root of the cubic through the nearest four.
+    All crossings are looked for at once, each at four shares of its way side by side.
     """
     if not crossings:
         return curves
@@ -113,19 +111,19 @@ def _located_bifurcations(
         [_outside(rows) - np.where(without_one, _beyond_one(rows), 0) for rows in ends], axis=0
     )
 
-    def heights(rows: np.ndarray) -> Float[np.ndarray, "crossing share"]:
+    def heights(rows: np.ndarray, which: np.ndarray) -> Float[np.ndarray, "crossing share"]:
         """Modulus beyond the circle, of the multiplier that is outside at one end only."""
-        free = without_one[:, None, None] & _is_beyond_one(rows)
+        free = without_one[which, None, None] & _is_beyond_one(rows)
         radius = np.sort(np.where(free, 0.0, np.abs(rows)), axis=-1)
-        place = np.broadcast_to(-last[:, None, None], (*radius.shape[:2], 1))
+        place = np.broadcast_to(-last[which, None, None], (*radius.shape[:2], 1))
         return np.take_along_axis(radius, place, axis=-1)[..., 0] - (1.0 + MARGIN)
 
-    known = heights(np.stack(ends, axis=1))
+    count = len(crossings)
+    known = heights(np.stack(ends, axis=1), np.arange(count))
     sense = np.sign(known[:, 1] - known[:, 0])[:, None]
-    numbers, count = np.arange(len(owner)), len(owner)
-    share = np.broadcast_to(np.linspace(0.0, 1.0, _SHARES + 2), (count, _SHARES + 2))
     low, high = np.zeros(count), np.ones(count)
     value_low, value_high = (sense * known).T
+    share = np.tile(np.arange(1, _SHARES + 1) / (_SHARES + 1), (count, 1))
     # Where the crossing is known to be passed: at first the neighbours behind it.
     point, tangent = (
         np.stack([rows[k + 1] for rows, k in zip(column, before.tolist(), strict=True)])
@@ -133,34 +131,32 @@ def _located_bifurcations(
     )
     passed, inside, missed = ends[1], np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
     for _ in range(_ROUNDS):
-        shares = np.sort(share[:, 1:-1], axis=1)
+        still = np.flatnonzero(high - low > _CROSSING)
+        if not still.size:
+            break
+        owners, places = (np.repeat(part[still], _SHARES) for part in (owner, before))
         points, tangents, found = points_between(
-            balances,
-            curves,
-            *(np.repeat(part, _SHARES).tolist() for part in (owner, before)),
-            shares.ravel().tolist(),
-            steps,
+            *(balances, curves, owners.tolist(), places.tolist()), share[still].ravel(), steps
         )
-        shape = (count, _SHARES)
-        points, tangents = (part.reshape(*shape, -1) for part in (points, tangents))
-        rows = many_multipliers(balances, owner, points)
-        found = found.reshape(shape) & np.all(np.isfinite(rows), axis=-1)
-        missed |= ~np.all(found, axis=1)
+        rows = many_multipliers(balances, owners, points)
+        found = (found & np.all(np.isfinite(rows), axis=1)).reshape(-1, _SHARES)
+        points, tangents, rows = (
+            part.reshape(len(still), _SHARES, -1) for part in (points, tangents, rows)
+        )
+        missed[still] |= ~np.all(found, axis=1)
         # A point that is not found counts as one before the crossing.
-        values = np.where(found, sense * heights(rows), value_low[:, None])
-        whole = np.concatenate([low[:, None], shares, high[:, None]], axis=1)
-        height = np.concatenate([value_low[:, None], values, value_high[:, None]], axis=1)
+        values = np.where(found, sense[still] * heights(rows, still), value_low[still, None])
+        whole = np.concatenate([low[still, None], share[still], high[still, None]], axis=1)
+        height = np.concatenate([value_low[still, None], values, value_high[still, None]], axis=1)
         behind = np.argmax(height[:, 1:] > 0, axis=1) + 1
         new = behind <= _SHARES
-        inside |= new
+        inside[still] |= new
         for kept, fresh in ((point, points), (tangent, tangents), (passed, rows)):
-            kept[new] = fresh[new, behind[new] - 1]
-        guess = _root(whole, height, behind)
-        low, high = whole[numbers, behind - 1], whole[numbers, behind]
-        value_low, value_high = height[numbers, behind - 1], height[numbers, behind]
-        if np.all(high - low <= _CROSSING):
-            break
-        share = _closer(low, high, guess)
+            kept[still[new]] = fresh[new, behind[new] - 1]
+        at = np.arange(len(still))
+        low[still], high[still] = whole[at, behind - 1], whole[at, behind]
+        value_low[still], value_high[still] = height[at, behind - 1], height[at, behind]
+        share[still] = _closer(whole, height, behind)
     located = (high - low <= _CROSSING) & (inside | ~missed)
     new_points = [
         NewPoint(int(o), int(k), point[e], tangent[e], _crossing_kind(passed[e]), passed[e])
@@ -172,35 +168,37 @@ def _located_bifurcations(
     return inserted(curves, new_points)
 
 
-def _closer(low: np.ndarray, high: np.ndarray, guess: np.ndarray) -> np.ndarray:
-    """Shares between two ends: at distances from a guess that grow in equal ratios."""
-    half = _SHARES // 2
-    ratio = np.maximum(high - low, _CROSSING) / _CROSSING
-    distance = 0.45 * _CROSSING * ratio[:, None] ** np.linspace(0.0, 1.0, half)
-    around = guess[:, None] + np.concatenate([-distance[:, ::-1], distance], axis=1)
-    inner = np.clip(around, low[:, None], high[:, None])
-    return np.concatenate([low[:, None], inner, high[:, None]], axis=1)
+def _closer(share: np.ndarray, height: np.ndarray, behind: np.ndarray) -> np.ndarray:
+    """Four shares for a closer look between the neighbours of a root, the second at `behind`.
 
-
-def _root(share: np.ndarray, height: np.ndarray, behind: np.ndarray) -> np.ndarray:
-    """Where the height vanishes before `behind`: by the share as a cubic of the height.
-
-    Through the two points on either side; by the chord between the nearest where that leads out.
+    Two divide the way into thirds. The others are on either side of where the share, as a cubic
+    of the height, has the root, as far away as the parabola's is.
     """
     rows = np.arange(len(share))
     low, high = share[rows, behind - 1], share[rows, behind]
-    first, last = height[rows, behind - 1], height[rows, behind]
-    chord = low - first * (high - low) / np.where(last > first, last - first, 1.0)
-    nodes = np.clip(behind[:, None] + np.arange(-2, 2), 0, share.shape[1] - 1)
-    x, y = (np.take_along_axis(part, nodes, axis=1) for part in (share, height))
-    with np.errstate(divide="ignore", invalid="ignore"):
+    nodes = behind[:, None] + np.array([-1, 0, -2, 1])
+    x, y = (
+        np.take_along_axis(part, np.clip(nodes, 0, share.shape[1] - 1), axis=1)
+        for part in (share, height)
+    )
+
+    def root(count: int) -> np.ndarray:
+        """By the first so many nodes."""
         weight = [
-            np.prod([y[:, j] / (y[:, j] - y[:, i]) for j in range(4) if j != i], axis=0)
-            for i in range(4)
+            np.prod([y[:, j] / (y[:, j] - y[:, i]) for j in range(count) if j != i], axis=0)
+            for i in range(count)
         ]
-        cubic = sum(w * x[:, i] for i, w in enumerate(weight))
-    good = np.isfinite(cubic) & (cubic >= low) & (cubic <= high)
-    return np.where(good, cubic, np.clip(chord, low, high))
+        return sum(w * x[:, i] for i, w in enumerate(weight))
+
+    with np.errstate(divide="ignore", invalid="ignore"):
+        cubic = root(4)
+        doubt = np.maximum(np.abs(cubic - root(3)), 0.45 * _CROSSING)
+    good = (cubic > low) & (cubic < high) & np.isfinite(doubt)
+    guess = np.where(good, cubic, 0.5 * (low + high))
+    doubt = np.where(good, doubt, 0.45 * _CROSSING)
+    third = (high - low) / 3
+    beside = [low + third, high - third, guess - doubt, guess + doubt]
+    return np.sort(np.clip(beside, low, high), axis=0).T
 
 
 def _outside(multipliers: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ from snrmjax.simulate.continuation.monodromy import monodromy
 
 _BLOCKS = ((1, 128), (2, 64))  # modes, and points whose linearised motions are side by side
 _BLOCK = 32  # of more modes
-_ROWS = 4  # of points of different structures, in one program
+_ROW, _ROWS = 16, 4  # points of one structure, and of how many structures, in one program
 STEPS_PER_CYCLE = 6  # of the fastest tangent frequency
 MARGIN = 1e-6  # beyond the unit circle: what the multipliers of a conservative motion may err by
 
@@ -67,19 +67,28 @@ def floquet_multipliers(
 
 
 def many_multipliers(
-    balances: HarmonicBalance, owner: np.ndarray, points: Float[np.ndarray, "row point unknown"]
-) -> Complex[np.ndarray, "row point multiplier"]:
-    """Floquet multipliers of as many points of every row, each row of another of the balances."""
-    n, size = len(owner), _ROWS if len(owner) > 1 else 1
+    balances: HarmonicBalance, owner: np.ndarray, points: Float[np.ndarray, "point unknown"]
+) -> Complex[np.ndarray, "point multiplier"]:
+    """Floquet multipliers of scaled points of several structures: `owner` says of which."""
+    groups = [np.flatnonzero(owner == o) for o in np.unique(owner)]
+    rows = [
+        np.resize(part, _ROW)  # filled up with its own
+        for group in groups
+        for part in np.split(group, range(_ROW, len(group), _ROW))
+    ]
+    size = _ROWS if len(rows) > 1 else 1
+    coefficients, frequency = taken(balances, owner).motions(points)
+    found = np.full((len(points), 2 * balances.model.n_modes), np.nan, dtype=np.complex128)
 
-    def block(begin: int) -> np.ndarray:
-        rows = np.minimum(np.arange(begin, begin + size), n - 1)
-        motions = [taken(balances, int(owner[k])).motions(points[k]) for k in rows]
-        columns = (np.stack(column) for column in zip(*motions, strict=True))
-        maps = _monodromies(taken(balances.model, owner[rows]), *columns)
-        return _eigenvalues(np.asarray(maps)[: n - begin])
+    def block(begin: int) -> None:
+        index = np.stack(rows[begin : begin + size])
+        index = index[np.minimum(np.arange(size), len(index) - 1)]
+        models = taken(balances.model, owner[index[:, 0]])
+        maps = _monodromies(models, coefficients[index], frequency[index])
+        found[index] = _eigenvalues(np.asarray(maps))
 
-    return np.concatenate(over_cores(block, range(0, n, size)))
+    over_cores(block, range(0, len(rows), size))
+    return found
 
 
 @partial(compiled, long_loops=True)

@@ -291,7 +291,7 @@ def line_with_a_crossing(monkeypatch, between):
         return np.outer(found, [0, 0, 0, 1.0]), along, ok
 
     def many_multipliers(_, __, points):
-        return multipliers_at(None, None, points[..., -1].ravel()).reshape(*points.shape[:2], 1)
+        return multipliers_at(None, None, points[:, -1])
 
     monkeypatch.setattr(bifurcations, "many_multipliers", many_multipliers)
     monkeypatch.setattr(bifurcations, "points_between", points_between)
