@@ -88,7 +88,9 @@ def write_event_curves(
             "frequency_hz": np.concatenate([c.frequency for c in curves]) / HERTZ,
             "velocity_h1_re_m_s": fundamental.real,
             "velocity_h1_im_m_s": fundamental.imag,
-            "velocity_peak_m_s": _peaks(np.concatenate([c.velocity[:, :, r] for c in curves])),
+            "velocity_peak_m_s": velocity_peaks(
+                np.concatenate([c.velocity[:, :, r] for c in curves])
+            ),
             "event": [event for c in curves for event in c.event],
         },
     )

@@ -3,7 +3,7 @@
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,8 @@ from jaxtyping import Array, Bool, Int
 
 from snrmjax.numerics.blocks import as_arrays, cores, on_accelerator, over_cores, taken
 
-Jobs, States = Any, Any  # trees of arrays with a leading axis
+Jobs: TypeAlias = Any  # trees of arrays with a leading axis
+States: TypeAlias = Any
 
 
 def lanes_for(unknowns: int) -> int:

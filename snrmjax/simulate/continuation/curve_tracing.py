@@ -88,7 +88,7 @@ def trace_from_rest(
 
 def trace_through(
     balances: HarmonicBalance,
-    ends: Float[Array, " end"],
+    ends: Float[np.ndarray, " end"],
     steps: StepControl,
     *,
     downward: bool,
@@ -100,7 +100,7 @@ def trace_through(
 
 def _walked(
     balances: HarmonicBalance,
-    ends: Float[Array, " end"],
+    ends: Float[np.ndarray, " end"],
     steps: StepControl,
     starts: Float[np.ndarray, "member unknown"] | None,
     lanes: int,
@@ -123,11 +123,12 @@ def _walked(
         return status == RUNNING, status, walks.n_solves
 
     (status, n_solves), rows = in_lanes(begun, advanced, result, (balances, starts), lanes)
-    nothing = (np.zeros((0, balances.size + 1)),) * 2
-    return [
-        TracedCurve(*(given or nothing), CurveStatus(int(status[k])), int(n_solves[k]))
-        for k, given in enumerate(rows)
-    ]
+    curves = []
+    for k, given in enumerate(rows):
+        points, tangents = given or (np.zeros((0, balances.size + 1)),) * 2
+        end = {"status": CurveStatus(int(status[k])), "n_solves": int(n_solves[k])}
+        curves.append(TracedCurve(points, tangents)._replace(**end))
+    return curves
 
 
 def _walker(balance: HarmonicBalance, ends: Array, steps: StepControl, rising: bool) -> Walker:

@@ -61,10 +61,12 @@ class EventSearch(eqx.Module):
         going = trial.goes_on(2 * self.control.iterations)
         return chosen(going, state, self._judged(state))
 
-    def ended(self) -> "Bracket":
-        """The search at its end."""
+    def ended(self, wanted: Bool[Array, ""] | bool = True) -> "Bracket":
+        """The search at its end; it is not begun where it is not wanted."""
         return jax.lax.while_loop(
-            lambda state: ~state.ended, lambda state: self.advanced(state), self.begun()
+            lambda state: ~state.ended,
+            lambda state: self.advanced(state),
+            self.begun()._replace(ended=~jnp.asarray(wanted)),
         )
 
     def _length(self) -> Float[Array, ""]:

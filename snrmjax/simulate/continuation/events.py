@@ -1,5 +1,6 @@
 """Folds, peaks and phase resonances along curves of periodic motions."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -210,7 +211,7 @@ def points_between(
     curves: list[TracedCurve],
     owner: list,
     position: list,
-    share: list,
+    share: Sequence[float] | np.ndarray,
     steps: StepControl,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points at shares of the way to the next one, their tangents, and whether they were found."""

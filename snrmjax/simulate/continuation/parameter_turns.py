@@ -11,7 +11,7 @@ from snrmjax.numerics.blocks import mapped, padded, taken
 from snrmjax.numerics.compiled import compiled
 from snrmjax.simulate.continuation.continuation import StepControl, TracedCurve
 from snrmjax.simulate.continuation.event_equations import EventEquations, EventKind, bordered
-from snrmjax.simulate.continuation.event_location import locate_event
+from snrmjax.simulate.continuation.event_location import EventSearch
 
 _BLOCK = 4  # turns that one call locates
 
@@ -69,14 +69,14 @@ def _turns(
     steps: StepControl,
 ) -> _Turn:
     def located(here: Array, tangent: Array, there: Array, wanted: Array) -> _Turn:
-        found = locate_event(
-            *(equations.linearised, lambda _, along: along[-1], here, tangent, there, steps),
-            wanted,
+        search = EventSearch(
+            equations.linearised, lambda _, along: along[-1], here, tangent, there, steps
         )
-        crossing, curvature = _unfolding(equations, found.point)
+        found = search.ended(wanted)
+        crossing, curvature = _unfolding(equations, found.last.point)
         return _Turn(
-            *(found.point, found.resolved, found.missed),
-            *(found.tangent[equations.balance.size], crossing, curvature),
+            *(found.last.point, found.resolved & wanted, found.missed & wanted),
+            *(found.last.tangent[equations.balance.size], crossing, curvature),
         )
 
     return mapped(located, here, tangent, there, wanted)

@@ -214,14 +214,14 @@ def _chunk_of_curves(
     walk = (ends, settings.steps, 1 if alone else lanes_for(balances.size + 1))
     upward = trace_from_rest(balances, np.arange(len(good)), *walk, downward=False)
 
-    def alone(k: int) -> bool:
+    def ends_well(k: int) -> bool:
         curve = upward[k]
         reached = curve.status == CurveStatus.UPPER_END
         return reached and _ends_near_rest(balances, k, curve)
 
     # Below a strong softening the lower end has several solutions and the upper end has one; and
     # where a resonance reaches beyond the upper end, another branch comes in there.
-    doubtful = [k for k in range(len(good)) if not alone(k)]
+    doubtful = [k for k in range(len(good)) if not ends_well(k)]
     found = trace_from_rest(balances, np.array(doubtful, dtype=int), *walk, downward=True)
     downward = dict(zip(doubtful, found, strict=True))
     # Beside a superharmonic resonance the linear response is no start: let the force rise.
@@ -233,7 +233,7 @@ def _chunk_of_curves(
     again = trace_from_rest(balances, np.array(lost, dtype=int), *walk, downward=False, ramp=True)
     for k, curve in zip(lost, again, strict=True):
         upward[k] = curve
-        if alone(k):
+        if ends_well(k):
             del downward[k]
     owner: list[int] = []
     without_branch: list[int] = []
@@ -252,10 +252,10 @@ def _chunk_of_curves(
                 pieces = [back.reversed()] if whole else [curve, back.reversed()]
         owner += [k] * len(pieces)
         parts += pieces
-    whole = assembled(
+    responses = assembled(
         taken(balances, np.array(owner)), parts, settings.steps, stability=settings.stability
     )
-    for k, response in zip(owner, whole, strict=True):
+    for k, response in zip(owner, responses, strict=True):
         results[good[k]].append(response)
     for k in without_branch:
         first = results[k][0]

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from snrmjax.model.structures import Structure, equilibria, simulated_structure
 from snrmjax.numerics.blocks import as_arrays, padded, taken
@@ -269,10 +269,9 @@ def _both_ways(
     steps: StepControl,
 ) -> TracedCurve:
     """The curve through a point: once around, or from one end to the other."""
-    start: Array = jnp.asarray(point)[None]
     ways = []
     for downward in (False, True):
-        way = trace_through(balances, jnp.asarray(ends), steps, downward=downward, starts=start)[0]
+        way = trace_through(balances, ends, steps, downward=downward, starts=point[None])[0]
         ways.append(way)
         if way.status == CurveStatus.CLOSED:
             return way
