@@ -19,7 +19,6 @@ from snrmjax.measure.signals import peak_amplitude
 from snrmjax.measure.states import SteadyStates, check_force, check_phases, relative_errors
 from snrmjax.model.modes import LinearModes, residual_velocity
 from snrmjax.numerics.compiled import compiled
-from snrmjax.numerics.finite_slopes import safe_root
 
 AmplitudeMeasure = Literal["fundamental", "peak"]
 
@@ -159,7 +158,7 @@ def _hypotenuse(std: Array, other: Array) -> Array:
     """√(std² + other²), NaN where `std` is, with finite derivatives there."""
     known = jnp.isfinite(std)
     both = jnp.where(known, std, 1.0) ** 2 + jnp.where(known, other, 0.0) ** 2
-    return jnp.where(known, safe_root(both), jnp.nan)
+    return jnp.where(known, _root(both), jnp.nan)
 
 
 def moved_by_modal_mass(
@@ -193,13 +192,13 @@ def _ratios_std(
     slopes, variance = safe(sensitivity, 0.0), safe(relative_std, 0.0) ** 2
     covariance = jnp.einsum("soi,si,spi->sop", slopes, variance, slopes)
     covariance = covariance + jax.vmap(jnp.diag)(safe(linear_variance, 0.0))
-    natural_std = safe_root(covariance[:, 0, 0]) / (2 * natural)
+    natural_std = _root(covariance[:, 0, 0]) / (2 * natural)
     # ζ̃ = δ/(2ω̃): dζ̃ = dδ/(2ω̃) − ζ̃ dω̃²/(2ω̃²).
     slope = jnp.stack([-damping / (2 * natural**2), 1 / (2 * natural)], axis=1)
     of_damping = jnp.einsum("so,sop,sp->s", slope, covariance[:, :2, :2], slope)
     return (
         jnp.where(known, natural_std, jnp.nan),
-        jnp.where(known, safe_root(of_damping), jnp.nan),
+        jnp.where(known, _root(of_damping), jnp.nan),
     )
 
 
@@ -249,7 +248,7 @@ def modal_filter(
     misfit = jnp.where(measured, of_mode - shape * modal, 0.0)
 
     def size_of(parts: Complex[Array, "state sensor"]) -> Float[Array, " state"]:
-        return safe_root(jnp.sum(weight * (parts.real**2 + parts.imag**2), axis=1))
+        return _root(jnp.sum(weight * (parts.real**2 + parts.imag**2), axis=1))
 
     relative_misfit = _ratio(size_of(misfit), size_of(of_mode))
     combined = jnp.sum(share * velocity, axis=1)
@@ -259,7 +258,7 @@ def modal_filter(
     def error(component: int) -> Array:
         each = jnp.where(measured, share * absolute[..., component], 0.0)
         known_all = jnp.all(stated[..., component] | ~measured, axis=1)
-        return jnp.where(known_all, _ratio(safe_root(jnp.sum(each**2, axis=1)), length), jnp.nan)
+        return jnp.where(known_all, _ratio(_root(jnp.sum(each**2, axis=1)), length), jnp.nan)
 
     std = jnp.stack([relative_std[:, 0, 0], error(0), error(1)], axis=1)
     return jnp.where(seen[:, 0], combined, jnp.nan), share, std, relative_misfit
@@ -346,3 +345,9 @@ def off_resonance_error_factor(
     for the distance from resonance, and away from it the correction brings its own errors.
     """
     return np.sqrt(1.0 + (NOISE_GROWTH * np.sin(np.angle(mode_velocity))) ** 2)
+
+
+def _root(square: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    """Square root whose slope at zero is zero: 0 · ∞ would make derivatives of others NaN."""
+    there = square != 0
+    return jnp.where(there, jnp.sqrt(jnp.where(there, square, 1.0)), 0.0)

@@ -1,8 +1,7 @@
 """Pseudo-arclength continuation of curves of solutions, with steps chosen by curvature."""
 
-from collections.abc import Callable
 from enum import StrEnum
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -10,16 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from snrmjax.numerics.blocks import on_accelerator
 from snrmjax.numerics.status import Status
+from snrmjax.simulate.continuation.newton import Linearised, Number, Point, Trial
 
 _FARTHEST = 3.0  # steps over the last one, beyond which the cubic is no guess
 _FIRST, _ORDINARY, _TO_END = 0, 1, 2  # what a trial is for
 RUNNING = -1  # the status of a curve that has not ended
-T = TypeVar("T")
-Point = Float[Array, " unknown"]
-Number = float | Array | np.ndarray
-Linearised = Callable[[Point], tuple[Float[Array, " equation"], Float[Array, "equation unknown"]]]
 
 
 class CurveStatus(Status):
@@ -142,95 +137,7 @@ def on_host(curve: Curve) -> TracedCurve:
     return TracedCurve(points, tangents, CurveStatus(int(curve.status)), int(curve.n_solves))
 
 
-@jax.custom_batching.custom_vmap
-def solved_behind(
-    matrix: Float[Array, "equation column"],
-) -> Float[Array, "equation right"]:
-    """The solutions for the right-hand sides that stand behind a square matrix."""
-    size = matrix.shape[0]
-    # The columns behind the square part come out multiplied by the inverse of L.
-    factors = jax.lax.linalg.lu(matrix)[0]
-    return jax.lax.linalg.triangular_solve(
-        factors[:, :size], factors[:, size:], left_side=True, lower=False
-    )
-
-
-@solved_behind.def_vmap
-def _solved_side_by_side(count: int, batched: list[bool], matrices: Array) -> tuple[Array, bool]:
-    """One after the other on a CPU.
-
-    A factorisation of many matrices at once spreads over the threads of a pool and waits for them:
-    called from as many threads itself, it waits for ever (jaxlib 0.10).
-    """
-    if on_accelerator():
-        return jax.vmap(solved_behind.fun)(matrices), True
-    return jnp.stack([solved_behind(matrices[k]) for k in range(count)]), True
-
-
-class Trial(NamedTuple):
-    """A correction under way: Newton's method in the hyperplane through `start` across `across`."""
-
-    start: Point
-    across: Point
-    point: Point  # the last iterate
-    tangent: Point  # of unit length, along `across`, at the iterate before
-    n_solves: Int[Array, ""]
-    converged: Bool[Array, ""]
-    finite: Bool[Array, ""]
-
-    @classmethod
-    def at(cls, start: Point, across: Point) -> "Trial":
-        """A correction that is to begin."""
-        yes = jnp.array(True)
-        return cls(start, across, start, across, jnp.array(0), ~yes, yes)
-
-    def goes_on(self, iterations: Number) -> Bool[Array, ""]:
-        """Whether another step of Newton's method is wanted."""
-        return self.finite & ~self.converged & (self.n_solves < iterations)
-
-    def stepped(self, linearised: Linearised, tolerance: Number) -> "Trial":
-        """After one step of Newton's method.
-
-        One LU factorisation of the bordered matrix, with both right-hand sides as further columns,
-        gives the step and the tangent. Converged when the error that is left falls below
-        `tolerance`; it is judged by the last step times what that step left of the residual.
-        """
-        size = self.start.shape[0]
-        residual, jacobian = linearised(self.point)
-        right = jnp.stack([residual, jnp.zeros(size - 1)], axis=1)
-        ahead = self.across @ (self.point - self.start)
-        border = jnp.concatenate([self.across, jnp.stack([ahead, 1.0])])
-        matrix = jnp.concatenate([jnp.concatenate([jacobian, right], axis=1), border[None]])
-        solved = solved_behind(matrix)
-        new, tangent = self.point - solved[:, 0], solved[:, 1]
-        step = jnp.max(jnp.abs(solved[:, 0]))
-        left = jnp.max(jnp.abs(linearised(new)[0])) / jnp.max(jnp.abs(residual))
-        done = (step <= tolerance) | ((step * left <= tolerance) & (step < 0.1))
-        return self._replace(
-            point=new,
-            tangent=tangent / jnp.linalg.norm(tangent),
-            n_solves=self.n_solves + 1,
-            converged=done & jnp.isfinite(step),
-            finite=jnp.isfinite(step),
-        )
-
-
-def correct(
-    linearised: Linearised,
-    start: Point,
-    direction: Point,
-    tolerance: Number,
-    iterations: Number,
-) -> Trial:
-    """Newton's method in the hyperplane through `start` across `direction`, to its end."""
-    return jax.lax.while_loop(
-        lambda trial: trial.goes_on(iterations),
-        lambda trial: trial.stepped(linearised, tolerance),
-        Trial.at(start, direction),
-    )
-
-
-class Walk(NamedTuple):
+class Tracing(NamedTuple):
     """A curve that is being traced: where it is, where it came from, and the trial under way."""
 
     here: Point
@@ -249,7 +156,7 @@ class Walk(NamedTuple):
     n_solves: Int[Array, ""]
 
 
-class Walker(eqx.Module):
+class CurveTracer(eqx.Module):
     """How a curve R(x, λ) = 0 is walked along, one trial after the other.
 
     `linearised` gives R and its Jacobian, `within` says where the curve ends. The next point is
@@ -270,10 +177,10 @@ class Walker(eqx.Module):
     control: StepControl
     groups: tuple[int, int] | None = eqx.field(static=True, default=None)
 
-    def begun(self, start: Point, direction: Point, across: Point | None = None) -> Walk:
+    def begun(self, start: Point, direction: Point, across: Point | None = None) -> Tracing:
         """Before the first point: `start` is a guess of it, corrected at its own λ or `across`."""
         unset = jnp.array(0)
-        return Walk(
+        return Tracing(
             *(start, direction, start, direction, start, direction, start, direction),
             trial=Trial.at(start, _at_lambda(start) if across is None else across),
             n_points=unset,
@@ -283,19 +190,19 @@ class Walker(eqx.Module):
             n_solves=unset,
         )
 
-    def patience(self, walk: Walk) -> Int[Array, ""]:
+    def patience(self, walk: Tracing) -> Int[Array, ""]:
         """Steps that Newton's method has for the trial under way."""
         usual = self.control.iterations
         return jnp.where(walk.aim == _ORDINARY, usual, 5 * usual)
 
-    def advanced(self, walk: Walk) -> tuple[Walk, Bool[Array, ""]]:
+    def advanced(self, walk: Tracing) -> tuple[Tracing, Bool[Array, ""]]:
         """After one step of Newton's method, and whether `here` is a new point of the curve."""
         trial = walk.trial.stepped(self.linearised, self.control.tolerance)
         going = trial.goes_on(self.patience(walk))
         unjudged = walk._replace(trial=trial), jnp.array(False)
         return jax.lax.cond(going, lambda: unjudged, lambda: self.judged(unjudged[0]))
 
-    def corrected(self, walk: Walk) -> tuple[Walk, Bool[Array, ""]]:
+    def corrected(self, walk: Tracing) -> tuple[Tracing, Bool[Array, ""]]:
         """After the whole trial under way, and whether `here` is a new point of the curve."""
         patience, tolerance = self.patience(walk), self.control.tolerance
         trial = jax.lax.while_loop(
@@ -305,7 +212,7 @@ class Walker(eqx.Module):
         )
         return self.judged(walk._replace(trial=trial))
 
-    def judged(self, walk: Walk) -> tuple[Walk, Bool[Array, ""]]:
+    def judged(self, walk: Tracing) -> tuple[Tracing, Bool[Array, ""]]:
         """After a trial that has ended, with the next one begun; and whether it gave a point."""
         control, trial, (lower, upper, _) = self.control, walk.trial, self.within
         here, tangent, new = walk.here, walk.tangent, trial.point
@@ -355,7 +262,7 @@ class Walker(eqx.Module):
 
     def _status(
         self,
-        walk: Walk,
+        walk: Tracing,
         new: Point,
         *,
         good: Array,
@@ -393,14 +300,14 @@ def trace_curve(
     start_across: Point | None = None,
     groups: tuple[int, int] | None = None,
 ) -> Curve:
-    """Trace the curve R(x, λ) = 0 from `start` until λ leaves its range, as `Walker` says.
+    """Trace the curve R(x, λ) = 0 from `start` until λ leaves its range, as `CurveTracer` says.
 
     Arguments: `linearised` gives R and its Jacobian; `start` is a guess of the first point,
     corrected at its own λ, or across `start_across`; `direction` says which way to go.
     Reference: Seydel, Practical Bifurcation and Stability Analysis (2010), chapter 4,
     doi:10.1007/978-1-4419-1740-9.
     """
-    walker = Walker(linearised, within, control, groups)
+    walker = CurveTracer(linearised, within, control, groups)
 
     def body(state: tuple) -> tuple:
         walk, points, tangents = state
@@ -426,7 +333,7 @@ def _at_lambda(point: Point) -> Point:
     return jnp.zeros_like(point).at[-1].set(1.0)
 
 
-def _passes(walk: Walk, new: Point, new_tangent: Point, closing: Number) -> Bool[Array, ""]:
+def _passes(walk: Tracing, new: Point, new_tangent: Point, closing: Number) -> Bool[Array, ""]:
     """Whether the curve passes its first point between `here` and `new`, in the same direction."""
     here, tangent, origin = walk.here, walk.tangent, walk.origin
     to_origin, to_new = tangent @ (origin - here), tangent @ (new - here)
@@ -436,11 +343,6 @@ def _passes(walk: Walk, new: Point, new_tangent: Point, closing: Number) -> Bool
     # A point that only happens to lie on the way has others where the curve passes it.
     nearest = here + to_origin / jnp.maximum(to_new, 1e-300) * (new - here)
     return passed & (jnp.linalg.norm(nearest - origin) < closing * jnp.linalg.norm(new - here))
-
-
-def chosen(yes: Bool[Array, ""], first: T, second: T) -> T:
-    """One of two states of one kind."""
-    return jax.tree.map(lambda a, b: jnp.where(yes, a, b), first, second)
 
 
 def _steady(
@@ -457,7 +359,7 @@ def _steady(
     return jnp.all((norms[2] <= control.largest_change * largest) | (largest <= slight))
 
 
-def _extrapolated(walk: Walk) -> Point:
+def _extrapolated(walk: Tracing) -> Point:
     """Where the cubic through the last two points and their tangents is, a step farther."""
     here, tangent, step = walk.here, walk.tangent, walk.step
     known = walk.n_points >= 2

@@ -24,10 +24,10 @@ from snrmjax.simulate.continuation.continuation import (
     RUNNING,
     CurveRange,
     CurveStatus,
+    CurveTracer,
     StepControl,
     TracedCurve,
-    Walk,
-    Walker,
+    Tracing,
 )
 
 _TOGETHER = 64  # steps of Newton's method before lanes that have ended take other curves
@@ -112,13 +112,13 @@ def _walked(
     way = (np.asarray(ends), steps, np.array(downward))
     length = _ALONE if lanes == 1 else _TOGETHER
 
-    def begun(jobs: tuple, wanted: Bool[np.ndarray, " lane"]) -> Walk:
+    def begun(jobs: tuple, wanted: Bool[np.ndarray, " lane"]) -> Tracing:
         return _begun(jobs, wanted, *way, rising=rising)
 
-    def advanced(jobs: tuple, walks: Walk, idle: int) -> tuple:
+    def advanced(jobs: tuple, walks: Tracing, idle: int) -> tuple:
         return _advanced(jobs, walks, *way, np.array(idle), rising=rising, length=length)
 
-    def result(walks: Walk) -> tuple:
+    def result(walks: Tracing) -> tuple:
         status = np.asarray(walks.status)
         return status == RUNNING, status, walks.n_solves
 
@@ -126,17 +126,16 @@ def _walked(
     curves = []
     for k, given in enumerate(rows):
         points, tangents = given or (np.zeros((0, balances.size + 1)),) * 2
-        end = {"status": CurveStatus(int(status[k])), "n_solves": int(n_solves[k])}
-        curves.append(TracedCurve(points, tangents)._replace(**end))
+        curves.append(TracedCurve(points, tangents, CurveStatus(int(status[k])), int(n_solves[k])))
     return curves
 
 
-def _walker(balance: HarmonicBalance, ends: Array, steps: StepControl, rising: bool) -> Walker:
+def _walker(balance: HarmonicBalance, ends: Array, steps: StepControl, rising: bool) -> CurveTracer:
     """Along the response, or along that at the lower end to a force that rises from zero."""
     lower, upper = ends / balance.frequency_scale
     if not rising:
         groups = (balance.n_coefficients, balance.model.n_modes)
-        return Walker(balance.linearised, CurveRange(lower, upper), steps, groups)
+        return CurveTracer(balance.linearised, CurveRange(lower, upper), steps, groups)
     load = balance.force * balance.load()
 
     def linearised(point: Array) -> tuple[Array, Array]:
@@ -145,7 +144,7 @@ def _walker(balance: HarmonicBalance, ends: Array, steps: StepControl, rising: b
         residual, jacobian = now.linearised(point.at[-1].set(lower))
         return residual, jacobian.at[:, -1].set(-load)
 
-    return Walker(linearised, CurveRange(lower=-1.0, upper=1.0), steps)
+    return CurveTracer(linearised, CurveRange(lower=-1.0, upper=1.0), steps)
 
 
 @compiled
@@ -156,8 +155,8 @@ def _begun(
     steps: StepControl,
     downward: Array,
     rising: bool,
-) -> Walk:
-    def begun(job: tuple, wanted: Array) -> Walk:
+) -> Tracing:
+    def begun(job: tuple, wanted: Array) -> Tracing:
         balance, start = job
         if rising:
             start = jnp.zeros(balance.size + 1)
@@ -177,15 +176,15 @@ def _begun(
 @partial(compiled, long_loops=True)
 def _advanced(
     jobs: tuple,
-    walks: Walk,
+    walks: Tracing,
     ends: Array,
     steps: StepControl,
     downward: Array,
     idle: Int[Array, ""],
     rising: bool,
     length: int,
-) -> tuple[Walk, tuple]:
-    def step(job: tuple, walk: Walk) -> tuple[Walk, tuple]:
+) -> tuple[Tracing, tuple]:
+    def step(job: tuple, walk: Tracing) -> tuple[Tracing, tuple]:
         walker = _walker(job[0], ends, steps, rising)
         walk, kept = walker.corrected(walk) if length == _ALONE else walker.advanced(walk)
         return walk, (kept, walk.here, walk.tangent)

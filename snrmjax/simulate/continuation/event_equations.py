@@ -22,8 +22,8 @@ from snrmjax.model.parameters import with_parameters
 from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance
 from snrmjax.simulate.balance.harmonics import harmonic_basis, tangent_blocks
-from snrmjax.simulate.continuation.continuation import Point
 from snrmjax.simulate.continuation.events import velocities_along
+from snrmjax.simulate.continuation.newton import Point
 
 EventKind = Literal["fold", "peak", "phase_resonance", "period_doubling", "neimark_sacker"]
 FORCE = "force"  # the name of the parameter that is no number of the model

@@ -8,13 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from snrmjax.simulate.continuation.continuation import (
-    Linearised,
-    Point,
-    StepControl,
-    Trial,
-    chosen,
-)
+from snrmjax.simulate.continuation.continuation import StepControl
+from snrmjax.simulate.continuation.newton import Linearised, Point, Trial, chosen
 
 _TRIALS = 40  # of the secant method, at most
 _CLOSE = 1e-10  # of the way between the neighbours: the next trial would be as near

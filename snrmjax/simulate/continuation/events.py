@@ -12,8 +12,9 @@ from snrmjax.numerics.blocks import over_cores, taken
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.lanes import in_lanes, iterated, lanes_for
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance
-from snrmjax.simulate.continuation.continuation import CurveEvent, StepControl, TracedCurve, correct
+from snrmjax.simulate.continuation.continuation import CurveEvent, StepControl, TracedCurve
 from snrmjax.simulate.continuation.event_location import Bracket, EventSearch
+from snrmjax.simulate.continuation.newton import correct
 
 EVENT_KINDS = (CurveEvent.FOLD, CurveEvent.PEAK, CurveEvent.PHASE_RESONANCE)
 _TOGETHER = 64  # steps of Newton's method before the host sees them

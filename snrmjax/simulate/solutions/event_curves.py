@@ -20,7 +20,6 @@ from snrmjax.simulate.continuation.continuation import (
     CurveStatus,
     StepControl,
     TracedCurve,
-    correct,
     on_host,
     trace_curve,
 )
@@ -30,6 +29,7 @@ from snrmjax.simulate.continuation.event_equations import (
     EventKind,
     bordered,
 )
+from snrmjax.simulate.continuation.newton import correct
 from snrmjax.simulate.continuation.parameter_turns import with_turns
 from snrmjax.simulate.continuation.response_curve import MotionCurve, motions_of
 from snrmjax.simulate.continuation.stability import floquet_multipliers

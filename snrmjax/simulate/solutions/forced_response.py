@@ -16,13 +16,9 @@ from snrmjax.numerics.lanes import lanes_for
 from snrmjax.numerics.result import AbstractResult, quantity
 from snrmjax.simulate.balance.given_numbers import frequency_range, positive
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, harmonic_balance
-from snrmjax.simulate.continuation.continuation import (
-    CurveStatus,
-    StepControl,
-    TracedCurve,
-    correct,
-)
+from snrmjax.simulate.continuation.continuation import CurveStatus, StepControl, TracedCurve
 from snrmjax.simulate.continuation.curve_tracing import response_balances, trace_from_rest
+from snrmjax.simulate.continuation.newton import correct
 from snrmjax.simulate.continuation.response_curve import ResponseCurve, assembled
 
 DEFAULT_STEPS = StepControl()

@@ -14,8 +14,8 @@ from snrmjax.numerics.result import AbstractResult, Variable
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, harmonic_balance
 from snrmjax.simulate.balance.harmonics import velocity_phasors
 from snrmjax.simulate.balance.labelled import HERTZ, batch_variables
-from snrmjax.simulate.continuation.continuation import Linearised, Point
 from snrmjax.simulate.continuation.events import velocities_along
+from snrmjax.simulate.continuation.newton import Linearised, Point
 
 Condition = Literal["frequency", "velocity", "fold", "peak", "phase_resonance"]
 

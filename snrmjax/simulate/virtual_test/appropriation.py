@@ -12,7 +12,7 @@ from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.numerics.blocks import padded
 from snrmjax.numerics.compiled import compiled
 from snrmjax.simulate.balance.harmonic_balance import harmonic_balance
-from snrmjax.simulate.continuation.continuation import correct
+from snrmjax.simulate.continuation.newton import correct
 from snrmjax.simulate.virtual_test.recording import VisitedStates
 
 

@@ -41,9 +41,13 @@ class Failures(NamedTuple):
     @property
     def facts(self) -> tuple[Fact, ...]:
         """What to do about members whose resonance is not in the range of a study of peaks."""
-        counts = self.failed_counts
-        outside = MemberStatus.NO_PEAK, MemberStatus.HIGHEST_AT_END
-        return tuple(Fact(name.value, n_members=counts[name]) for name in outside if name in counts)
+        facts, counts = [], self.failed_counts
+        if MemberStatus.NO_PEAK in counts:
+            facts.append(Fact("no_peak_in_range", n_members=counts[MemberStatus.NO_PEAK]))
+        if MemberStatus.HIGHEST_AT_END in counts:
+            n_members = counts[MemberStatus.HIGHEST_AT_END]
+            facts.append(Fact("highest_at_range_end", n_members=n_members))
+        return tuple(facts)
 
 
 class FailureShare(NamedTuple):

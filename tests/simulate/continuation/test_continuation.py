@@ -11,10 +11,10 @@ from snrmjax.simulate.continuation.continuation import (
     CurveRange,
     CurveStatus,
     StepControl,
-    correct,
     trace_curve,
 )
 from snrmjax.simulate.continuation.event_location import EventSearch
+from snrmjax.simulate.continuation.newton import correct
 
 STEPS = StepControl()
 
