@@ -3,10 +3,18 @@
 Alternating frequency-time with the analytic Jacobian as one matrix product, pseudo-arclength
 continuation, one LU factorisation (LAPACK) for the Newton step and for the tangent, steps chosen
 by the turn of the tangent and by Newton's iterations.
+
+A peer with an environment of its own (`simulator_peer_*.py`) is given the same equations, and
+`serve` lets another process run it.
 """
 
+import json
+import pickle
+import sys
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -60,7 +68,7 @@ class Curve(NamedTuple):
 
     coefficients: np.ndarray  # (point, coefficient, mode) over the displacement scale
     frequency: np.ndarray  # (point,) over the frequency scale
-    n_solves: int  # factorisations
+    n_solves: int | None = None  # factorisations, where the program counts them
 
 
 class Polynomial:
@@ -242,3 +250,21 @@ def solver(problem: Problem) -> Callable[[], Curve]:
         return Curve(coefficients, rows[:, -1], n_solves)
 
     return run
+
+
+def serve(ways: Callable[[Problem], dict[str, Callable]], version: str) -> None:
+    """Answer every line on standard input, the name of a way to run, with its seconds.
+
+    The problem is the pickle that the command line names; "points" answers with the curve.
+    """
+    told, sys.stdout = sys.stdout, sys.stderr  # what a package prints is no answer
+    problem = pickle.loads(Path(sys.argv[1]).read_bytes())
+    runs = ways(problem)
+    for line in sys.stdin:
+        begin = time.perf_counter()
+        result = runs[line.strip().replace("points", "curve")]()
+        answer = {"seconds": time.perf_counter() - begin, "version": version}
+        if line.strip() == "points":
+            hertz, velocity = midspan(problem, result)
+            answer |= {"curve": [hertz.tolist(), velocity.tolist()], "n_solves": result.n_solves}
+        print(json.dumps(answer), file=told, flush=True)

@@ -1,13 +1,15 @@
 """Seconds a point of a forced response, against other programs and against the LU solves alone.
 
-Run: OMP_NUM_THREADS=1 python benchmarks/simulator_speed.py
+Run: OMP_NUM_THREADS=1 python benchmarks/simulator_speed.py --environments DIR
 
 Two curves with nine harmonics around all their folds: the flat beam (77 unknowns with the
-frequency) and the monostable curved beam (20). The peer is a plain NumPy/SciPy program
-(`simulator_peer.py`), which gets the equations as numbers, not the package. The limit is as many LU
-factorisations (LAPACK) as snrmjax used, and nothing else. All take turns; times are medians of warm
-runs, with the compile time of the first run apart. `forced_response` also locates events and
-computes stability, which the peer does not: "no_stability" leaves out the latter.
+frequency) and the monostable curved beam (20). The peers are a plain NumPy/SciPy program
+(`simulator_peer.py`), jaxcont and pyHarm-os (`simulator_peer_*.py`, in environments of their own,
+made in the given folder on first use; without one, left out). They get the equations as numbers,
+not the package. The limit is as many LU factorisations (LAPACK) as snrmjax used, and nothing else.
+All take turns; times are medians of warm runs, with the compile time of the first run apart.
+`forced_response` also locates events and computes stability, which no peer does: "no_stability"
+leaves out the latter.
 
 Every curve is compared with snrmjax's of 31 harmonics (which shows the truncation error of nine)
 and of nine in fine steps (which shows errors of the method): the largest distance of a point from
@@ -16,20 +18,23 @@ peak. `reference_not_covered` is the opposite distance, from the reference to th
 points: about the square of a step, unless a method left out a part of the curve.
 
 Also: the first curve of a cold process, with and without a compilation cache; 64 forces one by one
-and as one batch, with and without stability.
+and as one batch, with and without stability, beside jaxcont's engine, one by one and under `vmap`.
 """
 
 import json
 import os
+import pickle
 import subprocess
 import sys
 import tempfile
-from typing import NamedTuple
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 import simulator_peer
-from harness import medians, options, seconds_of, teller
+from harness import HERE, medians, options, seconds_of, teller
 from scipy.interpolate import CubicSpline
 from scipy.linalg.lapack import dgetrf
 from simulator_peer import Problem
@@ -43,6 +48,8 @@ HARMONICS, REFERENCE_HARMONICS = 9, 31
 ROUNDS = 5
 PEER_TOLERANCE = 1e-8  # on the last step or the residual, in scaled unknowns
 MEMBERS = 64
+PLAIN = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
+REQUIREMENTS = {"jaxcont": "jaxcont==0.4.0", "pyharm": "pyHarm-os==1.2.2"}
 
 
 class Case(NamedTuple):
@@ -149,21 +156,71 @@ def problem_of(case: Case, scale: float) -> Problem:
     )
 
 
-def compare(case: Case) -> None:
-    """All methods on one beam; prints their lines, the ratios last."""
+class Peer:
+    """A program in an environment of its own that follows its curve whenever asked."""
+
+    def __init__(self, folder: str, name: str, problem: Problem):
+        python = Path(folder, name, "bin", "python").absolute()
+        if not python.exists():
+            subprocess.run([sys.executable, "-m", "venv", python.parents[1]], check=True)
+            install = [python, "-m", "pip", "install", "-qq", REQUIREMENTS[name]]
+            subprocess.run(install, check=True)
+        # A home of its own: numba compiles in this run too, and settings go nowhere else.
+        self.home = tempfile.TemporaryDirectory()
+        given = Path(self.home.name, "problem.pickle")
+        given.write_bytes(pickle.dumps(problem))
+        with Path(self.home.name, "log").open("w") as log:
+            self.process = subprocess.Popen(
+                [python, HERE / f"simulator_peer_{name}.py", given],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=log,
+                text=True,
+                env=PLAIN | {"HOME": self.home.name, "NUMBA_CACHE_DIR": self.home.name},
+            )
+
+    def ask(self, way: str) -> dict:
+        """Its answer to the name of a way to run."""
+        self.process.stdin.write(f"{way}\n")
+        self.process.stdin.flush()
+        line = self.process.stdout.readline()
+        if not line:
+            raise RuntimeError(Path(self.home.name, "log").read_text(encoding="utf-8"))
+        return json.loads(line)
+
+    def close(self) -> None:
+        """Let it end."""
+        self.process.stdin.close()
+        self.process.wait(timeout=30)
+        self.home.cleanup()
+
+
+def peers_of(folder: str | None, problem: Problem) -> dict[str, Peer]:
+    """All peers, or none without a folder for their environments."""
+    return {name: Peer(folder, name, problem) for name in REQUIREMENTS} if folder else {}
+
+
+def lu_limit(case: Case, solves: int) -> Callable[[], list]:
+    """Nothing but as many factorisations."""
+    matrix = np.random.default_rng(0).normal(size=(case.unknowns, case.unknowns))
+    factorised = np.asfortranarray(matrix)
+    return lambda: [dgetrf(factorised) for _ in range(solves)]
+
+
+def compare(case: Case, folder: str | None) -> Problem:
+    """All methods on one beam; prints their lines, the ratios last. Returns the peers' problem."""
     first, curves = seconds_of(lambda: respond(case))
     motion = np.concatenate([np.asarray(c.coefficients)[:, 1:3] for c in curves])
     problem = problem_of(case, float(np.max(np.abs(motion))))
-    peer = simulator_peer.solver(problem)
-    matrix = np.random.default_rng(0).normal(size=(case.unknowns, case.unknowns))
-    factorised = np.asfortranarray(matrix)
+    peer, peers = simulator_peer.solver(problem), peers_of(folder, problem)
     solves = sum(int(c.n_solves) for c in curves)
     seconds = medians(
         ROUNDS,
         snrmjax=lambda: respond(case),
         no_stability=lambda: respond(case, stability=False),
         numpy_scipy=peer,
-        lu_limit=lambda: [dgetrf(factorised) for _ in range(solves)],
+        lu_limit=lu_limit(case, solves),
+        **{name: lambda other=other: other.ask("curve") for name, other in peers.items()},
     )
     followed = peer()
     found = {
@@ -171,6 +228,10 @@ def compare(case: Case) -> None:
         "no_stability": (midspan(respond(case, stability=False)), solves, "events"),
         "numpy_scipy": (simulator_peer.midspan(problem, followed), followed.n_solves, ""),
     }
+    for name, other in peers.items():
+        told = other.ask("points")
+        found[name] = (tuple(np.array(told["curve"])), told["n_solves"], told["version"])
+        other.close()
     targets = {h: reference(case, h) for h in (HARMONICS, REFERENCE_HARMONICS)}
     natural = float(case.model.modes.natural_frequency[0]) / HERTZ
     unit = np.array([natural, np.max(targets[REFERENCE_HARMONICS][1])])
@@ -192,11 +253,13 @@ def compare(case: Case) -> None:
         )
     per_point = {name: seconds[name] / len(found[name][0][0]) for name in found}
     ratios = {
-        f"numpy_scipy_over_{ours}": per_point["numpy_scipy"] / per_point[ours]
+        f"{name}_over_{ours}": per_point[name] / per_point[ours]
+        for name in ("numpy_scipy", *peers)
         for ours in ("snrmjax", "no_stability")
     }
     over = {f"{name}_over_lu_limit": seconds[name] / seconds["lu_limit"] for name in found}
     tell(measurement="ratios", beam=case.beam, **ratios, **over)
+    return problem
 
 
 COLD_PROCESS = """
@@ -211,37 +274,54 @@ print(json.dumps([imported - begin, time.perf_counter() - imported]))
 """
 
 
-def cold_process(repeats: int = 3) -> None:
+def cold_process(folder: str | None, problem: Problem, repeats: int = 3) -> None:
     """From the start of a process to its first curve: no cache, an empty one, a filled one."""
     case = CASES[0]
     ends = {"lower": case.from_hz * HERTZ, "upper": case.to_hz * HERTZ}
     script = COLD_PROCESS.format(force=case.force, harmonics=HARMONICS, **ends)
-    plain = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
     found: dict[str, list] = {}
     for _ in range(repeats):
         with tempfile.TemporaryDirectory() as cache:
             for name, arguments in (("none", []), ("empty", [cache]), ("filled", [cache])):
                 command = [sys.executable, "-c", script, *arguments]
-                done = subprocess.run(
-                    command, check=True, capture_output=True, text=True, env=plain
+                whole, done = seconds_of(
+                    lambda command=command: subprocess.run(
+                        command, check=True, capture_output=True, text=True, env=PLAIN
+                    )
                 )
-                found.setdefault(name, []).append(json.loads(done.stdout.splitlines()[-1]))
+                spent = json.loads(done.stdout.splitlines()[-1])
+                found.setdefault(name, []).append([*spent, whole])
+        if folder:
+            whole, _ = seconds_of(lambda: first_curve(folder, problem))
+            found.setdefault("jaxcont", []).append([np.nan, np.nan, whole])
     for name, rows in found.items():
-        imports, first = np.median(rows, axis=0)
+        imports, first, whole = np.median(rows, axis=0)
         tell(
             measurement="first_curve_of_a_cold_process",
             beam=case.beam,
-            compilation_cache=name,
+            method="jaxcont" if name == "jaxcont" else "snrmjax",
+            compilation_cache="none" if name == "jaxcont" else name,
             import_seconds=imports,
             first_curve_seconds=first,
+            process_seconds=whole,
             repeats=repeats,
         )
 
 
-def batch(case: Case) -> None:
+def first_curve(folder: str, problem: Problem) -> None:
+    """Start jaxcont, follow one curve, end."""
+    peer = Peer(folder, "jaxcont", problem)
+    peer.ask("curve")
+    peer.close()
+
+
+def batch(case: Case, folder: str | None, problem: Problem) -> None:
     """Many forces as single calls and as one batch."""
     forces = np.geomspace(0.1 * case.force, case.force, MEMBERS).tolist()
     ends = case.from_hz * HERTZ, case.to_hz * HERTZ
+    peer = Peer(folder, "jaxcont", problem) if folder else None
+    ways = {"jaxcont": lambda: peer.ask("one_by_one")} if peer else {}
+    vmap = [peer.ask("vmap")["seconds"] for _ in range(2)][1] if peer else np.nan
     for stability in (False, True):
         settings = {"harmonic_order": HARMONICS, "stability": stability}
 
@@ -249,11 +329,13 @@ def batch(case: Case) -> None:
             for force in forces:
                 sj.forced_response(case.model, [force], *ends, **settings)
 
-        def together(settings: dict = settings) -> None:
+        def together(settings: dict = settings) -> Any:
             asked = sj.simulate.ResponseSettings(**settings)
-            sj.simulate.forced_response_batch(case.model, forces, *ends, settings=asked)
+            return sj.simulate.forced_response_batch(case.model, forces, *ends, settings=asked)
 
-        found = medians(3, single=single, together=together)
+        solves = sum(int(part.n_solves) for parts in together().curves for part in parts)
+        limit = lu_limit(case, solves)
+        found = medians(3, single=single, together=together, lu_limit=limit, **ways)
         tell(
             measurement="batch_of_forces",
             beam=case.beam,
@@ -262,18 +344,22 @@ def batch(case: Case) -> None:
             single_seconds_a_curve=found["single"] / MEMBERS,
             batch_seconds_a_curve=found["together"] / MEMBERS,
             single_over_batch=found["single"] / found["together"],
+            batch_over_lu_limit=found["together"] / found["lu_limit"],
+            jaxcont_one_by_one_seconds_a_curve=found.get("jaxcont", np.nan) / MEMBERS,
+            jaxcont_vmap_seconds_a_curve=vmap / MEMBERS,
         )
+    if peer:
+        peer.close()
 
 
 def main() -> None:
     """Measure and print."""
-    options(__doc__)
+    folder = options(__doc__, environments=str).environments
     tell(measurement="device", device=jax.devices()[0].device_kind, cores=os.cpu_count())
-    for case in CASES:
-        compare(case)
-    cold_process()
-    for case in CASES:
-        batch(case)
+    problems = [compare(case, folder) for case in CASES]
+    cold_process(folder, problems[0])
+    for case, problem in zip(CASES, problems, strict=True):
+        batch(case, folder, problem)
 
 
 if __name__ == "__main__":
