@@ -8,11 +8,13 @@ batch of curved beams with stability, curves not kept; then a thousand flat beam
 frequencies, damping and force of its own, as in a study. Seconds are the median of warm runs;
 `lu_share` is what as many LU factorisations (LAPACK) take of the time without stability,
 `stability` the time with it over the time without. Memory is the largest of the process during a
-warm run, and how much that is above what it held before.
+warm run, all programs of earlier lines included, and how much that is above what it held before.
 """
 
 import gc
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -27,58 +29,56 @@ tell = teller(__file__)
 HERTZ = 2 * np.pi
 RANGE, CURVED_RANGE = (60.0 * HERTZ, 120.0 * HERTZ), (25.0 * HERTZ, 140.0 * HERTZ)
 FLAT_FORCE, CURVED_FORCE = 1.334e-2, 1.779e-3  # N
-SLOW_SECONDS = 5.0  # from here on one warm run is enough
+STABLE_MODES = 50  # of a hundred, stability takes many minutes
+SLOW_SECONDS, SOME = 5.0, 20  # from here on one warm run is enough; factorisations timed
 
 
 def generated(n_modes: int) -> sj.model.Structure:
     """As many modes, evenly spaced from 79 Hz; as many monomials as modes."""
     order = np.arange(n_modes)
-    modes = sj.model.linear_modes(
-        HERTZ * 79.0 * (1 + 1.7 * order),
-        np.full(n_modes, 0.02),
-        [10.0 * (-1.0) ** order],
-        200.0 / (1 + order) * (-1.0) ** order,
-    )
-    driven = {(0, 0, 0, k): 2e13 / (1 + k) for k in range(1, n_modes)}
-    potential = sj.model.polynomial_potential({(0, 0, 0, 0): 2e13, **driven}, n_modes)
+    frequency, shape = HERTZ * 79.0 * (1 + 1.7 * order), 10.0 * (-1.0) ** order
+    damping, driven = np.full(n_modes, 0.02), 20.0 * shape / (1 + order)
+    modes = sj.model.linear_modes(frequency, damping, [shape], driven)
+    terms = {(0, 0, 0, k): 2e13 / (1 + k) for k in range(n_modes)}
+    potential = sj.model.polynomial_potential(terms, n_modes)
     return sj.model.structure(modes, potential, name="generated structure")
 
 
-def memory(function) -> tuple[float, float]:
-    """Largest memory of the process while a function runs, and what it adds (megabytes)."""
+def held(what: str) -> float:
+    """Megabytes of this process."""
+    rows = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
+    return next(float(row.split()[1]) for row in rows if row.startswith(what)) / 1024
+
+
+def measured(function: Callable[[], Any]) -> tuple[float, Any, dict[str, float]]:
+    """Seconds of a warm run, what it gave, its memory."""
     gc.collect()
-
-    def held(what: str) -> float:
-        rows = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
-        return next(float(row.split()[1]) for row in rows if row.startswith(what)) / 1024
-
     before = held("VmRSS")
     Path("/proc/self/clear_refs").write_text("5", encoding="utf-8")  # the maximum begins anew
-    function()
-    return held("VmHWM"), held("VmHWM") - before
-
-
-def factorisations(unknowns: int, count: int) -> float:
-    """Seconds of so many, from a few of them."""
-    matrix = np.asfortranarray(np.random.default_rng(0).normal(size=(unknowns, unknowns)))
-    some = min(count, 20)
-    spent = medians(3, lu=lambda: [dgetrf(matrix) for _ in range(some)])
-    return spent["lu"] / some * count
+    seconds, result = seconds_of(function)
+    memory = {"peak_megabytes": held("VmHWM"), "added_megabytes": held("VmHWM") - before}
+    if seconds < SLOW_SECONDS:
+        seconds = medians(3, run=function)["run"]
+    return seconds, result, memory
 
 
 def one_curve(measurement: str, model: sj.model.Structure, force: float, harmonics: int) -> None:
     """A curve alone."""
 
     def respond(stability: bool) -> list[sj.simulate.ResponseCurve]:
-        settings = {"harmonic_order": harmonics, "stability": stability}
-        return sj.forced_response(model, [force], *RANGE, **settings)
+        asked = {"harmonic_order": harmonics, "stability": stability}
+        return sj.forced_response(model, [force], *RANGE, **asked)
 
     first, curves = seconds_of(lambda: respond(False))
-    rounds = 1 if seconds_of(lambda: respond(False))[0] > SLOW_SECONDS else 3
-    spent = medians(rounds, curve=lambda: respond(False), whole=lambda: respond(True))
+    alone, _, memory = measured(lambda: respond(False))
+    whole = np.nan
+    if model.n_modes <= STABLE_MODES:
+        respond(True)  # compiles
+        whole, _, memory = measured(lambda: respond(True))
     points, solves = sum(len(c.frequency) for c in curves), sum(int(c.n_solves) for c in curves)
     unknowns = (2 * harmonics + 1) * model.n_modes + 1
-    peak, added = memory(lambda: respond(True))
+    matrix = np.asfortranarray(np.random.default_rng(0).normal(size=(unknowns, unknowns)))
+    lu = medians(3, some=lambda: [dgetrf(matrix) for _ in range(SOME)])
     tell(
         measurement=measurement,
         model=model.name,
@@ -88,12 +88,11 @@ def one_curve(measurement: str, model: sj.model.Structure, force: float, harmoni
         points=points,
         n_solves=solves,
         status=[c.status.name for c in curves],
-        compile_seconds=first - spent["curve"],
-        milliseconds_a_point=1e3 * spent["curve"] / points,
-        stability=spent["whole"] / spent["curve"],
-        lu_share=factorisations(unknowns, solves) / spent["curve"],
-        peak_megabytes=peak,
-        added_megabytes=added,
+        compile_seconds=first - alone,
+        milliseconds_a_point=1e3 * alone / points,
+        stability=whole / alone,
+        lu_share=lu["some"] * solves / SOME / alone,
+        **memory,
     )
 
 
@@ -101,38 +100,29 @@ def batch(measurement: str, models: list, forces: np.ndarray, ends: tuple) -> No
     """Many members with stability; curves are not kept."""
     respond = sj.simulate.forced_response_batch
     respond(models[:300], forces[:300], *ends)  # compiles
-    seconds, found = seconds_of(lambda: respond(models, forces, *ends, keep_curves=False))
-    if seconds < SLOW_SECONDS:
-        again = medians(3, run=lambda: respond(models, forces, *ends, keep_curves=False))
-        seconds = again["run"]
-    peak, added = memory(lambda: respond(models, forces, *ends, keep_curves=False))
-    whole = (sj.simulate.CurveStatus.UPPER_END, sj.simulate.CurveStatus.LOWER_END)
+    seconds, found, memory = measured(lambda: respond(models, forces, *ends, keep_curves=False))
     points = int(np.sum(found.n_points))
     tell(
         measurement=measurement,
         model=models[0].name,
         members=len(forces),
         points=points,
-        failed=int(np.sum(~np.isin(found.status, whole))),
+        failed=int(np.sum(found.status > sj.simulate.CurveStatus.LOWER_END)),
         milliseconds_a_curve=1e3 * seconds / len(forces),
         milliseconds_a_point=1e3 * seconds / points,
-        peak_megabytes=peak,
-        added_megabytes=added,
+        **memory,
     )
 
 
 def varied(model: sj.model.Structure, count: int) -> list[sj.model.Structure]:
     """Models with frequencies and damping of their own, two and ten per cent apart."""
-    draws = np.random.default_rng(0).normal(size=(count, 2)) * [0.02, 0.1]
-    values = [model.modes.natural_frequency, model.modes.damping_ratio]
-    return [
-        eqx.tree_at(
-            lambda m: [m.modes.natural_frequency, m.modes.damping_ratio],
-            model,
-            [np.asarray(value) * (1 + one) for value, one in zip(values, draw, strict=True)],
-        )
-        for draw in draws
-    ]
+
+    def parts(m: sj.model.Structure) -> list:
+        return [m.modes.natural_frequency, m.modes.damping_ratio]
+
+    draws = 1 + np.random.default_rng(0).normal(size=(count, 2)) * [0.02, 0.1]
+    values = [np.asarray(value) for value in parts(model)]
+    return [eqx.tree_at(parts, model, [values[0] * a, values[1] * b]) for a, b in draws]
 
 
 def main() -> None:

@@ -176,6 +176,7 @@ class Peer:
                 stdout=subprocess.PIPE,
                 stderr=log,
                 text=True,
+                cwd=self.home.name,
                 env=PLAIN | {"HOME": self.home.name, "NUMBA_CACHE_DIR": self.home.name},
             )
 
