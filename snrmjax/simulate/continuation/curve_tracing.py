@@ -1,7 +1,6 @@
 """Many response curves of one kind: stacked balances, starts, and their walks side by side."""
 
 from collections.abc import Sequence
-from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -110,13 +109,13 @@ def _walked(
 ) -> list[TracedCurve]:
     """Curves from given starts, or from the linear response; or under a rising force."""
     way = (np.asarray(ends), steps, np.array(downward))
-    length = _ALONE if lanes == 1 else _TOGETHER
+    further, length = (_advanced_alone, _ALONE) if lanes == 1 else (_advanced_together, _TOGETHER)
 
     def begun(jobs: tuple, wanted: Bool[np.ndarray, " lane"]) -> Tracing:
         return _begun(jobs, wanted, *way, rising=rising)
 
     def advanced(jobs: tuple, walks: Tracing, idle: int) -> tuple:
-        return _advanced(jobs, walks, *way, np.array(idle), rising=rising, length=length)
+        return further(jobs, walks, *way, np.array(idle), rising=rising, length=length)
 
     def result(walks: Tracing) -> tuple:
         status = np.asarray(walks.status)
@@ -173,7 +172,6 @@ def _begun(
     return jax.vmap(begun)(jobs, wanted)
 
 
-@partial(compiled, long_loops=True)
 def _advanced(
     jobs: tuple,
     walks: Tracing,
@@ -190,3 +188,7 @@ def _advanced(
         return walk, (kept, walk.here, walk.tangent)
 
     return iterated(step, lambda walks: walks.status == RUNNING, jobs, walks, length, idle)
+
+
+_advanced_alone = compiled(_advanced)
+_advanced_together = compiled(_advanced, long_loops=True)
