@@ -94,6 +94,7 @@ def test_identify_compiles_few_programs_and_none_a_second_time(files, tmp_path):
     assert second == 0
 
 
+@pytest.mark.long
 def test_a_simulation_compiles_nothing_a_second_time(files, tmp_path):
     words = ("nnm", files[0], "--to-hz", 60, "--harmonics", 1, "--out", tmp_path / "out")
     store = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "store")}

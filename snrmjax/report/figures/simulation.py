@@ -110,8 +110,9 @@ def event_curve_figure(curves: Sequence[EventCurve], *, sensor: str | None = Non
     below += "" if label == "1" else f" ({label})"
     unit = unit_for(np.concatenate([np.abs(velocity_of(c, name)) for c in drawn]), "m/s")
     figure, ((frequencies, speeds),) = panels(PAGE, 3.2, 1, 2)
-    for number, curve in enumerate(drawn):
-        x, colour = curve.value / size, SERIES[number % len(SERIES)]
+    kinds = list(dict.fromkeys(curve.kind for curve in drawn))
+    for curve in drawn:
+        x, colour = curve.value / size, SERIES[kinds.index(curve.kind)]
         turns = np.flatnonzero([bool(event) for event in curve.event])
         speed = np.abs(velocity_of(curve, name)) / unit.size
         for axes, y in ((frequencies, curve.frequency / HERTZ), (speeds, speed)):

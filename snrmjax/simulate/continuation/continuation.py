@@ -85,7 +85,7 @@ class CurveRange(NamedTuple):
 
     lower: Number
     upper: Number
-    largest_amplitude: Number = np.inf
+    largest_amplitude: Number | None = None
 
 
 class Curve(NamedTuple):
@@ -169,13 +169,14 @@ class CurveTracer(eqx.Module):
     response turns its sign, and on the scale of the peak the two flanks far below it are
     neighbours.
     The last point of a curve that left the range lies on its end; that of a closed one is the
-    first again.
+    first again (a curve that begins at an end of its range does not close: `may_close`).
     """
 
     linearised: Linearised
     within: CurveRange
     control: StepControl
     groups: tuple[int, int] | None = eqx.field(static=True, default=None)
+    may_close: bool = eqx.field(static=True, default=True)
 
     def begun(self, start: Point, direction: Point, across: Point | None = None) -> Tracing:
         """Before the first point: `start` is a guess of it, corrected at its own λ or `across`."""
@@ -231,8 +232,11 @@ class CurveTracer(eqx.Module):
         to_end = (here + share * (new - here)).at[-1].set(end)
         pending = jnp.where(leaving, to_end, walk.pending)
 
-        closed = good & (walk.n_points > 4) & _passes(walk, new, new_tangent, control.closing)
-        new = jnp.where(closed, walk.origin, new)
+        closed = jnp.array(False)
+        if self.may_close:
+            passed = _passes(walk, new, new_tangent, control.closing)
+            closed = good & (walk.n_points > 4) & passed
+            new = jnp.where(closed, walk.origin, new)
         kept = good & ~leaving
         n_points = walk.n_points + kept
         longer = jnp.minimum(
@@ -274,7 +278,9 @@ class CurveTracer(eqx.Module):
         """Whether and how the curve has ended."""
         lower, upper, largest_amplitude = self.within
         is_first, is_end = walk.aim == _FIRST, walk.aim == _TO_END
-        large = jnp.max(jnp.abs(new[:-1])) > largest_amplitude
+        large = jnp.array(False)
+        if largest_amplitude is not None:
+            large = jnp.max(jnp.abs(new[:-1])) > largest_amplitude
         ends = (
             (is_first & ~good, CurveStatus.NO_START),
             (is_end & good & (new[-1] >= upper), CurveStatus.UPPER_END),

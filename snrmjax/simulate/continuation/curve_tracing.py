@@ -1,8 +1,7 @@
 """Many response curves of one kind: stacked balances, starts, and their walks side by side."""
 
 from collections.abc import Sequence
-from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -31,6 +30,7 @@ from snrmjax.simulate.continuation.continuation import (
 )
 
 _TOGETHER = 64  # steps of Newton's method before lanes that have ended take other curves
+_Way = Literal["from_end", "rising", "through"]  # an end of the range, a force, or a point
 _ALONE = 512  # points of a single curve before the host sees them
 
 
@@ -77,7 +77,7 @@ def trace_from_rest(
         return []
     mine, starts = taken(balances, index), None
     if ramp:
-        risen = _walked(mine, ends, steps, None, lanes, downward=downward, rising=True)
+        risen = _walked(mine, ends, steps, None, lanes, downward=downward, way="rising")
         starts = np.full((len(index), balances.size + 1), np.nan)
         for start, curve in zip(starts, risen, strict=True):
             if curve.status == CurveStatus.UPPER_END:
@@ -95,7 +95,8 @@ def trace_through(
     starts: Float[np.ndarray, "member unknown"],
 ) -> list[TracedCurve]:
     """Curves through given scaled points, towards one end of the range (rad/s)."""
-    return _walked(balances, ends, steps, np.asarray(starts), 1, downward=downward)
+    starts = np.asarray(starts)
+    return _walked(balances, ends, steps, starts, 1, downward=downward, way="through")
 
 
 def _walked(
@@ -106,17 +107,17 @@ def _walked(
     lanes: int,
     *,
     downward: bool,
-    rising: bool = False,
+    way: _Way = "from_end",
 ) -> list[TracedCurve]:
     """Curves from given starts, or from the linear response; or under a rising force."""
-    way = (np.asarray(ends), steps, np.array(downward))
-    length = _ALONE if lanes == 1 else _TOGETHER
+    walk = (np.asarray(ends), steps, np.array(downward))
+    further, length = (_advanced_alone, _ALONE) if lanes == 1 else (_advanced_together, _TOGETHER)
 
     def begun(jobs: tuple, wanted: Bool[np.ndarray, " lane"]) -> Tracing:
-        return _begun(jobs, wanted, *way, rising=rising)
+        return _begun(jobs, wanted, *walk, way=way)
 
     def advanced(jobs: tuple, walks: Tracing, idle: int) -> tuple:
-        return _advanced(jobs, walks, *way, np.array(idle), rising=rising, length=length)
+        return further(jobs, walks, *walk, np.array(idle), way=way, length=length)
 
     def result(walks: Tracing) -> tuple:
         status = np.asarray(walks.status)
@@ -130,12 +131,12 @@ def _walked(
     return curves
 
 
-def _walker(balance: HarmonicBalance, ends: Array, steps: StepControl, rising: bool) -> CurveTracer:
+def _tracer(balance: HarmonicBalance, ends: Array, steps: StepControl, way: _Way) -> CurveTracer:
     """Along the response, or along that at the lower end to a force that rises from zero."""
     lower, upper = ends / balance.frequency_scale
-    if not rising:
-        groups = (balance.n_coefficients, balance.model.n_modes)
-        return CurveTracer(balance.linearised, CurveRange(lower, upper), steps, groups)
+    if way != "rising":
+        groups, closes = (balance.n_coefficients, balance.model.n_modes), way == "through"
+        return CurveTracer(balance.linearised, CurveRange(lower, upper), steps, groups, closes)
     load = balance.force * balance.load()
 
     def linearised(point: Array) -> tuple[Array, Array]:
@@ -144,7 +145,7 @@ def _walker(balance: HarmonicBalance, ends: Array, steps: StepControl, rising: b
         residual, jacobian = now.linearised(point.at[-1].set(lower))
         return residual, jacobian.at[:, -1].set(-load)
 
-    return CurveTracer(linearised, CurveRange(lower=-1.0, upper=1.0), steps)
+    return CurveTracer(linearised, CurveRange(lower=-1.0, upper=1.0), steps, None, False)
 
 
 @compiled
@@ -154,26 +155,25 @@ def _begun(
     ends: Array,
     steps: StepControl,
     downward: Array,
-    rising: bool,
+    way: _Way,
 ) -> Tracing:
     def begun(job: tuple, wanted: Array) -> Tracing:
         balance, start = job
-        if rising:
+        if way == "rising":
             start = jnp.zeros(balance.size + 1)
         elif start is None:
             begin = jnp.where(downward, ends[1], ends[0])
             order = balance.harmonic_order
             linear = linear_coefficients(balance.model, balance.force, begin, order)
             start = balance.point(linear, begin)
-        sense = 1.0 if rising else jnp.where(downward, -1.0, 1.0)
+        sense = 1.0 if way == "rising" else jnp.where(downward, -1.0, 1.0)
         direction = jnp.zeros_like(start).at[-1].set(sense)
-        walk = _walker(balance, ends, steps, rising).begun(start, direction)
+        walk = _tracer(balance, ends, steps, way).begun(start, direction)
         return walk._replace(status=jnp.where(wanted, RUNNING, int(CurveStatus.NO_START)))
 
     return jax.vmap(begun)(jobs, wanted)
 
 
-@partial(compiled, long_loops=True)
 def _advanced(
     jobs: tuple,
     walks: Tracing,
@@ -181,12 +181,16 @@ def _advanced(
     steps: StepControl,
     downward: Array,
     idle: Int[Array, ""],
-    rising: bool,
+    way: _Way,
     length: int,
 ) -> tuple[Tracing, tuple]:
     def step(job: tuple, walk: Tracing) -> tuple[Tracing, tuple]:
-        walker = _walker(job[0], ends, steps, rising)
-        walk, kept = walker.corrected(walk) if length == _ALONE else walker.advanced(walk)
+        tracer = _tracer(job[0], ends, steps, way)
+        walk, kept = tracer.corrected(walk) if length == _ALONE else tracer.advanced(walk)
         return walk, (kept, walk.here, walk.tangent)
 
     return iterated(step, lambda walks: walks.status == RUNNING, jobs, walks, length, idle)
+
+
+_advanced_alone = compiled(_advanced)
+_advanced_together = compiled(_advanced, long_loops=True)

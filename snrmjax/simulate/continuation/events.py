@@ -93,10 +93,8 @@ def _searched(jobs: tuple, steps: StepControl) -> tuple[np.ndarray, ...]:
         return _advanced(jobs, states, steps, np.array(idle))
 
     def result(states: Bracket) -> tuple:
-        return (
-            ~np.asarray(states.ended),
-            *(states.last.point, states.last.tangent, states.resolved, states.missed),
-        )
+        end = jax.tree.map(np.asarray, states)  # on the host, where nothing is compiled
+        return ~end.ended, end.last.point, end.last.tangent, end.resolved, end.missed
 
     return in_lanes(begun, advanced, result, jobs, lanes_for(jobs[0].size + 1))[0]
 

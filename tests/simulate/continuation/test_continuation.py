@@ -1,6 +1,7 @@
 """Continuation on curves whose points, folds and ends are known exactly."""
 
 import dataclasses
+import re
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +15,7 @@ from snrmjax.simulate.continuation.continuation import (
     trace_curve,
 )
 from snrmjax.simulate.continuation.event_location import EventSearch
-from snrmjax.simulate.continuation.newton import correct
+from snrmjax.simulate.continuation.newton import correct, solved_behind
 
 STEPS = StepControl()
 
@@ -323,3 +324,16 @@ def test_correction_stays_in_its_plane_and_says_when_it_fails():
     assert not bool(converged)
     converged = correct(broken, jnp.array([0.6, 0.6]), across, 1e-8, 20).converged
     assert not bool(converged)
+
+
+def test_matrices_side_by_side_are_factorised_one_by_one():
+    # Factorised together they may wait for each other for ever in two threads (jaxlib 0.10).
+    matrices = np.random.default_rng(0).normal(size=(3, 5, 7))
+    found = jax.vmap(solved_behind)(matrices)
+    exact = np.linalg.solve(matrices[:, :, :5], matrices[:, :, 5:])
+    np.testing.assert_allclose(found, exact, rtol=1e-12, atol=1e-13)
+    program = str(jax.make_jaxpr(jax.vmap(solved_behind))(matrices))
+    assert (
+        re.findall(r"f64\[([\d,]+)\] \w+:i32\[[\d,]+\] \w+:i32\[[\d,]+\] = lu", program)
+        == ["5,7"] * 3
+    )

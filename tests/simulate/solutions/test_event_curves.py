@@ -232,6 +232,7 @@ def test_resonances_lead_to_the_isolated_response():
     assert [loop.branch.name for loop in found] == ["GIVEN_START"]
 
 
+@pytest.mark.long
 def test_an_isolated_response_begins_where_the_closed_form_says():
     model, ends, fine = falling_damping(), (0.9, 1.2), 512
     birth = singular(falling_load, (0.757, 1.0086))
@@ -345,6 +346,7 @@ def test_curves_pass_what_single_motions_are(kind, name):
     assert curve.frequency[k] != pytest.approx(curve.frequency[0], rel=1e-6)
 
 
+@pytest.mark.long
 def test_further_modes_of_an_effect_are_followed():
     modes = sj.model.linear_modes([2.0], [0.01], [[1.0]], [1.0])
     effect = make_effect(
@@ -413,6 +415,7 @@ def test_neimark_sacker_points_lie_where_responses_have_them(tori):
         assert response.at_events("neimark_sacker").size == number
 
 
+@pytest.mark.long
 def test_neimark_sacker_points_feel_damping_that_depends_on_the_velocity():
     name, ends = "cubic_damping.coefficient", (1.7, 2.3)
     model = coupled(make_effect("cubic_damping", {"coefficient": 1e-3}))
@@ -492,6 +495,7 @@ def published_cantilever(n_modes):
     return sj.model.structure(modes, sj.model.polynomial_potential(potential, n_modes))
 
 
+@pytest.mark.long
 def test_published_neimark_sacker_points_belong_to_two_curves():
     model = published_cantilever(2)
     published = np.array([15.587, 15.590, 15.665, 15.863])
@@ -521,6 +525,7 @@ def _sorted(curve, force):
     return curve.frequency[k][order], slow[order]
 
 
+@pytest.mark.long
 def test_period_doublings_lie_where_responses_have_them():
     model, load, ends, order = curved_beam(), CURVED_BEAM_FORCES[1], (20 * HZ, 80 * HZ), 15
     start = event_of(model, load, ends, "period_doubling", order=order, stability=True)

@@ -1,0 +1,63 @@
+"""Lanes: Collatz sequences, whose lengths differ much and are known, side by side."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from snrmjax.numerics import lanes as module
+from snrmjax.numerics.lanes import in_lanes, iterated
+
+START = np.array([27, 1, 2, 97, 7, 3, 16, 6, 19, 1, 54, 12, 5])
+
+
+def sequence(number):
+    """All numbers behind the first, to one."""
+    found = []
+    while number != 1:
+        number = number // 2 if number % 2 == 0 else 3 * number + 1
+        found.append(number)
+    return found
+
+
+@jax.jit
+def begun(jobs, wanted):
+    return jnp.where(wanted, jobs, 1), jnp.zeros_like(jobs)
+
+
+@jax.jit
+def advanced(jobs, states, idle):
+    def step(job, state):
+        number, count = state
+        number = jnp.where(number % 2 == 0, number // 2, 3 * number + 1)
+        return (number, count + 1), (number % 2 == 0, number)
+
+    return iterated(step, lambda states: states[0] > 1, jobs, states, 10, idle)
+
+
+def result(states):
+    return np.asarray(states[0]) > 1, *states
+
+
+@pytest.mark.parametrize("lanes", [1, 2, 4, 16])
+@pytest.mark.parametrize("cores", [1, 2])
+def test_every_job_comes_to_its_own_end(lanes, cores, monkeypatch):
+    monkeypatch.setattr(module, "cores", lambda: cores)
+    (last, count), rows = in_lanes(begun, advanced, result, START, lanes)
+    assert last.tolist() == [1] * len(START)
+    exact = [sequence(int(number)) for number in START]
+    assert count.tolist() == [len(numbers) for numbers in exact]
+    # Kept rows are the even numbers, in order.
+    for found, numbers in zip(rows, exact, strict=True):
+        even = [number for number in numbers if number % 2 == 0]
+        assert [number for part in found for number in part.tolist()] == even
+
+
+def test_lanes_stop_where_few_go_on():
+    jobs = jnp.asarray(START[:4])
+    states = begun(jobs, jnp.ones(4, dtype=bool))
+    # One is at its end from the start, 2 after one step; two lanes are left then.
+    (_, count), _ = advanced(jobs, states, jnp.array(2))
+    assert count.tolist() == [1, 0, 1, 1]
+    (_, count), _ = advanced(jobs, states, jnp.array(0))
+    assert count.tolist() == [10, 0, 1, 10]
