@@ -59,41 +59,36 @@ def ways(problem: Problem) -> dict[str, Callable]:
     damping = np.diag(2 * problem.damping_ratio * natural)
     matrices = {"M": np.eye(n), "C": damping, "K": np.diag(natural**2)}
     polynomial = {"type": "PolynomialForce", "connect": "beam", "problem": problem}
-    lengths = {"lc": problem.displacement_scale, "wc": problem.frequency_scale}
+    unit = {"status": True, "lc": problem.displacement_scale, "wc": problem.frequency_scale}
+    order, samples = problem.harmonic_order, problem.n_samples
+    response = {
+        "study": "frf",
+        "solver": "scipyroot",
+        "solver_options": {"root": {"options": {"xtol": problem.tolerance}}},
+        "predictor": "tangent",
+        "predictor_options": {"verbose": False},
+        "corrector": "pseudo_arc_length",
+        "ds0": problem.first_step,
+        "ds_max": LARGEST_STEP * problem.largest_step,
+        "ds_min": problem.smallest_step,
+        "sign_ds": 1 if problem.to_hz > problem.from_hz else -1,
+        "puls_inf": low,
+        "puls_sup": high,
+        "verbose": False,
+    }
     data = {
         "plugin": [PolynomialForce],
-        "system": {
-            "type": "Base",
-            "nh": problem.harmonic_order,
-            "nti": problem.n_samples,
-            "adim": {"status": True, **lengths},
-        },
+        "system": {"type": "Base", "nh": order, "nti": samples, "adim": unit},
         "substructures": {"beam": {"matrix": matrices, "ndofs": n}},
         "connectors": {"polynomial": polynomial},
-        "analysis": {
-            "response": {
-                "study": "frf",
-                "solver": "scipyroot",
-                "solver_options": {"root": {"options": {"xtol": problem.tolerance}}},
-                "predictor": "tangent",
-                "predictor_options": {"verbose": False},
-                "corrector": "pseudo_arc_length",
-                "ds0": problem.first_step,
-                "ds_max": LARGEST_STEP * problem.largest_step,
-                "ds_min": problem.smallest_step,
-                "sign_ds": 1 if problem.to_hz > problem.from_hz else -1,
-                "puls_inf": low,
-                "puls_sup": high,
-                "verbose": False,
-            }
-        },
+        "analysis": {"response": response},
     }
 
     def curve() -> Curve:
         maestro = Maestro(data)  # a fresh one for every run: it keeps its solutions
         maestro.operate()
         rows = np.array([s.x for s in maestro.nls["response"].SolList if s.flag_accepted])
-        coefficients = rows[:, :-1].reshape(len(rows), 2 * problem.harmonic_order + 1, n)
+        coefficients = rows[:, :-1].reshape(len(rows), 2 * order + 1, n)
         return Curve(coefficients, rows[:, -1])
 
     return {"curve": curve}

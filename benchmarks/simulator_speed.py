@@ -27,6 +27,7 @@ import pickle
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -163,8 +164,7 @@ class Peer:
         python = Path(folder, name, "bin", "python").absolute()
         if not python.exists():
             subprocess.run([sys.executable, "-m", "venv", python.parents[1]], check=True)
-            install = [python, "-m", "pip", "install", "-qq", REQUIREMENTS[name]]
-            subprocess.run(install, check=True)
+            subprocess.run([python, "-m", "pip", "install", "-qq", REQUIREMENTS[name]], check=True)
         # A home of its own: numba compiles in this run too, and settings go nowhere else.
         self.home = tempfile.TemporaryDirectory()
         given = Path(self.home.name, "problem.pickle")
@@ -196,11 +196,6 @@ class Peer:
         self.home.cleanup()
 
 
-def peers_of(folder: str | None, problem: Problem) -> dict[str, Peer]:
-    """All peers, or none without a folder for their environments."""
-    return {name: Peer(folder, name, problem) for name in REQUIREMENTS} if folder else {}
-
-
 def lu_limit(case: Case, solves: int) -> Callable[[], list]:
     """Nothing but as many factorisations."""
     matrix = np.random.default_rng(0).normal(size=(case.unknowns, case.unknowns))
@@ -213,7 +208,8 @@ def compare(case: Case, folder: str | None) -> Problem:
     first, curves = seconds_of(lambda: respond(case))
     motion = np.concatenate([np.asarray(c.coefficients)[:, 1:3] for c in curves])
     problem = problem_of(case, float(np.max(np.abs(motion))))
-    peer, peers = simulator_peer.solver(problem), peers_of(folder, problem)
+    peer = simulator_peer.solver(problem)
+    peers = {name: Peer(folder, name, problem) for name in REQUIREMENTS if folder}
     solves = sum(int(c.n_solves) for c in curves)
     seconds = medians(
         ROUNDS,
@@ -285,16 +281,19 @@ def cold_process(folder: str | None, problem: Problem, repeats: int = 3) -> None
         with tempfile.TemporaryDirectory() as cache:
             for name, arguments in (("none", []), ("empty", [cache]), ("filled", [cache])):
                 command = [sys.executable, "-c", script, *arguments]
-                whole, done = seconds_of(
-                    lambda command=command: subprocess.run(
-                        command, check=True, capture_output=True, text=True, env=PLAIN
-                    )
+                begin = time.perf_counter()
+                done = subprocess.run(
+                    command, check=True, capture_output=True, text=True, env=PLAIN
                 )
-                spent = json.loads(done.stdout.splitlines()[-1])
-                found.setdefault(name, []).append([*spent, whole])
+                spent = [*json.loads(done.stdout.splitlines()[-1]), time.perf_counter() - begin]
+                found.setdefault(name, []).append(spent)
         if folder:
-            whole, _ = seconds_of(lambda: first_curve(folder, problem))
-            found.setdefault("jaxcont", []).append([np.nan, np.nan, whole])
+            begin = time.perf_counter()
+            peer = Peer(folder, "jaxcont", problem)
+            peer.ask("curve")
+            peer.close()
+            spent = [np.nan, np.nan, time.perf_counter() - begin]
+            found.setdefault("jaxcont", []).append(spent)
     for name, rows in found.items():
         imports, first, whole = np.median(rows, axis=0)
         tell(
@@ -307,13 +306,6 @@ def cold_process(folder: str | None, problem: Problem, repeats: int = 3) -> None
             process_seconds=whole,
             repeats=repeats,
         )
-
-
-def first_curve(folder: str, problem: Problem) -> None:
-    """Start jaxcont, follow one curve, end."""
-    peer = Peer(folder, "jaxcont", problem)
-    peer.ask("curve")
-    peer.close()
 
 
 def batch(case: Case, folder: str | None, problem: Problem) -> None:
