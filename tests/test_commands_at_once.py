@@ -84,6 +84,7 @@ def test_numbers_are_double_whichever_import_comes_first(first, variable):
     assert ran(script, JAX_ENABLE_X64=variable) == "float64 float64"
 
 
+@pytest.mark.long
 def test_identify_compiles_few_programs_and_none_a_second_time(files, tmp_path):
     model, data = files
     words = ("identify", data, "--model", model, "--out", tmp_path / "out")

@@ -83,7 +83,7 @@ def is_number(text):
     return True
 
 
-LIGHT = ("joint", "wrong", "diagnose", "stopped")
+LIGHT = ("wrong", "diagnose", "stopped")
 
 
 @pytest.mark.parametrize(

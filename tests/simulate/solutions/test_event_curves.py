@@ -194,6 +194,7 @@ def test_isola_and_main_response_merge_where_the_closed_form_says():
         np.testing.assert_allclose(found, exact[:3], rtol=1e-7)
 
 
+@pytest.mark.long
 def test_folds_lead_to_the_isolated_response():
     model, unit = cantilever(), 0.1
     # The outer fold of the joined response, at a higher force, is the isola's at a lower one.
@@ -286,6 +287,7 @@ def test_the_coefficient_of_an_effect_is_followed():
 # --------------------------------------------------------------- resonances of many modes
 
 
+@pytest.mark.long
 def test_phase_resonances_are_the_damped_backbone_and_lie_where_responses_have_them():
     model, load = flat_beam(), FLAT_BEAM_FORCES[-1]
     ends, order = (60 * HZ, 115 * HZ), 5
@@ -330,7 +332,11 @@ def with_slider():
 
 
 @pytest.mark.parametrize(
-    ("kind", "name"), [*((k, RATIO_NAME) for k in ("fold", "peak")), ("fold", SLIP_NAME)]
+    ("kind", "name"),
+    [
+        *(pytest.param(k, RATIO_NAME, marks=pytest.mark.long) for k in ("fold", "peak")),
+        ("fold", SLIP_NAME),
+    ],
 )
 def test_curves_pass_what_single_motions_are(kind, name):
     model, load, value = with_slider(), 0.12, LIGHT[name]
@@ -437,6 +443,7 @@ def test_neimark_sacker_points_feel_damping_that_depends_on_the_velocity():
         np.testing.assert_allclose(np.sort(found), np.sort(located), rtol=2e-6)
 
 
+@pytest.mark.long
 def test_neimark_sacker_curves_close_and_end_in_a_strong_resonance(tori):
     start, _ = tori
     settings = {"kind": "neimark_sacker", "parameter": "mode_2.natural_frequency"}
@@ -567,6 +574,7 @@ def test_wrong_arguments_say_so():
         follow_event(with_slider(), 0.12, start, kind="neimark_sacker", to=(0.1, 0.2))
 
 
+@pytest.mark.long
 def test_a_curve_says_where_it_stopped():
     model = duffing()
     start = event_of(model, P, (0.5, 1.6), "fold")
