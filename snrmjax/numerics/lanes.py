@@ -120,7 +120,8 @@ def iterated(
         def unless_ended(a: Array, b: Array) -> Array:
             return jnp.where(going.reshape(-1, *(1,) * (a.ndim - 1)), a, b)
 
-        states = jax.tree.map(unless_ended, new, states)
+        # A lane alone that has ended ends the loop.
+        states = new if alone else jax.tree.map(unless_ended, new, states)
         row = (kept & going, *given)
         return k + 1, states, tuple(a.at[k].set(b) for a, b in zip(rows, row, strict=True))
 

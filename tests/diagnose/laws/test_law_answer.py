@@ -36,6 +36,7 @@ def slack():
     return sj.diagnose_model(*files("slack_cable", "drawn"))
 
 
+@pytest.mark.long
 def test_a_law_of_a_time_integrated_set_is_drawn_with_its_band():
     found = slack()
     assert found.verdict is Verdict.DRAWN
