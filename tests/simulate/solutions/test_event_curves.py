@@ -334,10 +334,11 @@ def with_slider():
 @pytest.mark.parametrize(
     ("kind", "name"),
     [
-        *(pytest.param(k, RATIO_NAME, marks=pytest.mark.long) for k in ("fold", "peak")),
+        *((k, RATIO_NAME) for k in ("fold", "peak")),
         ("fold", SLIP_NAME),
     ],
 )
+@pytest.mark.long
 def test_curves_pass_what_single_motions_are(kind, name):
     model, load, value = with_slider(), 0.12, LIGHT[name]
     start = event_of(model, load, (1.5, 3.5), kind, order=3)
