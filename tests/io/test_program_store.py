@@ -170,6 +170,7 @@ def test_with_an_effect_of_a_user_nothing_is_kept(tmp_path):
     assert len(digits) > 10
 
 
+@pytest.mark.long
 def test_a_folder_that_cannot_be_written_does_not_matter(tmp_path):
     (tmp_path / "programs").write_text("a file in its place")
     digits, _ = ran(tmp_path)

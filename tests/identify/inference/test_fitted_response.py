@@ -258,6 +258,7 @@ def test_where_only_the_drive_is_known_advice_is_in_volts(tmp_path):
     assert float(first.split(",")[-1]) == pytest.approx(advice[0].drive)
 
 
+@pytest.mark.long
 def test_advice_is_a_table(fit):
     advice = sj.next_measurements(fit, 3)
     table = advice.to_pandas()

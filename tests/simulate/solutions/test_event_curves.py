@@ -171,6 +171,7 @@ def singular(load, near):
     return a, omega, np.sqrt(load(a, omega)), np.linalg.det(np.array(hessian)) > 0
 
 
+@pytest.mark.long
 def test_isola_and_main_response_merge_where_the_closed_form_says():
     model, unit = cantilever(), 0.1  # of ε, as the source has it
     exact = singular(cantilever_load, (0.026 / TIP, 7.0023))
