@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Int
 
 from snrmjax.numerics.blocks import as_arrays, cores, on_accelerator, over_cores, taken
 
+TOGETHER = 64  # iterations of several lanes, at most, before the host sees them
 Jobs: TypeAlias = Any  # trees of arrays with a leading axis
 States: TypeAlias = Any
 
@@ -40,8 +41,7 @@ def in_lanes(
     end; `advanced` takes them some iterations further, as long as more than so many lanes are at
     work, and gives the rows of each: whether it is kept, then anything, all of shape
     (iteration, lane, …); `result` says of states which have not ended, and what is wanted of them
-    at their ends. What a job gives does not depend on the lane
-    that it is in, nor on its neighbours.
+    at their ends. What a job gives does not depend on its lane, nor on its neighbours.
     Returns the results, of shape (job, …), and the rows that every job gave on the way.
     """
     n = len(jax.tree.leaves(jobs)[0])

@@ -15,11 +15,6 @@ from snrmjax.simulate.continuation.events import (
 )
 from snrmjax.simulate.continuation.stability import MARGIN, many_multipliers
 
-BIFURCATIONS = (
-    CurveEvent.BRANCH_POINT,
-    CurveEvent.PERIOD_DOUBLING,
-    CurveEvent.NEIMARK_SACKER,
-)
 _FOLDS_OWN = 12  # points from a fold at which its multiplier may cross
 _CROSSING = 5e-7  # of a step, to which the crossing of the circle is located
 _SHARES = 4  # of the way through an interval that are looked at side by side

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import stacked, taken
 from snrmjax.numerics.compiled import compiled
-from snrmjax.numerics.lanes import in_lanes, iterated
+from snrmjax.numerics.lanes import TOGETHER, in_lanes, iterated
 from snrmjax.simulate.balance.harmonic_balance import (
     HarmonicBalance,
     linear_coefficients,
@@ -29,7 +29,6 @@ from snrmjax.simulate.continuation.continuation import (
     Tracing,
 )
 
-_TOGETHER = 64  # steps of Newton's method before lanes that have ended take other curves
 _Way = Literal["from_end", "rising", "through"]  # an end of the range, a force, or a point
 _ALONE = 512  # points of a single curve before the host sees them
 
@@ -111,7 +110,7 @@ def _walked(
 ) -> list[TracedCurve]:
     """Curves from given starts, or from the linear response; or under a rising force."""
     walk = (np.asarray(ends), steps, np.array(downward))
-    further, length = (_advanced_alone, _ALONE) if lanes == 1 else (_advanced_together, _TOGETHER)
+    further, length = (_advanced_alone, _ALONE) if lanes == 1 else (_advanced_together, TOGETHER)
 
     def begun(jobs: tuple, wanted: Bool[np.ndarray, " lane"]) -> Tracing:
         return _begun(jobs, wanted, *walk, way=way)

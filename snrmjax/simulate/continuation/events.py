@@ -10,14 +10,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from snrmjax.numerics.blocks import over_cores, taken
 from snrmjax.numerics.compiled import compiled
-from snrmjax.numerics.lanes import in_lanes, iterated, lanes_for
+from snrmjax.numerics.lanes import TOGETHER, in_lanes, iterated, lanes_for
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance
 from snrmjax.simulate.continuation.continuation import CurveEvent, StepControl, TracedCurve
 from snrmjax.simulate.continuation.event_location import Bracket, EventSearch
 from snrmjax.simulate.continuation.newton import correct
 
 EVENT_KINDS = (CurveEvent.FOLD, CurveEvent.PEAK, CurveEvent.PHASE_RESONANCE)
-_TOGETHER = 64  # steps of Newton's method before the host sees them
 _INSIDE = 7  # points inside an interval that is looked at more closely
 
 
@@ -77,7 +76,7 @@ def _advanced(
     def step(job: tuple, state: Bracket) -> tuple[Bracket, tuple]:
         return _search(job, steps).advanced(state), (jnp.array(False),)
 
-    return iterated(step, lambda states: ~states.ended, jobs, states, _TOGETHER, idle)
+    return iterated(step, lambda states: ~states.ended, jobs, states, TOGETHER, idle)
 
 
 def _searched(jobs: tuple, steps: StepControl) -> tuple[np.ndarray, ...]:

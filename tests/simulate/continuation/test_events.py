@@ -11,7 +11,7 @@ from snrmjax.model.modes import linear_modes
 from snrmjax.model.potential import polynomial_potential
 from snrmjax.model.structures import structure
 from snrmjax.simulate.continuation import bifurcations, events
-from snrmjax.simulate.continuation.bifurcations import BIFURCATIONS, with_bifurcations
+from snrmjax.simulate.continuation.bifurcations import with_bifurcations
 from snrmjax.simulate.continuation.continuation import CurveEvent, StepControl, TracedCurve
 from snrmjax.simulate.continuation.curve_tracing import response_balances
 from snrmjax.simulate.continuation.events import EVENT_KINDS
@@ -218,7 +218,7 @@ def test_bifurcations_lie_where_multipliers_cross(kind, numpy_balance, time_doma
     (curve,) = forced_response(model, [force], *ends, harmonic_order=order)
     where = curve.at_events(kind)
     assert len(where) == number
-    assert not any(curve.at_events(other).size for other in BIFURCATIONS if other != kind)
+    assert not any(curve.at_events(other).size for other in CROSSINGS if other != kind)
     balance = numpy_balance(model, force, order, np.abs(curve.coefficients).max())
     for k in where:
         start = np.append(curve.coefficients[k].ravel(), curve.frequency[k])
