@@ -245,6 +245,10 @@ def test_a_wrong_model_ends_with_two(files, tmp_path):
             ("simulate", "--force", 1, "--from-hz", 50, "--to-hz", 80, "--follow", "fold"),
             ("--follow", "--to"),
         ),
+        (
+            ("simulate", "--force", 1, "--from-hz", 50, "--to-hz", 80, "--to", 2),
+            ("--parameter", "--follow"),
+        ),
         (("nnm", "--to-hz", -5), ("--to-hz", "-5 Hz")),
         (("nnm", "--to-hz", 64.78), ("--to-hz", "64.78 Hz")),
         (("identify", "--predict-force", 0), ("--predict-force", "0 N")),

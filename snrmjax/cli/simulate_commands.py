@@ -86,6 +86,8 @@ def simulate(
     require_positive("--force", force, "N")
     if follow and to is None:
         raise ValueError("`--follow` needs `--to`, the value that the parameter goes to.")
+    if follow is None and (to is not None or parameter != "force"):
+        raise ValueError("`--parameter` and `--to` need `--follow`, the kind of event.")
     with staged(out) as folder:
         found = simulate_responses(
             *(read_model(model), force, from_hz, to_hz),

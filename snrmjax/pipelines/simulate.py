@@ -61,10 +61,12 @@ def simulate_responses(
     `parameter` goes from its value to `to`, and back where it turns (see `follow_event`);
     `progress` is told each force when it begins.
     Raises `ValueError` as `forced_response` and `follow_event` do, where no curve has a point, and
-    for events to follow without `to`.
+    for events to follow without `to`, or the other way round.
     """
     if follow and to is None:
         raise ValueError("`to` must be given with `follow`: the value that the parameter goes to.")
+    if not follow and (to is not None or parameter != FORCE):
+        raise ValueError("`parameter` and `to` must be given with `follow`, the kinds of events.")
     if follow and parameter != FORCE:
         checked_names(model, [parameter])
     ends, settings = (from_hz * HERTZ, to_hz * HERTZ), ResponseSettings(harmonic_order=harmonics)

@@ -83,6 +83,8 @@ def test_simulation(files, tmp_path):
         )
     with pytest.raises(ValueError, match="`to` must be given"):
         sj.pipelines.simulate_responses(given, [1.0], 55, 65, follow=["fold"])
+    with pytest.raises(ValueError, match="must be given with `follow`"):
+        sj.pipelines.simulate_responses(given, [1.0], 55, 65, parameter="mode_1.damping_ratio")
     with pytest.raises(ValueError, match="must differ from the linear frequency"):
         sj.pipelines.simulate_mode(given, 60.0)
 
