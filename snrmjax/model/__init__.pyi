@@ -23,6 +23,7 @@ from .effect_metadata import (
 )
 from .effect_shape import shape_of
 from .effects import EFFECTS, LAWS, make_effect, register_effect
+from .matrices import Matrices, chain, from_matrices
 from .modes import (
     LinearModes,
     LinearModesStd,
@@ -32,6 +33,7 @@ from .modes import (
     residual_velocity,
 )
 from .parameters import parameter_values, with_parameters
+from .places import between
 from .potential import PolynomialPotential, polynomial_potential
 from .structures import Structure, equilibria, structure
 
@@ -52,6 +54,7 @@ __all__ = [
     "Imitation",
     "LinearModes",
     "LinearModesStd",
+    "Matrices",
     "MotionScales",
     "Parameter",
     "Part",
@@ -62,9 +65,12 @@ __all__ = [
     "Structure",
     "Symmetry",
     "averaged_effect",
+    "between",
+    "chain",
     "curved_beam",
     "equilibria",
     "flat_beam",
+    "from_matrices",
     "linear_modes",
     "linear_response",
     "make_effect",

@@ -1,8 +1,10 @@
 """Base classes of effects, one for each way in which a model may be incomplete.
 
-A force acts on the mode of interest: f is added on the left of q̈ + 2ζω₀q̇ + ω₀²q + … = p, with
-q in kg^1/2 m. Other effects change the linear terms, add a mode, add harmonics to the force or
-change what the instruments record.
+A force acts on the mode of interest, or at points of the structure. On the mode of interest f is
+added on the left of q̈ + 2ζω₀q̇ + ω₀²q + … = p, with q in kg^1/2 m. At points it acts on their
+displacement x in m and is a force in N, so that kg^1/2 drops out of all units. Other effects
+change the linear terms, add a mode, add harmonics to the force or change what the instruments
+record.
 """
 
 import dataclasses
@@ -26,6 +28,7 @@ from snrmjax.model.effect_metadata import (
     Shape,
 )
 from snrmjax.model.modes import LinearModes
+from snrmjax.model.places import Row, checked_row
 from snrmjax.model.potential import PolynomialPotential
 
 Scalar = Float[Array, ""]
@@ -41,7 +44,8 @@ class AbstractEffect(eqx.Module):
     """One physical effect, defined once: its equation, and what a diagnosis must know about it.
 
     Effects act on the mode of interest alone: on its modal coordinate q, its linear terms, or
-    what is recorded of it. A nonlinearity that couples modes belongs in the potential.
+    what is recorded of it. Forces may act at points instead (`AbstractForce`) and then couple
+    modes, as the potential does.
 
     The parameters are the fields without a default, the first of them the effect's strength: at
     zero the effect does nothing. `parameter` gives a field its unit, rules and prior; a field
@@ -135,14 +139,23 @@ class AbstractEffect(eqx.Module):
 
 
 class AbstractForce(AbstractEffect):
-    """A force on the mode of interest, known over one cycle of a steady motion."""
+    """A force on the mode of interest or at points, known over one cycle of a steady motion.
+
+    `at` says where: a point, `between("tip", "root")` for their relative motion, or points with
+    weights b; the force then acts on x = Σ b x_point and, by b, on every point. Such a force is the
+    whole element: the linear modes hold no part of it. Without `at` it acts on the mode of
+    interest.
+    """
+
+    at: Row | None = eqx.field(default=None, static=True, kw_only=True, converter=checked_row)
 
     @abstractmethod
     def cycle_force(self, displacement: Samples, velocity: Samples) -> Samples:
         """The force at equally spaced samples of one period of a steady motion.
 
-        Arguments: q in kg^1/2 m and q̇ in kg^1/2 m/s; sample 0 is at phase 0 of the force and the
-        end of the period is left out. Returns kg^1/2 m/s², on the left of the modal equation.
+        Arguments: q in kg^1/2 m and q̇ in kg^1/2 m/s (at points: m, m/s); sample 0 is at phase 0
+        of the force and the end of the period is left out. Returns kg^1/2 m/s² (at points: N), on
+        the left of the equations of motion.
         """
 
     def quick_cycle_force(self, displacement: Samples, velocity: Samples) -> Samples:

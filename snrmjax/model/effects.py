@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from snrmjax.model.effect_base import AbstractEffect
+from snrmjax.model.effect_base import AbstractEffect, AbstractForce
 from snrmjax.model.effect_metadata import Entries
 from snrmjax.model.library.damping import CubicDamping, QuadraticDamping, VanDerPolDamping
 from snrmjax.model.library.free_laws import (
@@ -49,6 +49,7 @@ from snrmjax.model.library.stiffness import (
     QuinticStiffness,
     StaticPreload,
 )
+from snrmjax.model.places import Row, row_over_points
 from snrmjax.numerics.kept_programs import keep_no_programs
 from snrmjax.numerics.rules import require
 
@@ -170,12 +171,21 @@ def effect_parameters(kind: str) -> tuple[str, ...]:
     return tuple(effect_class(kind).parameters())
 
 
-def make_effect(kind: str, parameters: Mapping[str, float | Array | np.ndarray]) -> AbstractEffect:
+def make_effect(
+    kind: str,
+    parameters: Mapping[str, float | Array | np.ndarray],
+    *,
+    at: str | Mapping[str, float] | Row | None = None,
+) -> AbstractEffect:
     """Build an effect from its kind and its parameters by name.
+
+    `at` is a point, a row such as `between("tip", "root")`, or points with weights: there a force
+    acts, with parameters in N and m; without it on the mode of interest.
 
     Raises `ValueError` for an unknown kind, for an unknown, a missing and a non-finite parameter,
     for one out of its range (traced parameters are not looked at), and for a law whose tables
-    have not two knots or more, or different numbers of them, or knots that do not rise.
+    have not two knots or more, or different numbers of them, or knots that do not rise, and for a
+    place of an effect that is no force.
 
     >>> drag = make_effect("quadratic_damping", {"coefficient": 2.0})
     >>> drag.cycle_force(jnp.array([1.0, 0.0]), jnp.array([0.0, -3.0]))
@@ -190,7 +200,11 @@ def make_effect(kind: str, parameters: Mapping[str, float | Array | np.ndarray])
         require(f"`{name}` of {kind}", value, *wanted[name].rules)
     arrays = {k: jnp.asarray(v, dtype=jnp.float64) for k, v in parameters.items()}
     _check_tables(kind, arrays)
-    return effect_class(kind)(**arrays)
+    if at is None:
+        return effect_class(kind)(**arrays)
+    if not issubclass(effect_class(kind), AbstractForce):
+        raise ValueError(f"{kind} is no force: it cannot act at a point.")
+    return effect_class(kind)(**arrays, at=row_over_points(at))
 
 
 def _check_tables(kind: str, arrays: Mapping[str, Array]) -> None:

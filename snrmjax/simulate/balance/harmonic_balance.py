@@ -11,7 +11,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from snrmjax.model.averaging import AveragedForce, averaged_effect
-from snrmjax.model.effect_base import AbstractForce, AbstractKinked
+from snrmjax.model.effect_base import AbstractHysteresis, AbstractKinked
+from snrmjax.model.elements import elements_of
+from snrmjax.model.modes import phasor_of_load
 from snrmjax.model.structures import Structure, linear_terms_of
 from snrmjax.numerics.compiled import compiled
 from snrmjax.simulate.balance.harmonics import (
@@ -20,6 +22,8 @@ from snrmjax.simulate.balance.harmonics import (
     squared_orders,
     tangent_blocks,
 )
+
+_BY_CYCLE = (AbstractHysteresis, AbstractKinked)  # whose force needs the whole cycle
 
 
 class HarmonicBalance(eqx.Module):
@@ -81,6 +85,9 @@ class HarmonicBalance(eqx.Module):
         orders = np.arange(min(len(spectrum), self.harmonic_order + 1))
         cosines = np.eye(self.n_coefficients)[:, np.maximum(2 * orders - 1, 0)]
         load = jnp.outer(cosines @ spectrum[: len(orders)], model.modes.participation)
+        if model.modes.participation_lag is not None:
+            sine = np.eye(self.n_coefficients)[2] * spectrum[1]
+            load = load + jnp.outer(sine, model.modes.participation_lag)
         return load.reshape(-1) / (self.frequency_scale**2 * self.displacement_scale)
 
     def residual(self, point: Float[Array, " unknown"]) -> Float[Array, " equation"]:
@@ -108,13 +115,11 @@ class HarmonicBalance(eqx.Module):
         rate = omega * by_omega
         unit = fs**2 * self.displacement_scale
         internal = jnp.asarray(basis.analysis) @ (model.nonlinear_force(samples, rate) / unit)
-        balance = (stiffness - omega**2 * inertia) * x + omega * damping * slope + internal
+        damped = terms.damped(slope) / fs
+        balance = (stiffness - omega**2 * inertia) * x + omega * damped + internal
         residual = balance.reshape(-1) - self.force * self.load()
         if not with_jacobian:
             return residual, jnp.zeros((0,))
-        tangent = model.pointwise.tangent_stiffness(samples, rate).reshape(self.n_samples, n * n)
-        blocks = tangent_blocks(basis, tangent / fs**2).reshape(size, size, n, n)
-        blocks = blocks.transpose(0, 2, 1, 3)
         eye = jnp.eye(size)[:, None, :]
         linear = (
             eye * stiffness[:, None]
@@ -122,42 +127,57 @@ class HarmonicBalance(eqx.Module):
             + omega * jnp.asarray(basis.derivative)[:, None, :] * damping[:, None]
         )
         # Adding zeros beside the diagonal is faster than writing to its entries one by one.
-        blocks = blocks + linear[..., None] * np.eye(n)[:, None]
-        column = damping * slope - 2 * omega * inertia * x
-        if model.effects:
-            added, by_rate = self._effects(samples, rate, by_omega, omega)
-            j = model.modes.mode_of_interest
-            blocks = blocks.at[:, j, :, j].add(added)
-            column = column.at[:, j].add(by_rate)
+        blocks = linear[..., None] * np.eye(n)[:, None]
+        if model.potential.monomials:
+            tangent = model.potential.stiffness(samples).reshape(self.n_samples, n * n)
+            nonlinear = tangent_blocks(basis, tangent / fs**2).reshape(size, size, n, n)
+            blocks = blocks + nonlinear.transpose(0, 2, 1, 3)
+        if terms.coupling is not None:
+            by_rate = jnp.asarray(basis.derivative)[:, None, :, None]
+            blocks = blocks + omega / fs * by_rate * terms.coupling[None, :, None, :]
+        column = damped - 2 * omega * inertia * x
+        if model.forces:
+            added, by_omega = self._elements(samples, by_omega, omega)
+            blocks, column = blocks + added, column + by_omega
         by_x = blocks.reshape(size * n, size * n)
         return residual, jnp.concatenate([by_x, column.reshape(-1, 1)], axis=1)
 
-    def _effects(
-        self, samples: Array, rate: Array, by_omega: Array, omega: Array
-    ) -> tuple[Array, Array]:
-        """What velocity and history add on the mode of interest: the block and the λ column."""
-        model, j = self.model, self.model.modes.mode_of_interest
+    def _elements(
+        self, samples: Array, by_omega: Array, omega: Array
+    ) -> tuple[Float[Array, "coefficient mode coefficient mode"], Float[Array, "coefficient mode"]]:
+        """What forces of effects add to the blocks and to the column of λ."""
+        model, fs = self.model, self.frequency_scale
         basis = harmonic_basis(self.harmonic_order, self.n_samples, cosine_only=self.cosine_only)
-        unit = self.frequency_scale**2 * self.displacement_scale
-        q, v, v_omega = samples[:, j], rate[:, j], by_omega[:, j]
-        viscous = model.pointwise.tangent_damping(samples, rate)
-        viscous_blocks = tangent_blocks(basis, viscous[:, None])[:, :, 0] @ basis.derivative
-        block = viscous_blocks * (omega / self.frequency_scale)
-        change = viscous * v_omega
-        if model.by_cycle:
-
-            def cycle(q: Array, v: Array) -> Array:
-                return sum((e.cycle_force(q, v) for e in model.by_cycle), jnp.zeros_like(q))
+        size, unit = self.n_coefficients, fs**2 * self.displacement_scale
+        elements = elements_of(model.forces, model.modes)
+        x, v_omega = elements.displacement(samples), elements.displacement(by_omega)
+        v = omega * v_omega
+        slopes = elements.without(_BY_CYCLE).slopes(x, v)
+        block = tangent_blocks(basis, slopes.stiffness / fs**2)
+        viscous = tangent_blocks(basis, slopes.damping / fs)
+        block = block + omega * jnp.einsum("cep,ed->cdp", viscous, basis.derivative)
+        change = slopes.damping * v_omega / unit
+        by_cycle = elements.only(_BY_CYCLE)
+        if by_cycle.groups:
 
             def along(direction: Array, direction_rate: Array) -> Array:
-                return jax.jvp(cycle, (q, v), (direction, direction_rate))[1]
+                return jax.jvp(by_cycle.cycle_force, (x, v), (direction, direction_rate))[1] / unit
 
+            # One direction moves all places: a force feels its own alone.
             shapes = jnp.asarray(basis.synthesis.T) * self.displacement_scale
             rates = jnp.asarray((basis.synthesis @ basis.derivative).T)
-            rates = rates * (omega * self.frequency_scale * self.displacement_scale)
-            block = block + basis.analysis @ jax.vmap(along)(shapes, rates).T / unit
-            change = change + along(jnp.zeros_like(q), v_omega)
-        return block, jnp.asarray(basis.analysis) @ change / unit
+            rates = rates * (omega * fs * self.displacement_scale)
+            every = jnp.ones(elements.n_places)
+            by_shape = jax.vmap(along)(shapes[..., None] * every, rates[..., None] * every)
+            block = block + jnp.einsum("ct,dtp->cdp", basis.analysis, by_shape)
+            change = change + along(jnp.zeros_like(x), v_omega)
+        by_frequency = elements.on_modes(jnp.asarray(basis.analysis) @ change)
+        added = elements.matrix(block.reshape(size * size, -1)).reshape(size, size, *self._square)
+        return added.transpose(0, 2, 1, 3), by_frequency
+
+    @property
+    def _square(self) -> tuple[int, int]:
+        return self.model.n_modes, self.model.n_modes
 
 
 def harmonic_balance(
@@ -203,7 +223,7 @@ def samples_for(model: Structure, harmonic_order: int, n_samples: int | None) ->
         )
     if n_samples is None:
         n_samples = alias_free_samples(harmonic_order, max(model.potential.degree - 1, 1))
-        if any(isinstance(effect, AbstractForce) for effect in model.effects):
+        if model.forces:
             n_samples = max(n_samples, 128, 16 * harmonic_order)
         if model.by_cycle:
             kinked = any(isinstance(e, AbstractKinked) for e in model.effects)
@@ -227,7 +247,7 @@ def truncation_error(
     x = jnp.moveaxis(coefficients, 0, 2)
     synthesis = basis.synthesis[:, : 2 * order + 1]
     samples = jnp.tensordot(synthesis, x, axes=1)  # (time, mode, point)
-    if any(isinstance(effect, AbstractForce) for effect in model.effects):
+    if model.forces:
         slopes = (basis.synthesis @ basis.derivative)[:, : 2 * order + 1]
         rate = frequency * jnp.tensordot(slopes, x, axes=1)
         values = jax.vmap(model.nonlinear_force, in_axes=2, out_axes=2)(samples, rate)
@@ -250,9 +270,12 @@ def linear_coefficients(
     model: Structure, force: Float[Array, ""], frequency: Float[Array, ""], harmonic_order: int
 ) -> Float[Array, "coefficient mode"]:
     """Displacement coefficients of the linear response: where a forced response starts."""
-    terms = model.linear_terms()
+    terms, load = model.linear_terms(), force * phasor_of_load(model.modes)
     stiffness = terms.stiffness - terms.mass * frequency**2 + 1j * terms.damping * frequency
-    phasor = force * model.modes.participation / stiffness
+    if terms.coupling is None:
+        phasor = load / stiffness
+    else:
+        phasor = jnp.linalg.solve(jnp.diag(stiffness) + 1j * frequency * terms.coupling, load)
     start = jnp.zeros((2 * harmonic_order + 1, model.n_modes))
     return start.at[1].set(phasor.real).at[2].set(-phasor.imag)
 
@@ -265,7 +288,7 @@ def resonance_displacement(model: Structure, force: float) -> float:
     at least the static displacement of every mode, so that no motion is small beside it.
     """
     modes, j = model.modes, model.modes.mode_of_interest
-    mass, damping, stiffness = (np.asarray(part) for part in linear_terms_of(model))
+    mass, damping, stiffness = (np.asarray(part) for part in linear_terms_of(model)[:3])
     participation = np.asarray(modes.participation)
     omega = np.sqrt(stiffness[j] / mass[j])
     least_damping = 1e-4 * omega
@@ -281,9 +304,8 @@ def resonance_displacement(model: Structure, force: float) -> float:
     amplitude = largest * np.logspace(-9, 0, 361)
     needed_stiffness = stiffness[j] + quartic * amplitude**2
     viscous = np.full(amplitude.shape, damping[j])
-    forces = tuple(e for e in model.effects if isinstance(e, AbstractForce))
-    if forces:
-        added = _averages(forces, jnp.asarray(amplitude), jnp.asarray(omega))
+    if model.forces:
+        added = averaged_forces(model, jnp.asarray(amplitude), jnp.asarray(omega))
         needed_stiffness = needed_stiffness + np.maximum(np.asarray(added.stiffness), 0.0)
         viscous = viscous + np.asarray(added.damping)
     needed = np.maximum(viscous, least_damping) * np.sqrt(needed_stiffness) * amplitude
@@ -291,9 +313,21 @@ def resonance_displacement(model: Structure, force: float) -> float:
 
 
 @compiled
-def _averages(effects: tuple[AbstractForce, ...], amplitude: Array, omega: Array) -> AveragedForce:
-    """What all effects together do to a mode, by averaging."""
-    each = [averaged_effect(effect, amplitude, omega, n_samples=128) for effect in effects]
-    return AveragedForce(
-        *(sum(part, jnp.zeros_like(amplitude)) for part in zip(*each, strict=True))
-    )
+def averaged_forces(
+    model: Structure, amplitude: Float[Array, "*batch"], frequency: Float[Array, "*batch"]
+) -> AveragedForce:
+    """What all forces of effects do to the mode of interest, by averaging, while others rest.
+
+    Arguments: `amplitude` of that mode in kg^1/2 m, `frequency` in rad/s.
+    """
+    j = model.modes.mode_of_interest
+    stiffness = damping = jnp.zeros_like(amplitude)
+    for force in model.forces:
+        row = elements_of([force], model.modes).rows[0, j]
+        moves = row != 0
+        there = jnp.abs(jnp.where(moves, row, 1.0)) * amplitude
+        average = averaged_effect(force, there, frequency, n_samples=128)
+        share = jnp.where(moves, row, 0.0) ** 2
+        stiffness = stiffness + share * average.stiffness
+        damping = damping + share * average.damping
+    return AveragedForce(stiffness, damping)

@@ -8,14 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from snrmjax.model.averaging import averaged_effect
-from snrmjax.model.effect_base import AbstractForce
 from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.result import quantity
 from snrmjax.simulate.balance.given_numbers import frequency_range, positive
 from snrmjax.simulate.balance.harmonic_balance import (
     HarmonicBalance,
+    averaged_forces,
     harmonic_balance,
     linear_coefficients,
     resonance_displacement,
@@ -112,11 +111,8 @@ def _trace_damped(balance: HarmonicBalance, steps: StepControl) -> Curve:
 
     # What averaging says of a small motion; friction may damp that one most.
     small = 0.01
-    stiffness, damping = terms.stiffness[j], terms.damping[j]
-    for effect in model.effects:
-        if isinstance(effect, AbstractForce):
-            average = averaged_effect(effect, small * balance.displacement_scale, fs)
-            stiffness, damping = stiffness + average.stiffness, damping + average.damping
+    added = averaged_forces(model, small * balance.displacement_scale, fs)
+    stiffness, damping = terms.stiffness[j] + added.stiffness, terms.damping[j] + added.damping
     begin = jnp.sqrt(stiffness / terms.mass[j]) / fs
     start = jnp.zeros(balance.size + 2).at[n + j].set(small)
     start = start.at[-2].set(damping / (terms.mass[j] * fs)).at[-1].set(begin)
