@@ -12,7 +12,7 @@ from snrmjax.io.toml_table import TomlTable, parsed_toml
 from snrmjax.io.units import DEGREE, HERTZ, in_unit
 from snrmjax.model.effect_base import AbstractEffect
 from snrmjax.model.effect_metadata import Entries
-from snrmjax.model.effects import EFFECTS, LAWS, effect_class, make_effect
+from snrmjax.model.effects import effect_class, known_effects, make_effect
 from snrmjax.model.modes import (
     UNSTATED_MODAL_MASS_STD,
     Beside,
@@ -254,7 +254,7 @@ def _potential(table: TomlTable, n_modes: int) -> PolynomialPotential:
 def _effect(table: TomlTable) -> AbstractEffect:
     if "kind" not in table.entries:
         raise ValueError(f"{table.place} lacks the key `kind`.")
-    kind, known_kinds = table.text("kind"), (*EFFECTS, *LAWS)
+    kind, known_kinds = table.text("kind"), tuple(known_effects())
     if kind not in known_kinds:
         near = suggestion(kind, known_kinds) or f" (known are {', '.join(sorted(known_kinds))})"
         raise ValueError(f"{table.place} has the unknown kind {shown(kind)}{near}.")
@@ -369,7 +369,7 @@ def _entries(model: Structure) -> dict[str, object]:
 
 
 def _effect_entry(effect: AbstractEffect) -> dict[str, object]:
-    if effect.kind not in (*EFFECTS, *LAWS):
+    if effect.kind not in known_effects():
         raise ValueError(f"an effect to be written must be of a known kind, not {effect.kind!r}.")
     entry: dict[str, object] = {"kind": effect.kind}
     at = getattr(effect, "at", None)

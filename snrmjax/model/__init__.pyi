@@ -22,7 +22,7 @@ from .effect_metadata import (
     parameter,
 )
 from .effect_shape import shape_of
-from .effects import EFFECTS, LAWS, make_effect, register_effect
+from .effects import EFFECTS, ELEMENTS, LAWS, make_effect, register_effect
 from .matrices import Matrices, chain, from_matrices
 from .modes import (
     LinearModes,
@@ -40,6 +40,7 @@ from .structures import Structure, equilibria, structure
 __all__ = [
     "CURVED_BEAM_FORCES",
     "EFFECTS",
+    "ELEMENTS",
     "FLAT_BEAM_FORCES",
     "LAWS",
     "AbstractForce",

@@ -2,7 +2,7 @@
 
 A force acts on the mode of interest, or at points of the structure. On the mode of interest f is
 added on the left of q̈ + 2ζω₀q̇ + ω₀²q + … = p, with q in kg^1/2 m. At points it acts on their
-displacement x in m and is a force in N, so that kg^1/2 drops out of all units. Other effects
+displacement x in m and is a force in N, which is then what its parameters are in. Other effects
 change the linear terms, add a mode, add harmonics to the force or change what the instruments
 record.
 """

@@ -24,6 +24,7 @@ from snrmjax.model.library.internal_resonances import (
     InternalResonanceOneToThree,
     InternalResonanceOneToTwo,
 )
+from snrmjax.model.library.joints import FourParameterIwan, RegularisedFriction, SpringLinkage
 from snrmjax.model.library.linear_changes import (
     AddedMass,
     FrequencyDrift,
@@ -125,6 +126,11 @@ LAWS: dict[str, type[AbstractLaw]] = {
 }
 """The laws given by a table of knots, by their kind: drawn where no effect of the library holds."""
 
+ELEMENTS: dict[str, type[AbstractEffect]] = EffectTable(
+    (element.kind, element) for element in (RegularisedFriction, SpringLinkage, FourParameterIwan)
+)
+"""Further forces for points of a structure, by their kind; a diagnosis does not look for them."""
+
 # `help(EFFECTS)` shows the docstring of its class.
 EffectTable.__doc__ = f"{EffectTable.__doc__}\n\n{EFFECTS!r}"
 
@@ -149,7 +155,7 @@ def register_effect(effect: type[AbstractEffect]) -> type[AbstractEffect]:
     Returns the class. Raises `ValueError` for a kind that exists already and for a class without
     parameters.
     """
-    if effect.kind in (*EFFECTS, *LAWS):
+    if effect.kind in known_effects():
         raise ValueError(f"there is an effect of the kind {effect.kind!r} already.")
     if not effect.parameters():
         raise ValueError(f"{effect.kind!r} must have a parameter: a field without a default.")
@@ -159,11 +165,16 @@ def register_effect(effect: type[AbstractEffect]) -> type[AbstractEffect]:
 
 
 def effect_class(kind: str) -> type[AbstractEffect]:
-    """The class of a kind of effect, of the library, of a user or a drawn law.
+    """The class of a kind of effect, of the library, of a user, an element or a drawn law.
 
     Raises `KeyError` for an unknown kind.
     """
-    return EFFECTS[kind] if kind in EFFECTS else LAWS[kind]
+    return known_effects()[kind]
+
+
+def known_effects() -> dict[str, type[AbstractEffect]]:
+    """All classes of effects by their kinds: `EFFECTS`, `ELEMENTS` and `LAWS`."""
+    return {**EFFECTS, **ELEMENTS, **LAWS}
 
 
 def effect_parameters(kind: str) -> tuple[str, ...]:
@@ -191,8 +202,8 @@ def make_effect(
     >>> drag.cycle_force(jnp.array([1.0, 0.0]), jnp.array([0.0, -3.0]))
     Array([  0., -18.], dtype=float64)
     """
-    if kind not in (*EFFECTS, *LAWS):
-        raise ValueError(f"unknown effect kind {kind!r}; known are {sorted((*EFFECTS, *LAWS))}.")
+    if kind not in known_effects():
+        raise ValueError(f"unknown effect kind {kind!r}; known are {sorted(known_effects())}.")
     wanted = effect_class(kind).parameters()
     if set(parameters) != set(wanted):
         raise ValueError(f"{kind} takes the parameters {list(wanted)}, not {sorted(parameters)}.")

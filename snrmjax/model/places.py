@@ -51,3 +51,31 @@ def row_text(row: Row) -> str:
         for name, weight in row
     ]
     return " ".join(parts).removeprefix("+ ")
+
+
+_UNITS = {
+    "1": "1",
+    "kg^1/2 m": "m",
+    "kg^1/2 m/s": "m/s",
+    "kg^1/2 m/s²": "N",
+    "1/s": "N s/m",
+    "1/s²": "N/m",
+    "1/(kg^1/2 m s²)": "N/m²",
+    "1/(kg m² s²)": "N/m³",
+    "1/(kg² m⁴ s²)": "N/m⁵",
+    "1/(kg^1/2 m)": "N s²/m²",
+    "s/(kg m²)": "N s³/m³",
+    "1/(kg m² s)": "N s/m³",
+    "(kg^1/2 m)^(1-exponent)/s²": "N/m^exponent",
+}
+
+
+def unit_at(row: Row | None, unit: str) -> str:
+    """The unit of a parameter of a force at a row, from that on the mode of interest.
+
+    Of an effect of a user's own it is that with N in place of kg^1/2 m/s² and m of kg^1/2 m.
+
+    >>> unit_at(between("tip", "root"), "1/s²")
+    'N/m'
+    """
+    return unit if row is None else _UNITS.get(unit, f"({unit}, in N and m)")

@@ -24,7 +24,7 @@ from snrmjax.model.effect_base import (
 )
 from snrmjax.model.elements import elements_of
 from snrmjax.model.modes import LinearModes, have_values
-from snrmjax.model.places import row_text
+from snrmjax.model.places import row_text, unit_at
 from snrmjax.model.potential import PolynomialPotential, polynomial_potential
 from snrmjax.numerics.compiled import compiled
 
@@ -84,11 +84,11 @@ class Structure(eqx.Module):
         lines = [f"Structure {self.name!r}", *repr(self.modes).splitlines()]
         lines.append(f"polynomial potential: {terms}")
         for effect in self.effects:
-            values = [
-                f"{name} {_text(getattr(effect, name))} {parameter.unit}".removesuffix(" 1")
-                for name, parameter in effect.parameters().items()
-            ]
             row = effect.at if isinstance(effect, AbstractForce) else None
+            values = [
+                f"{name} {_text(getattr(effect, name))} {unit_at(row, of.unit)}".removesuffix(" 1")
+                for name, of in effect.parameters().items()
+            ]
             where = "" if row is None else f" at {row_text(row)}"
             lines.append(f"effect {effect.kind}{where}: {', '.join(values)}")
         names = ("relative gain", "phase (rad)", "natural frequency (rad/s)", "damping ratio")

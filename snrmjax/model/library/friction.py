@@ -11,6 +11,7 @@ Reference: Iwan, ASME J. Appl. Mech. 33 (1966), 893, doi:10.1115/1.3625199.
 
 import dataclasses
 from abc import abstractmethod
+from collections.abc import Callable
 from typing import ClassVar, NamedTuple, Self
 
 import equinox as eqx
@@ -139,14 +140,19 @@ class AbstractSliders(AbstractHysteresis):
         return settled_positions(displacement, self.sliders().slip_displacement)
 
     def cycle_force(self, displacement: Samples, velocity: Samples) -> Samples:
-        lost = self.settled_states(displacement, velocity) @ self.sliders().stiffness
-        return self.added_stiffness() * displacement - lost
+        return self.for_cycle(displacement)._force_on(displacement, settled_positions)
 
     def quick_cycle_force(self, displacement: Samples, velocity: Samples) -> Samples:
         """Over a cycle between two turning points."""
-        sliders = self.sliders()
-        lost = slipped_position(displacement, sliders.slip_displacement) @ sliders.stiffness
-        return self.added_stiffness() * displacement - lost
+        return self.for_cycle(displacement)._force_on(displacement, slipped_position)
+
+    def for_cycle(self, displacement: Samples) -> Self:
+        """The sliders that resolve a cycle; the effect itself where they do not depend on it."""
+        return self
+
+    def _force_on(self, displacement: Samples, positions: Callable[..., Array]) -> Samples:
+        stiffness, slip = self.sliders()
+        return self.added_stiffness() * displacement - positions(displacement, slip) @ stiffness
 
 
 class JenkinsSlider(AbstractSliders):

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from snrmjax.model.averaging import AveragedForce, averaged_effect
+from snrmjax.model.averaging import AveragedForce
 from snrmjax.model.effect_base import AbstractHysteresis, AbstractKinked
 from snrmjax.model.elements import elements_of
 from snrmjax.model.modes import phasor_of_load
@@ -305,29 +305,34 @@ def resonance_displacement(model: Structure, force: float) -> float:
     needed_stiffness = stiffness[j] + quartic * amplitude**2
     viscous = np.full(amplitude.shape, damping[j])
     if model.forces:
-        added = averaged_forces(model, jnp.asarray(amplitude), jnp.asarray(omega))
-        needed_stiffness = needed_stiffness + np.maximum(np.asarray(added.stiffness), 0.0)
-        viscous = viscous + np.asarray(added.damping)
+        row = np.asarray(elements_of(model.forces, modes).rows)[:, j]
+        there = np.abs(row) * amplitude[:, None]
+        each = jax.vmap(averaged_at_places, (None, 0, None))(model, there, omega)
+        stiffer, damped = (np.asarray(part) @ row**2 for part in each)
+        needed_stiffness = needed_stiffness + np.maximum(stiffer, 0.0)
+        viscous = viscous + damped
     needed = np.maximum(viscous, least_damping) * np.sqrt(needed_stiffness) * amplitude
     return float(np.maximum(static, np.interp(load, np.maximum.accumulate(needed), amplitude)))
 
 
 @compiled
-def averaged_forces(
-    model: Structure, amplitude: Float[Array, "*batch"], frequency: Float[Array, "*batch"]
+def averaged_at_places(
+    model: Structure, amplitude: Float[Array, " place"], frequency: Float[Array, ""]
 ) -> AveragedForce:
-    """What all forces of effects do to the mode of interest, by averaging, while others rest.
+    """What the forces of effects add to stiffness and damping at their places, by averaging.
 
-    Arguments: `amplitude` of that mode in kg^1/2 m, `frequency` in rad/s.
+    Arguments: amplitudes of x there, places in the order of `elements_of`; `frequency` in rad/s.
+    Nothing where the amplitude is zero.
     """
-    j = model.modes.mode_of_interest
-    stiffness = damping = jnp.zeros_like(amplitude)
-    for force in model.forces:
-        row = elements_of([force], model.modes).rows[0, j]
-        moves = row != 0
-        there = jnp.abs(jnp.where(moves, row, 1.0)) * amplitude
-        average = averaged_effect(force, there, frequency, n_samples=128)
-        share = jnp.where(moves, row, 0.0) ** 2
-        stiffness = stiffness + share * average.stiffness
-        damping = damping + share * average.damping
-    return AveragedForce(stiffness, damping)
+    elements, beta = (
+        elements_of(model.forces, model.modes),
+        2 * np.pi * np.arange(128)[:, None] / 128,
+    )
+    x, v = amplitude * np.cos(beta), -amplitude * frequency * np.sin(beta)
+    force = elements.cycle_force(x, v)
+    moves = amplitude > 0
+    size = jnp.where(moves, amplitude, 1.0)
+    cosine, sine = 2 * jnp.mean(force * np.cos(beta), 0), 2 * jnp.mean(force * np.sin(beta), 0)
+    return AveragedForce(
+        jnp.where(moves, cosine / size, 0.0), jnp.where(moves, -sine / (size * frequency), 0.0)
+    )
