@@ -97,6 +97,7 @@ SUB_ROOMS = {
     },
     "report.sentences": set(),
     "report.study": {"report.style", "report.html", "report.sentences"},
+    "io.programs": set(),
     "io.reduction": {
         *("io.columns", "io.files", "io.rows", "io.tables", "io.toml_table", "io.units"),
     },
