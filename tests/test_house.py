@@ -98,6 +98,10 @@ SUB_ROOMS = {
     "report.sentences": set(),
     "report.study": {"report.style", "report.html", "report.sentences"},
     "io.programs": set(),
+    "model.builders": {
+        *("model.effect_base", "model.effects", "model.modes", "model.places", "model.potential"),
+        "model.structures",
+    },
     "io.reduction": {
         *("io.columns", "io.files", "io.rows", "io.tables", "io.toml_table", "io.units"),
     },

@@ -12,8 +12,8 @@ from jaxtyping import Float
 from snrmjax.io.files import shown
 from snrmjax.io.toml_table import TomlTable
 from snrmjax.io.units import DEGREE
+from snrmjax.model.builders.matrices import from_matrices
 from snrmjax.model.effect_base import AbstractEffect
-from snrmjax.model.matrices import from_matrices
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.rules import BELOW_ONE, NOT_ZERO
 

@@ -1,6 +1,7 @@
-from .arches import ArchSettings, shallow_arch
 from .averaging import averaged_effect
-from .beams import CURVED_BEAM_FORCES, FLAT_BEAM_FORCES, curved_beam, flat_beam
+from .builders.arches import ArchSettings, shallow_arch
+from .builders.beams import CURVED_BEAM_FORCES, FLAT_BEAM_FORCES, curved_beam, flat_beam
+from .builders.matrices import Matrices, chain, from_matrices
 from .effect_base import (
     AbstractForce,
     AbstractHysteresis,
@@ -23,7 +24,6 @@ from .effect_metadata import (
 )
 from .effect_shape import shape_of
 from .effects import EFFECTS, ELEMENTS, LAWS, make_effect, register_effect
-from .matrices import Matrices, chain, from_matrices
 from .modes import (
     LinearModes,
     LinearModesStd,

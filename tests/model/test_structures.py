@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from snrmjax.model.beams import flat_beam
+from snrmjax.model.builders.beams import flat_beam
 from snrmjax.model.effect_base import AbstractMemoryless
 from snrmjax.model.effects import EFFECTS, make_effect
 from snrmjax.model.modes import linear_modes

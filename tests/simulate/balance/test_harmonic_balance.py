@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from snrmjax.model.beams import flat_beam
+from snrmjax.model.builders.beams import flat_beam
 from snrmjax.model.effect_base import AbstractForce
 from snrmjax.model.effects import EFFECTS, make_effect
 from snrmjax.model.modes import linear_modes, linear_response
