@@ -86,7 +86,10 @@ def _arrays(path: Path, table: TomlTable) -> dict[str, Any]:
     try:
         arrays = dict(reading(path))
     except (OSError, ValueError, NotImplementedError) as error:
-        raise ValueError(f"{shown(path.name)} of {table.place} cannot be read: {error}") from error
+        kind = f"an {path.suffix[1:].upper()} file of arrays (MAT up to version 7)"
+        raise ValueError(
+            f"{shown(path.name)} of {table.place} cannot be read: it is not {kind}."
+        ) from error
     found = {key: arrays[key] for key in (*_MATRICES, "points") if key in arrays}
     if "points" in found:
         names = np.ravel(found["points"])
