@@ -45,7 +45,13 @@ ROOMS = {
 # import all of them; none of them imports it, unless it is named here.
 SUB_ROOMS = {
     "model.library": {
-        *("model.effect_base", "model.effect_metadata", "model.modes", "model.potential"),
+        *(
+            "model.effect_base",
+            "model.effect_metadata",
+            "model.kinks",
+            "model.modes",
+            "model.potential",
+        ),
     },
     "measure.recordings": {"measure.signals", "measure.states"},
     "measure.sweeps": {"measure.recordings", "measure.signals", "measure.states"},

@@ -27,6 +27,7 @@ from snrmjax.model.effect_metadata import (
     Part,
     Shape,
 )
+from snrmjax.model.kinks import Kinks, with_kinks
 from snrmjax.model.modes import LinearModes
 from snrmjax.model.places import Row, checked_row
 from snrmjax.model.potential import PolynomialPotential
@@ -186,40 +187,17 @@ class AbstractMemoryless(AbstractForce):
 class AbstractKinked(AbstractMemoryless):
     """A memoryless force whose slope jumps where a contact opens or closes.
 
-    In time integration the kink is sharp. Over a cycle it is rounded over a hundredth of half the
-    range of q to either side: harmonic balance evaluates a cycle at samples, and a sharp kink
-    would jump from one sample to the next. The equivalent stiffness changes by less than 1e-4 of
-    the contact's.
+    Harmonic balance evaluates a cycle at samples, of which a contact that opens between two of them
+    would make jumps; `cycle_force` therefore finds these times (see `with_kinks`).
     """
 
     @abstractmethod
-    def rounded_force(self, displacement: Scalar, velocity: Scalar, width: Scalar) -> Scalar:
-        """The force with its kinks rounded over ±`width` (kg^1/2 m) of displacement."""
-
-    def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
-        """The force with sharp kinks."""
-        return self.rounded_force(displacement, velocity, jnp.zeros(()))
+    def kinks(self) -> Kinks:
+        """Where the slope jumps; elsewhere the force is smooth, and everywhere continuous."""
 
     def cycle_force(self, displacement: Samples, velocity: Samples) -> Samples:
-        """The force with kinks rounded by the cycle's own range of q."""
-        width = 0.5 * KINK_WIDTH * (jnp.max(displacement) - jnp.min(displacement))
-        return jax.vmap(lambda q, v: self.rounded_force(q, v, width))(displacement, velocity)
-
-
-KINK_WIDTH = 0.02  # over which a kink is rounded, to either side, over half the range of q
-
-
-def ramp(beyond: Scalar, width: Scalar) -> Scalar:
-    """max(x, 0), rounded over ±`width` so that the first two derivatives are continuous.
-
-    >>> ramp(jnp.array([-1.0, 0.0, 3.0]), jnp.array(0.0))
-    Array([0., 0., 3.], dtype=float64)
-    """
-    sharp = jnp.maximum(beyond, 0.0)
-    safe = jnp.where(width > 0, width, 1.0)
-    share = jnp.clip(beyond / safe, -1.0, 1.0)
-    rounded = safe * (1 + share) ** 3 * (3 - share) / 16
-    return jnp.where((width > 0) & (jnp.abs(beyond) < width), rounded, sharp)
+        """The force over one period, such that Fourier sums over its samples are integrals."""
+        return with_kinks(super().cycle_force(displacement, velocity), displacement, self.kinks())
 
 
 class AbstractHysteresis(AbstractForce):

@@ -62,7 +62,7 @@ def test_effects_add_to_the_mode_of_interest_alone():
     model = with_all_effects()
     q = jnp.array([[0.3, -0.8], [1.1, 0.7], [-0.4, 0.1]])
     v = jnp.array([[2.0, 0.4], [-0.3, -1.2], [0.1, 0.9]])
-    force = np.asarray(model.nonlinear_force(q, v))
+    force = np.asarray(model.memoryless_force(q, v))
     # ∂V/∂q by hand.
     x, y = np.asarray(q).T
     by_hand = np.stack([1.5 * x**2 + 1.4 * x * y**2, 1.4 * x**2 * y - 0.6 * y**2], axis=1)
@@ -80,14 +80,14 @@ def test_tangents_against_central_differences():
     q = jnp.array([[0.3, -0.8], [1.1, 0.7], [-0.4, 0.1]])
     v = jnp.array([[2.0, 0.4], [-0.3, -1.2], [0.1, 0.9]])
     step = 1e-5
-    nonlinear_force = partial(eqx.filter_jit(type(model).nonlinear_force), model)
+    force = partial(eqx.filter_jit(type(model).memoryless_force), model)
     stiffness, damping = map(np.asarray, eqx.filter_jit(type(model).slopes)(model, q, v))
     # h²/6·|f'''| ≤ 1e-10/6·120 and rounding 10·1e-16/1e-5.
     for mode in range(2):
         shift = step * jnp.eye(2)[mode]
-        slope = (nonlinear_force(q + shift, v) - nonlinear_force(q - shift, v)) / (2 * step)
+        slope = (force(q + shift, v) - force(q - shift, v)) / (2 * step)
         np.testing.assert_allclose(stiffness[:, :, mode], slope, rtol=0, atol=3e-9)
-        slope = (nonlinear_force(q, v + shift) - nonlinear_force(q, v - shift)) / (2 * step)
+        slope = (force(q, v + shift) - force(q, v - shift)) / (2 * step)
         np.testing.assert_allclose(damping[:, :, mode], slope, rtol=0, atol=3e-9)
 
 

@@ -226,8 +226,7 @@ def samples_for(model: Structure, harmonic_order: int, n_samples: int | None) ->
         if model.forces:
             n_samples = max(n_samples, 128, 16 * harmonic_order)
         if model.by_cycle:
-            kinked = any(isinstance(e, AbstractKinked) for e in model.effects)
-            n_samples = max(n_samples, 512 if kinked else 256)
+            n_samples = max(n_samples, 256)
     return n_samples
 
 

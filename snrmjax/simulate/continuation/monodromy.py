@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from snrmjax.model.effect_base import AbstractHysteresis
+from snrmjax.model.effect_base import AbstractHysteresis, AbstractKinked
 from snrmjax.model.elements import Elements, elements_of
+from snrmjax.model.kinks import crossings
 from snrmjax.model.library.friction import AbstractSliders
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.compiled import compiled
@@ -18,6 +19,7 @@ _MOST_SEGMENTS = 256
 _SEGMENT = 32  # steps whose propagators, or kicks, are computed side by side
 _KICKS = 3  # for every step of Magnus' method
 _LEAST_KICKS = 240
+_CONTACT_SAMPLES = 512  # over a period, among which contacts are looked for
 _GAUSS = np.array([0.5 - np.sqrt(0.15), 0.5, 0.5 + np.sqrt(0.15)])
 
 
@@ -144,15 +146,17 @@ def _by_magnus(
     rate = jnp.sqrt(jnp.max(jnp.sum(jnp.abs(k), axis=-1)))
     cycles = jnp.nan_to_num(jnp.maximum(rate, 0.5 * jnp.max(jnp.sum(jnp.abs(c), axis=-1))))
     n_segments, step = _segments(jnp.maximum(steps_per_cycle * cycles, 512), _MOST_SEGMENTS)
+    contacts = _contacts(model, coefficients, frequency, friction.begin)
     unit = jnp.sqrt(jnp.max(terms.stiffness / terms.mass)) / frequency  # of δq̇, over Ω
     places, owner, n_places = friction.places, friction.owner, friction.places.n_places
     size, n_dragged = 2 * n + n_places, len(friction.dragged)
     of_place = np.eye(n_places)[owner]  # (slider, place)
 
-    def generators(start: Array, held: Array) -> Array:
+    def generators(start: Array, length: Array, held: Array) -> Array:
         """The matrices A of y' = A y at the Gauss points of a segment's steps."""
-        tau = start + step * (jnp.arange(_SEGMENT)[:, None] + _GAUSS).reshape(-1)
-        k, c = _tangents(model, friction, coefficients, frequency, friction.begin + tau[:, None])
+        tau = start[:, None] + length[:, None] * _GAUSS[:, None]
+        tau = friction.begin + tau.reshape(-1, n_points)
+        k, c = _tangents(model, friction, coefficients, frequency, tau)
         a = jnp.zeros((len(tau), n_points, size, size))
         if n_places:
             loose = jnp.where(held, 0.0, friction.stiffness) @ of_place
@@ -169,8 +173,10 @@ def _by_magnus(
     def segment(number: Array, state: tuple) -> tuple:
         index = (number * _SEGMENT + jnp.arange(_SEGMENT)) * n_dragged
         held = ~friction.dragged[index // (n_segments * _SEGMENT)]
-        start = number * _SEGMENT * step
-        propagators = _magnus(generators(start, held), step)
+        ends = _step_ends(number * _SEGMENT + jnp.arange(_SEGMENT + 1), step, contacts)
+        length = ends[1:] - ends[:-1]
+        per_step = generators(ends[:-1], length, held)
+        propagators = _magnus(per_step, length[..., None, None])
 
         def advance(state: tuple, item: tuple) -> tuple[tuple, None]:
             y, z = state
@@ -200,6 +206,39 @@ def _by_magnus(
     y, z = jax.lax.fori_loop(0, n_segments, segment, (y, z))
     whole = jnp.concatenate([y, jnp.where(slips, z, 0.0)[:, free]], axis=1)
     return jnp.where(n_segments > 0, whole, jnp.nan)
+
+
+def _contacts(
+    model: Structure, coefficients: Array, frequency: Array, begin: Array
+) -> Float[Array, "contact point"]:
+    """Phases behind `begin` at which contacts open and close; infinite where there are fewer."""
+    tau = 2 * jnp.pi * jnp.arange(_CONTACT_SAMPLES) / _CONTACT_SAMPLES
+    phases = begin + tau[:, None]
+    q, _ = _states_at(coefficients, frequency, phases)
+    found = [jnp.zeros((0, len(frequency)))]
+    for effect in model.memoryless:
+        if isinstance(effect, AbstractKinked):
+            x = elements_of([effect], model.modes).displacement(q)[..., 0]
+            for place in effect.kinks().displacement:
+                there = jax.vmap(crossings, (1, None), 1)(x, place)
+                phase = (there.interval + there.share) * tau[1]
+                found.append(jnp.where(there.passes, phase, jnp.inf))
+    return jnp.concatenate(found)
+
+
+def _step_ends(number: Array, step: Array, contacts: Array) -> Float[Array, "end point"]:
+    """Phases at the ends of steps: equally spaced, the nearest to each contact moved onto it.
+
+    No step then holds a jump of the stiffness but one of two contacts closer than half a step.
+    """
+    even = number * step
+    if not len(contacts):
+        return jnp.broadcast_to(even[:, None], (len(number), contacts.shape[1]))
+    near = jnp.round(contacts / step) == number[:, None, None]
+    inner = (number > 0) & (even < 2 * jnp.pi - 0.5 * step)
+    chosen = jnp.take_along_axis(contacts[None], jnp.argmax(near, axis=1)[:, None], axis=1)[:, 0]
+    moved = jnp.any(near, axis=1) & inner[:, None]
+    return jnp.where(moved, chosen, even[:, None])
 
 
 def _magnus(
