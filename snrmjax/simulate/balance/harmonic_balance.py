@@ -112,17 +112,13 @@ class HarmonicBalance(eqx.Module):
         residual = balance.reshape(-1) - self.force * self.load()
         if not with_jacobian:
             return residual, jnp.zeros((0,))
-        tangent = model.pointwise.tangent_stiffness(samples, rate).reshape(self.n_samples, n * n)
-        blocks = tangent_blocks(basis, tangent / fs**2).reshape(size, size, n, n)
-        blocks = blocks.transpose(0, 2, 1, 3)
-        eye = jnp.eye(size)[:, None, :]
-        linear = (
-            eye * stiffness[:, None]
-            - omega**2 * eye * inertia[:, :, None]
-            + omega * jnp.asarray(basis.derivative)[:, None, :] * damping[:, None]
-        )
+        tangent = model.pointwise.tangent_stiffness(samples, rate) / fs**2 + jnp.diag(stiffness)
         # Adding zeros beside the diagonal is faster than writing to its entries one by one.
-        blocks = blocks + linear[..., None] * np.eye(n)[:, None]
+        of_inertia, of_damping = np.diag(h2[:, 0])[..., None, None], basis.derivative[..., None, None]
+        blocks = tangent_blocks(basis, tangent)
+        blocks = blocks - of_inertia * (omega**2 * jnp.diag(terms.mass))
+        blocks = blocks + of_damping * (omega * jnp.diag(damping))
+        blocks = blocks.transpose(0, 2, 1, 3)
         column = damping * slope - 2 * omega * inertia * x
         if model.effects:
             added, by_rate = self._effects(samples, rate, by_omega, omega)
@@ -130,7 +126,7 @@ class HarmonicBalance(eqx.Module):
             blocks = blocks.at[:, j, :, j].add(added)
             column = column.at[:, j].add(by_rate)
         by_x = blocks.reshape(size * n, size * n)
-        return residual, jnp.concatenate([by_x, column.reshape(-1, 1)], axis=1)
+        return residual, jnp.concatenate([by_x.T, column.reshape(1, -1)]).T
 
     def _effects(
         self, samples: Array, rate: Array, by_omega: Array, omega: Array
