@@ -114,7 +114,10 @@ class HarmonicBalance(eqx.Module):
             return residual, jnp.zeros((0,))
         tangent = model.pointwise.tangent_stiffness(samples, rate) / fs**2 + jnp.diag(stiffness)
         # Adding zeros beside the diagonal is faster than writing to its entries one by one.
-        of_inertia, of_damping = np.diag(h2[:, 0])[..., None, None], basis.derivative[..., None, None]
+        of_inertia, of_damping = (
+            np.diag(h2[:, 0])[..., None, None],
+            basis.derivative[..., None, None],
+        )
         blocks = tangent_blocks(basis, tangent)
         blocks = blocks - of_inertia * (omega**2 * jnp.diag(terms.mass))
         blocks = blocks + of_damping * (omega * jnp.diag(damping))
