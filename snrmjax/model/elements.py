@@ -62,7 +62,7 @@ class Elements(NamedTuple):
         """The matrices over the modes that belong to slopes at the places."""
         if self.own is not None:
             return slopes[..., None] * np.outer(self.rows[0], self.rows[0])
-        return jnp.swapaxes(slopes[..., None] * self.rows, -1, -2) @ self.rows
+        return jnp.tensordot(slopes, self.rows[:, :, None] * self.rows[:, None], axes=1)
 
     def applied(
         self, of: OfForce, x: Float[Array, "time place"], v: Float[Array, "time place"]

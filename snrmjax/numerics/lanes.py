@@ -3,6 +3,7 @@
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from typing import Any, TypeAlias
 
 import jax
@@ -10,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int
 
-from snrmjax.numerics.blocks import as_arrays, cores, on_accelerator, over_cores, taken
+from snrmjax.numerics.blocks import cores, on_accelerator, over_cores, taken
 
 TOGETHER = 64  # iterations of several lanes, at most, before the host sees them
 Jobs: TypeAlias = Any  # trees of arrays with a leading axis
@@ -61,7 +62,7 @@ def in_lanes(
             if not busy.any():
                 return
             if fresh.any():
-                mine = as_arrays(taken(jobs, member))
+                mine = taken(jobs, member)
                 states = _joined(fresh, begun(mine, busy), states)
             states, rows = advanced(mine, states, lanes // 8 if queue else 0)
             kept, *parts = (np.asarray(part) for part in rows)
@@ -123,7 +124,8 @@ def iterated(
         # A lane alone that has ended ends the loop.
         states = new if alone else jax.tree.map(unless_ended, new, states)
         row = (kept & going, *given)
-        return k + 1, states, tuple(a.at[k].set(b) for a, b in zip(rows, row, strict=True))
+        put = partial(jax.lax.dynamic_update_index_in_dim, index=k, axis=0)
+        return k + 1, states, tuple(map(put, rows, row))
 
     shapes = jax.eval_shape(stepped, states)[1]
     rows = tuple(jnp.zeros((length, *part.shape), part.dtype) for part in shapes)

@@ -105,7 +105,7 @@ class HarmonicBalance(eqx.Module):
         n, size = model.n_modes, self.n_coefficients
         basis = harmonic_basis(self.harmonic_order, self.n_samples, cosine_only=self.cosine_only)
         terms = model.linear_terms()
-        stiffness, damping = terms.stiffness / fs**2, terms.damping / fs
+        stiffness = terms.stiffness / fs**2
         h2 = squared_orders(self.harmonic_order, cosine_only=self.cosine_only)[:, None]
         inertia = h2 * terms.mass
         x, omega = point[:-1].reshape(size, n), point[-1]
@@ -120,35 +120,31 @@ class HarmonicBalance(eqx.Module):
         residual = balance.reshape(-1) - self.force * self.load()
         if not with_jacobian:
             return residual, jnp.zeros((0,))
-        eye = jnp.eye(size)[:, None, :]
-        linear = (
-            eye * stiffness[:, None]
-            - omega**2 * eye * inertia[:, :, None]
-            + omega * jnp.asarray(basis.derivative)[:, None, :] * damping[:, None]
-        )
         # Adding zeros beside the diagonal is faster than writing to its entries one by one.
-        blocks = linear[..., None] * np.eye(n)[:, None]
+        of_inertia = np.diag(h2[:, 0])[..., None, None]
+        of_damping = basis.derivative[..., None, None]
         if model.potential.monomials:
-            tangent = model.potential.stiffness(samples).reshape(self.n_samples, n * n)
-            nonlinear = tangent_blocks(basis, tangent / fs**2).reshape(size, size, n, n)
-            blocks = blocks + nonlinear.transpose(0, 2, 1, 3)
-        if terms.coupling is not None:
-            by_rate = jnp.asarray(basis.derivative)[:, None, :, None]
-            blocks = blocks + omega / fs * by_rate * terms.coupling[None, :, None, :]
+            tangent = model.potential.stiffness(samples) / fs**2 + jnp.diag(stiffness)
+            blocks = tangent_blocks(basis, tangent)
+        else:
+            blocks = jnp.eye(size)[..., None, None] * jnp.diag(stiffness)
+        blocks = blocks - of_inertia * (omega**2 * jnp.diag(terms.mass))
+        blocks = blocks + of_damping * (omega * terms.damping_matrix() / fs)
         column = damped - 2 * omega * inertia * x
         if model.forces:
             added, by_omega = self._elements(samples, by_omega, omega)
             blocks, column = blocks + added, column + by_omega
+        blocks = blocks.transpose(0, 2, 1, 3)
         by_x = blocks.reshape(size * n, size * n)
-        return residual, jnp.concatenate([by_x, column.reshape(-1, 1)], axis=1)
+        return residual, jnp.concatenate([by_x.T, column.reshape(1, -1)]).T
 
     def _elements(
         self, samples: Array, by_omega: Array, omega: Array
-    ) -> tuple[Float[Array, "coefficient mode coefficient mode"], Float[Array, "coefficient mode"]]:
+    ) -> tuple[Float[Array, "coefficient coefficient mode mode"], Float[Array, "coefficient mode"]]:
         """What forces of effects add to the blocks and to the column of λ."""
         model, fs = self.model, self.frequency_scale
         basis = harmonic_basis(self.harmonic_order, self.n_samples, cosine_only=self.cosine_only)
-        size, unit = self.n_coefficients, fs**2 * self.displacement_scale
+        unit = fs**2 * self.displacement_scale
         elements = elements_of(model.forces, model.modes)
         x, v_omega = elements.displacement(samples), elements.displacement(by_omega)
         v = omega * v_omega
@@ -171,13 +167,7 @@ class HarmonicBalance(eqx.Module):
             by_shape = jax.vmap(along)(shapes[..., None] * every, rates[..., None] * every)
             block = block + jnp.einsum("ct,dtp->cdp", basis.analysis, by_shape)
             change = change + along(jnp.zeros_like(x), v_omega)
-        by_frequency = elements.on_modes(jnp.asarray(basis.analysis) @ change)
-        added = elements.matrix(block.reshape(size * size, -1)).reshape(size, size, *self._square)
-        return added.transpose(0, 2, 1, 3), by_frequency
-
-    @property
-    def _square(self) -> tuple[int, int]:
-        return self.model.n_modes, self.model.n_modes
+        return elements.matrix(block), elements.on_modes(jnp.asarray(basis.analysis) @ change)
 
 
 def harmonic_balance(

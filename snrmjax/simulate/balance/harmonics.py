@@ -19,8 +19,8 @@ class HarmonicBasis(NamedTuple):
     analysis: np.ndarray  # (coefficient, time): its left inverse
     derivative: np.ndarray  # (coefficient, coefficient): d/dτ
     spectrum: np.ndarray  # (order, time): cosine sums of orders 0…2H, then their sine sums
-    row: np.ndarray  # (2, coefficient · coefficient): rows of `spectrum` in each product
-    sign: np.ndarray  # (2, coefficient · coefficient): their factors
+    row: np.ndarray  # (2, coefficient, coefficient): rows of `spectrum` in each product
+    sign: np.ndarray  # (2, coefficient, coefficient): their factors
 
 
 @lru_cache(maxsize=64)
@@ -72,23 +72,25 @@ def _product_to_sum(harmonic_order: int, cosine_only: bool) -> tuple[np.ndarray,
     first = np.where(mixed, np.where(left, 1, -1) * np.sign(difference), 1.0)
     second = np.where(left & right, -1.0, 1.0)
     half = np.where(order[:, None] == 0, 0.25, 0.5)
-    row = np.stack([np.abs(difference) + offset, total + offset]).reshape(2, -1)
-    return row, np.stack([half * first, half * second]).reshape(2, -1)
+    row = np.stack([np.abs(difference) + offset, total + offset])
+    return row, np.stack([half * first, half * second])
 
 
 def tangent_blocks(
-    basis: HarmonicBasis, samples: Float[Array, "time entry"]
-) -> Float[Array, "coefficient coefficient entry"]:
+    basis: HarmonicBasis, samples: Float[Array, "time *entry"]
+) -> Float[Array, "coefficient coefficient *entry"]:
     """∂(coefficients of k·q)/∂(coefficients of q) for every entry k of `samples` over a period.
 
     The products of two basis functions are sums of harmonics up to 2H, so 2(2H + 1) Fourier
     sums hold all of the blocks.
     """
-    sums = jnp.asarray(basis.spectrum) @ samples
-    size = basis.synthesis.shape[1]
-    sign = jnp.asarray(basis.sign)[:, :, None]
-    blocks = sign[0] * sums[basis.row[0]] + sign[1] * sums[basis.row[1]]
-    return blocks.reshape(size, size, -1)
+    sums = jnp.tensordot(basis.spectrum, samples, axes=1)
+    shape = (*basis.row.shape, *(1,) * (samples.ndim - 1))
+    first, second = (
+        sign * sums[row]
+        for row, sign in zip(basis.row, jnp.asarray(basis.sign).reshape(shape), strict=True)
+    )
+    return first + second
 
 
 def squared_orders(harmonic_order: int, *, cosine_only: bool = False) -> np.ndarray:

@@ -141,13 +141,11 @@ class Tracing(NamedTuple):
     """A curve that is being traced: where it is, where it came from, and the trial under way."""
 
     here: Point
-    tangent: Point
+    tangent: Point  # at first which way to go
     back: Point
     back_tangent: Point
     origin: Point
     origin_tangent: Point
-    pending: Point  # a guess of the curve's last point, where it left the range
-    ahead: Point  # which way to go at first
     trial: Trial
     n_points: Int[Array, ""]
     step: Float[Array, ""]
@@ -182,7 +180,7 @@ class CurveTracer(eqx.Module):
         """Before the first point: `start` is a guess of it, corrected at its own λ or `across`."""
         unset = jnp.array(0)
         return Tracing(
-            *(start, direction, start, direction, start, direction, start, direction),
+            *(start, direction, start, direction, start, direction),
             trial=Trial.at(start, _at_lambda(start) if across is None else across),
             n_points=unset,
             step=jnp.minimum(jnp.asarray(self.control.first), self.control.largest),
@@ -218,8 +216,7 @@ class CurveTracer(eqx.Module):
         control, trial, (lower, upper, _) = self.control, walk.trial, self.within
         here, tangent, new = walk.here, walk.tangent, trial.point
         is_first, is_end = walk.aim == _FIRST, walk.aim == _TO_END
-        ahead = jnp.where(is_first, walk.ahead, tangent)
-        new_tangent = trial.tangent * jnp.where(trial.tangent @ ahead < 0, -1.0, 1.0)
+        new_tangent = trial.tangent * jnp.where(trial.tangent @ tangent < 0, -1.0, 1.0)
         turn = jnp.arccos(jnp.clip(new_tangent @ tangent, -1.0, 1.0))
         near = control.is_near(walk.step, jnp.linalg.norm(new - trial.start), turn)
         near &= _steady(here, new, self.groups, control)
@@ -230,13 +227,16 @@ class CurveTracer(eqx.Module):
         end = jnp.where(new[-1] > upper, upper, lower)
         share = (end - here[-1]) / (new[-1] - here[-1])
         to_end = (here + share * (new - here)).at[-1].set(end)
-        pending = jnp.where(leaving, to_end, walk.pending)
 
         closed = jnp.array(False)
         if self.may_close:
             passed = _passes(walk, new, new_tangent, control.closing)
             closed = good & (walk.n_points > 4) & passed
             new = jnp.where(closed, walk.origin, new)
+            walk = walk._replace(
+                origin=jnp.where(is_first, new, walk.origin),
+                origin_tangent=jnp.where(is_first, new_tangent, walk.origin_tangent),
+            )
         kept = good & ~leaving
         n_points = walk.n_points + kept
         longer = jnp.minimum(
@@ -251,16 +251,13 @@ class CurveTracer(eqx.Module):
             tangent=jnp.where(kept, new_tangent, tangent),
             back=jnp.where(kept, here, walk.back),
             back_tangent=jnp.where(kept, tangent, walk.back_tangent),
-            origin=jnp.where(is_first, new, walk.origin),
-            origin_tangent=jnp.where(is_first, new_tangent, walk.origin_tangent),
-            pending=pending,
             n_points=n_points,
             step=step,
             aim=jnp.where(leaving, _TO_END, _ORDINARY),
             status=status,
             n_solves=walk.n_solves + trial.n_solves,
         )
-        guess = jnp.where(leaving, pending, _extrapolated(onward))
+        guess = jnp.where(leaving, to_end, _extrapolated(onward))
         across = jnp.where(leaving, _at_lambda(guess), onward.tangent)
         return onward._replace(trial=Trial.at(guess, across)), kept
 

@@ -192,4 +192,4 @@ def _advanced(
 
 
 _advanced_alone = compiled(_advanced)
-_advanced_together = compiled(_advanced, long_loops=True)
+_advanced_together = compiled(_advanced, thoroughly=True)

@@ -18,11 +18,11 @@ _CLOSE = 1e-10  # of the way between the neighbours: the next trial would be as 
 class EventSearch(eqx.Module):
     """The search between two neighbours of a curve for where `test(point, tangent)` changes sign.
 
-    Illinois' variant of the secant method in the arclength, each trial corrected across the
-    tangent at the first neighbour, `here`. The event is resolved when the sign change lies between
-    the neighbours, or beside them by less than the tangents of a curve are late; where the
-    corrected neighbours have one sign there is nothing to find.
-    Reference: Dowell & Jarratt, BIT 11 (1971) 168, doi:10.1007/BF01934364.
+    Anderson and Björck's variant of the secant method in the arclength, each trial corrected
+    across the tangent at the first neighbour, `here`. The event is resolved when the sign change
+    lies between the neighbours, or beside them by less than the tangents of a curve are late;
+    where the corrected neighbours have one sign there is nothing to find.
+    Reference: Anderson & Björck, BIT 13 (1973) 253, doi:10.1007/BF01951936.
     """
 
     linearised: Linearised
@@ -83,10 +83,14 @@ class EventSearch(eqx.Module):
         inner = ~is_low & ~is_high
         in_upper = inner & (jnp.sign(found.value) == jnp.sign(low.value))
         in_lower = inner & ~in_upper
-        halved = jnp.where(in_lower & (side == -1), 0.5, 1.0)
-        low = low._replace(value=low.value * halved)
-        halved = jnp.where(in_upper & (side == 1), 0.5, 1.0)
-        high = high._replace(value=high.value * halved)
+        # An end that stays counts less: by the share of its value that the other one lost.
+        left = [1 - value / end.value for end in (low, high)]
+        left_low, left_high = (jnp.where(part > 0, part, 0.5) for part in left)
+        stays_low, stays_high = in_lower & (side == -1), in_upper & (side == 1)
+        low, high = (
+            low._replace(value=low.value * jnp.where(stays_low, left_high, 1.0)),
+            high._replace(value=high.value * jnp.where(stays_high, left_low, 1.0)),
+        )
         low = chosen(in_upper | is_low, found, low)
         high = chosen(in_lower | is_high, found, high)
         differ = low.value * high.value <= 0
@@ -114,7 +118,7 @@ class _Known(NamedTuple):
     """What a trial between two neighbours found."""
 
     share: Array  # of the way
-    value: Array  # of the test function, halved where the other end keeps moving
+    value: Array  # of the test function, less where the other end keeps moving
     point: Array
     tangent: Array  # of unit length
     slope: Array  # dpoint/dshare

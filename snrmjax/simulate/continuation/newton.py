@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from snrmjax.numerics.blocks import on_accelerator
+from snrmjax.numerics.blocks import mapped
 
 T = TypeVar("T")
 Point = Float[Array, " unknown"]
@@ -18,27 +18,25 @@ Linearised = Callable[[Point], tuple[Float[Array, " equation"], Float[Array, "eq
 
 @jax.custom_batching.custom_vmap
 def solved_behind(
-    matrix: Float[Array, "equation column"],
-) -> Float[Array, "equation right"]:
-    """The solutions for the right-hand sides that stand behind a square matrix."""
-    size = matrix.shape[0]
+    columns: Float[Array, "column equation"],
+) -> Float[Array, "right equation"]:
+    """The solutions for the right-hand sides that stand behind the columns of a square matrix."""
+    size = columns.shape[1]
     # The columns behind the square part come out multiplied by the inverse of L.
-    factors = jax.lax.linalg.lu(matrix)[0]
+    factors = jax.lax.linalg.lu(columns.T)[0]
     return jax.lax.linalg.triangular_solve(
         factors[:, :size], factors[:, size:], left_side=True, lower=False
-    )
+    ).T
 
 
 @solved_behind.def_vmap
-def _solved_side_by_side(count: int, batched: list[bool], matrices: Array) -> tuple[Array, bool]:
+def _solved_side_by_side(count: int, batched: list[bool], columns: Array) -> tuple[Array, bool]:
     """One after the other on a CPU.
 
     A factorisation of many matrices at once spreads over the threads of a pool and waits for them:
     called from as many threads itself, it waits for ever (jaxlib 0.10).
     """
-    if on_accelerator():
-        return jax.vmap(solved_behind.fun)(matrices), True
-    return jnp.stack([solved_behind(matrices[k]) for k in range(count)]), True
+    return mapped(solved_behind.fun, columns), True
 
 
 class Trial(NamedTuple):
@@ -71,13 +69,11 @@ class Trial(NamedTuple):
         """
         size = self.start.shape[0]
         residual, jacobian = linearised(self.point)
-        right = jnp.stack([residual, jnp.zeros(size - 1)], axis=1)
         ahead = self.across @ (self.point - self.start)
         border = jnp.concatenate([self.across, jnp.stack([ahead, 1.0])])
-        matrix = jnp.concatenate([jnp.concatenate([jacobian, right], axis=1), border[None]])
-        solved = solved_behind(matrix)
-        new, tangent = self.point - solved[:, 0], solved[:, 1]
-        step = jnp.max(jnp.abs(solved[:, 0]))
+        columns = jnp.concatenate([jacobian.T, residual[None], jnp.zeros((1, size - 1))])
+        change, tangent = solved_behind(jnp.concatenate([columns, border[:, None]], axis=1))
+        new, step = self.point - change, jnp.max(jnp.abs(change))
         left = jnp.max(jnp.abs(linearised(new)[0])) / jnp.max(jnp.abs(residual))
         done = (step <= tolerance) | ((step * left <= tolerance) & (step < 0.1))
         return self._replace(
