@@ -1,7 +1,7 @@
 from .averaging import averaged_effect
 from .builders.arches import ArchSettings, shallow_arch
 from .builders.beams import CURVED_BEAM_FORCES, FLAT_BEAM_FORCES, curved_beam, flat_beam
-from .builders.matrices import Matrices, chain, from_matrices
+from .builders.matrices import Matrices, beam, chain, from_matrices
 from .effect_base import (
     AbstractForce,
     AbstractHysteresis,
@@ -66,6 +66,7 @@ __all__ = [
     "Structure",
     "Symmetry",
     "averaged_effect",
+    "beam",
     "between",
     "chain",
     "curved_beam",

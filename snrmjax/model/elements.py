@@ -75,11 +75,9 @@ class Elements(NamedTuple):
                 values = of(force, x[:, places[0]], v[:, places[0]])[:, None]
             else:
                 values = jax.vmap(of, (0, 1, 1), 1)(force, x[:, index], v[:, index])
-            total = total + (values if self.n_places == 1 else values @ self._spread(index))
+            one_each = self.n_places == 1 or np.array_equal(index, np.arange(self.n_places))
+            total = total + (values if one_each else values @ np.eye(self.n_places)[index])
         return total
-
-    def _spread(self, index: np.ndarray) -> np.ndarray:
-        return np.eye(self.n_places)[index]
 
     def cycle_force(
         self, x: Float[Array, "time place"], v: Float[Array, "time place"]

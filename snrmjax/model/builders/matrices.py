@@ -15,7 +15,7 @@ from snrmjax.model.modes import Beside, RigidBodyModes, linear_modes
 from snrmjax.model.places import Row, row_over_points
 from snrmjax.model.structures import Structure, structure
 from snrmjax.numerics.names import suggestion
-from snrmjax.numerics.rules import require
+from snrmjax.numerics.rules import POSITIVE, require
 
 _SYMMETRIC = 1e-8  # of the largest entry: what a finite-element program's output may miss by
 _RIGID = 1e-9  # of the largest: natural frequencies squared below are of rigid-body motions
@@ -45,6 +45,7 @@ def from_matrices(
     force: str | Mapping[str, Phasor],
     effects: AbstractEffect | Iterable[AbstractEffect] = (),
     n_modes: int | None = None,
+    residuals: bool = True,
     mode_of_interest: int = 0,
     sensors: Sequence[str] | None = None,
     name: str = "structure",
@@ -58,7 +59,8 @@ def from_matrices(
     `effects` act at points by their `at`, in N and m; the matrices hold no part of them.
     `n_modes` keeps so many modes of lowest frequency, and for every place of an effect and for
     the force one vector more: what the left out modes give way there statically, exactly, as
-    further modes of high frequency. `sensors` are the points that are watched, by default all.
+    further modes of high frequency; without `residuals` it does not, as many places want it.
+    `sensors` are the points that are watched, by default all.
     Damping that couples modes is kept. Modes without stiffness become rigid-body modes.
 
     Returns a `Structure`. What `n_modes` leaves out is the dynamics of higher modes: a share of
@@ -85,7 +87,7 @@ def from_matrices(
     rows = [_column(names, row, "an effect") for row in places]
     load = _column(names, force, "`force`")
     squared, shapes, rigid = _modes(m, k, n_modes)
-    if n_modes is not None:
+    if n_modes is not None and residuals:
         parts = [*rows, load.real, *([load.imag] if np.any(load.imag) else [])]
         squared, shapes = _with_residuals(k, m, squared, shapes, rigid, parts)
     if not squared.size or not np.any(load @ shapes):
@@ -271,3 +273,60 @@ def chain(
         parts.append(np.diag(row[:-1] + row[1:]) - np.diag(row[1:-1], 1) - np.diag(row[1:-1], -1))
     names = tuple(f"x{i + 1}" for i in range(size))
     return Matrices(np.diag(weights), parts[1], parts[0], names)
+
+
+def beam(
+    bending_stiffness: float,
+    mass_per_length: float,
+    length: float,
+    n_elements: int,
+    *,
+    supports: tuple[str, str] = ("clamped", "free"),
+    springs: Mapping[str, float] | None = None,
+    stiffness_damping: float = 0.0,
+    mass_damping: float = 0.0,
+) -> Matrices:
+    """A straight beam in bending by Euler and Bernoulli's elements, with consistent masses.
+
+    The points are the deflections "w0", "w1", …, "w`n_elements`" (m) and the slopes "r0", "r1", …
+    (rad) of the nodes, but for those that `supports` hold: "clamped", "pinned" or "free" at either
+    end. `springs` (N/m) stand at points, linear; the damping is `mass_damping` (1/s) times the mass
+    and `stiffness_damping` (s) times the stiffness of the beam without springs.
+    Arguments: `bending_stiffness` E I in N m², `mass_per_length` ρ A in kg/m, `length` in m.
+    Raises `ValueError` for numbers that cannot be and unknown supports.
+
+    >>> model = from_matrices(*beam(174.3, 0.78, 0.5, 20), force="w20")
+    >>> round(float(model.modes.natural_frequency[0]), 2)  # 1.8751²/l² √(E I/ρ A)
+    210.24
+    """
+    for name, value in (
+        *(("bending_stiffness", bending_stiffness), ("mass_per_length", mass_per_length)),
+        *(("length", length), ("n_elements", n_elements)),
+    ):
+        require(f"`{name}`", value, POSITIVE)
+    h = length / n_elements
+    bending = np.array([[12, 6 * h, -12, 6 * h], [0, 4 * h**2, -6 * h, 2 * h**2]])
+    bending = np.vstack([bending, [[0, 0, 12, -6 * h], [0, 0, 0, 4 * h**2]]])
+    inertia = np.array([[156, 22 * h, 54, -13 * h], [0, 4 * h**2, 13 * h, -3 * h**2]])
+    inertia = np.vstack([inertia, [[0, 0, 156, -22 * h], [0, 0, 0, 4 * h**2]]])
+    size = 2 * n_elements + 2
+    mass, stiffness = np.zeros((size, size)), np.zeros((size, size))
+    for k in range(n_elements):
+        here = slice(2 * k, 2 * k + 4)
+        mass[here, here] += mass_per_length * h / 420 * inertia
+        stiffness[here, here] += bending_stiffness / h**3 * bending
+    mass, stiffness = (np.triu(part) + np.triu(part, 1).T for part in (mass, stiffness))
+    names = [f"{kind}{k}" for k in range(n_elements + 1) for kind in "wr"]
+    held = {"clamped": 2, "pinned": 1, "free": 0}
+    for end in supports:
+        if end not in held:
+            raise ValueError(f"`supports` must be clamped, pinned or free, but has {end!r}.")
+    gone = [*range(held[supports[0]]), *(size - 2 + k for k in range(held[supports[1]]))]
+    keep = np.setdiff1d(np.arange(size), gone)
+    mass, stiffness = mass[np.ix_(keep, keep)], stiffness[np.ix_(keep, keep)]
+    points = tuple(names[k] for k in keep)
+    damping = mass_damping * mass + stiffness_damping * stiffness
+    for point, value in (springs or {}).items():
+        place = _place(points, point, "`springs`")
+        stiffness[place, place] += value
+    return Matrices(mass, damping, stiffness, points)
