@@ -70,9 +70,22 @@ def read_model(path: FilePath) -> Structure:
     Files are in Hz and degrees and count modes from one; the result is in rad/s and rad and
     counts from zero. The sensors are those of the modes' shapes, in the first mode's order; a
     model without a name takes the file's. A mode may state the 1σ of its linear test:
-    `frequency_std_hz`, `damping_ratio_std` and, relative, `modal_mass_std`. In place of modes a
-    file may have matrices under [structure], with [force] and [sensors]: see `from_matrices`.
-    Effects act on the mode of interest, or at points by `at` or `between`, in N and m.
+    `frequency_std_hz`, `damping_ratio_std` and, relative, `modal_mass_std`. Effects act on the mode
+    of interest, or at points by `at` or `between`, in N and m. In place of modes a file may have
+    matrices (see `from_matrices`; or `file`, an NPZ or MAT file with such arrays):
+
+        [structure]
+        points = ["a", "b"]
+        mass = [[1.0, 0.0], [0.0, 1.0]]            # kg
+        stiffness = [[2.0, -1.0], [-1.0, 2.0]]     # N/m
+        damping_ratio = 0.01                       # or damping, a matrix in N s/m
+        [force]
+        at = { a = 1.0 }                           # newtons per newton of the recorded force
+        [[effect]]
+        kind = "one_sided_stop"
+        between = ["b", "a"]                       # acts on x_b − x_a
+        stiffness = 100.0
+        gap = 0.01
 
     Returns the structure. Raises `ValueError` that names file, table, key, value and what was
     expected; a near miss is suggested for an unknown name.
