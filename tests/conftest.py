@@ -40,8 +40,8 @@ def _knows_quick() -> bool:
 
 
 # Before JAX is imported, which a folder's own conftest does, and before workers, which inherit the
-# environment, are started. Compiling is most of the time: no program of a test runs long enough to
-# be worth optimising.
+# environment, are started. Compiling is most of the time: hardly a program of a test runs long
+# enough to be worth optimising.
 os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # further threads wait for work at full speed
 if "XLA_FLAGS" not in os.environ:
@@ -86,6 +86,18 @@ def no_kept_programs():
     from snrmjax.numerics.kept_programs import keep_no_programs
 
     keep_no_programs()
+
+
+@pytest.fixture(scope="module")
+def optimised():
+    """Programs as users have them, for tests of which they run longer than they take to compile."""
+    import jax
+
+    name = "jax_disable_most_optimizations"
+    before = jax.config.values[name]
+    jax.config.update(name, False)
+    yield
+    jax.config.update(name, before)
 
 
 @pytest.fixture(autouse=True, scope="module")
