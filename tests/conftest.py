@@ -17,7 +17,7 @@ _LEAST_TIME = "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"
 _ROOM = 3 * 2**30  # bytes of a worker, beyond which it forgets its programs
 _QUICK = " ".join(
     (
-        # Half of the time, and by one thread: each worker has one core.
+        # Two thirds of the time, and by one thread: each worker has one core.
         "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1",
         # Another fifth: loops within loops are copied for every look into how often they turn and
         # what does not change in them, and what is known of memory is for optimisations alone.
