@@ -94,7 +94,7 @@ def compiled(
         traced = any(isinstance(a, jax.core.Tracer) for a in arrays)
         if traced:
             return inside(structure, fixed, arrays)
-        hurried = jax.config.values["jax_disable_most_optimizations"]
+        hurried = jax.config.read("jax_disable_most_optimizations")
         keeper = program_keeper()
         if keeper is not None:
             shapes = tuple((a.shape, a.dtype, getattr(a, "weak_type", False)) for a in arrays)
