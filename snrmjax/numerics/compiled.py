@@ -35,9 +35,8 @@ def compiled(
     Arrays and floating-point numbers anywhere in the arguments, NumPy's too, are arguments of the
     program, so that other values do not compile anew; everything else (whole numbers, truth
     values, text, None) is compiled into it. All results are arrays. Inside another program that
-    one's order of steps rules. Programs of `long_loops` over many points at once take half as long
-    again to compile and run 1.5 times faster; `thoroughly`, the walks of several curves take twice
-    as long and run a tenth faster, but those of many points no longer so fast.
+    one's order of steps rules. `long_loops` over many points at once take half as long again to
+    compile and run 1.5 times faster; walks of many curves `thoroughly` twice, and a tenth faster.
     """
 
     def run(structure: Any, fixed: tuple, arrays: list) -> R:

@@ -17,7 +17,7 @@ from snrmjax.numerics.blocks import cores, on_accelerator, over_cores, taken
 TOGETHER = 64  # iterations of several lanes, at most, before the host sees them
 Jobs: TypeAlias = Any  # trees of arrays with a leading axis
 States: TypeAlias = Any
-Rows: TypeAlias = Float[Array | np.ndarray, "lane number"]
+StateRows: TypeAlias = Float[Array, "lane number"]
 
 
 def lanes_for(unknowns: int) -> int:
@@ -32,14 +32,14 @@ def lanes_for(unknowns: int) -> int:
 
 
 def in_lanes(
-    begun: Callable[[Jobs, Bool[np.ndarray, " lane"]], Rows],
-    advanced: Callable[[Jobs, Rows, int], tuple[Rows, tuple, tuple]],
+    begun: Callable[[Jobs, Bool[np.ndarray, " lane"]], StateRows],
+    advanced: Callable[[Jobs, StateRows, int], tuple[StateRows, tuple, tuple]],
     jobs: Jobs,
     lanes: int,
 ) -> tuple[tuple[np.ndarray, ...], list[tuple[np.ndarray, ...]]]:
     """All jobs to their ends, `lanes` at a time on every core.
 
-    Arguments: `begun` gives the packed states of `lanes` jobs, those of lanes not wanted being at
+    Arguments: `begun` gives the states of `lanes` jobs in rows, those of lanes not wanted being at
     their end; `advanced` is what `iterated` gives of them, with as many lanes as may be idle.
     What a job gives does not depend on its lane, nor on its neighbours.
     Returns the results, of shape (job, …), and the rows that every job gave on the way.
@@ -51,7 +51,7 @@ def in_lanes(
 
     def worked(_: int) -> None:
         member, busy = np.zeros(lanes, dtype=int), np.zeros(lanes, dtype=bool)
-        states: Rows | None = None
+        states: Any = None
         while True:
             fresh = np.zeros(lanes, dtype=bool)
             for lane in np.flatnonzero(~busy)[: len(queue)].tolist():
@@ -81,7 +81,7 @@ def in_lanes(
     return results, [tuple(map(np.concatenate, zip(*rows, strict=True))) for rows in given]
 
 
-def packed(states: States) -> Rows:
+def in_rows(states: States) -> StateRows:
     """The states of several lanes, each in a row: one array is handed over faster than many."""
     return jax.vmap(lambda state: ravel_pytree(state)[0])(states)
 
@@ -91,22 +91,19 @@ def iterated(
     step: Callable[[Any, Any], tuple[Any, tuple]],
     result: Callable[[Any], tuple],
     jobs: Jobs,
-    states: Rows,
+    states: StateRows,
     length: int,
     idle: Int[Array, ""],
-) -> tuple[Rows, tuple, tuple]:
+) -> tuple[StateRows, tuple, tuple]:
     """Iterations of all lanes in one program: `length`, or until `idle` of them or fewer go on.
 
     Arguments: of one lane, `begun(job)` is the state at first; `step(job, state)` gives the next
     state and a row, the first part of which says whether it is kept; `result(state)` says whether
-    it goes on, and what is wanted of it at its end. `states` are packed.
-    Returns the packed states, the rows, of shape (iteration, lane, …), and the results.
+    it goes on, and what is wanted of it at its end. `states` are in rows.
+    Returns the states, the rows given, of shape (iteration, lane, …), and the results.
     """
     first = jax.eval_shape(begun, jax.tree.map(lambda a: a[0], jobs))
     whole = ravel_pytree(jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), first))[1]
-
-    def running(states: States) -> Array:
-        return jax.vmap(result)(states)[0]
 
     alone, states = len(states) == 1, jax.vmap(whole)(states)
 
@@ -118,7 +115,7 @@ def iterated(
 
     def body(loop: tuple) -> tuple:
         k, states, rows = loop
-        going = running(states)
+        going = jax.vmap(result)(states)[0]
         new, (kept, *given) = stepped(states)
 
         def unless_ended(a: Array, b: Array) -> Array:
@@ -134,7 +131,7 @@ def iterated(
     rows = tuple(jnp.zeros((length, *part.shape), part.dtype) for part in shapes)
 
     def going_on(loop: tuple) -> Array:
-        return (loop[0] < length) & (jnp.sum(running(loop[1])) > idle)
+        return (loop[0] < length) & (jnp.sum(jax.vmap(result)(loop[1])[0]) > idle)
 
     _, states, rows = jax.lax.while_loop(going_on, body, (jnp.array(0), states, rows))
-    return packed(states), rows, jax.vmap(result)(states)
+    return in_rows(states), rows, jax.vmap(result)(states)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from snrmjax.numerics import lanes as module
-from snrmjax.numerics.lanes import in_lanes, iterated, packed
+from snrmjax.numerics.lanes import in_lanes, in_rows, iterated
 
 START = np.array([27, 1, 2, 97, 7, 3, 16, 6, 19, 1, 54, 12, 5])
 
@@ -22,7 +22,7 @@ def sequence(number):
 
 @jax.jit
 def begun(jobs, wanted):
-    return packed((jnp.where(wanted, jobs, 1), jnp.zeros_like(jobs)))
+    return in_rows((jnp.where(wanted, jobs, 1), jnp.zeros_like(jobs)))
 
 
 @jax.jit

@@ -114,14 +114,9 @@ class HarmonicBalance(eqx.Module):
             return residual, jnp.zeros((0,))
         tangent = model.pointwise.tangent_stiffness(samples, rate) / fs**2 + jnp.diag(stiffness)
         # Adding zeros beside the diagonal is faster than writing to its entries one by one.
-        of_inertia, of_damping = (
-            np.diag(h2[:, 0])[..., None, None],
-            basis.derivative[..., None, None],
-        )
-        blocks = tangent_blocks(basis, tangent)
-        blocks = blocks - of_inertia * (omega**2 * jnp.diag(terms.mass))
-        blocks = blocks + of_damping * (omega * jnp.diag(damping))
-        blocks = blocks.transpose(0, 2, 1, 3)
+        squared, once = np.diag(h2[:, 0])[..., None, None], basis.derivative[..., None, None]
+        blocks = tangent_blocks(basis, tangent) - squared * (omega**2 * jnp.diag(terms.mass))
+        blocks = (blocks + once * (omega * jnp.diag(damping))).transpose(0, 2, 1, 3)
         column = damping * slope - 2 * omega * inertia * x
         if model.effects:
             added, by_rate = self._effects(samples, rate, by_omega, omega)

@@ -1,6 +1,7 @@
 """Many response curves of one kind: stacked balances, starts, and their walks side by side."""
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, Literal
 
 import equinox as eqx
@@ -12,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import stacked, taken
 from snrmjax.numerics.compiled import compiled
-from snrmjax.numerics.lanes import TOGETHER, Rows, in_lanes, iterated, packed
+from snrmjax.numerics.lanes import TOGETHER, StateRows, in_lanes, in_rows, iterated
 from snrmjax.simulate.balance.harmonic_balance import (
     HarmonicBalance,
     linear_coefficients,
@@ -112,10 +113,10 @@ def _walked(
     walk = (np.asarray(ends), steps, np.array(downward))
     further, length = (_advanced_alone, _ALONE) if lanes == 1 else (_advanced_together, TOGETHER)
 
-    def begun(jobs: tuple, wanted: Bool[np.ndarray, " lane"]) -> Rows:
+    def begun(jobs: tuple, wanted: Bool[np.ndarray, " lane"]) -> StateRows:
         return _begun(jobs, wanted, *walk, way=way)
 
-    def advanced(jobs: tuple, walks: Rows, idle: int) -> tuple:
+    def advanced(jobs: tuple, walks: StateRows, idle: int) -> tuple:
         return further(jobs, walks, *walk, np.array(idle), way=way, length=length)
 
     (status, n_solves), rows = in_lanes(begun, advanced, (balances, starts), lanes)
@@ -166,27 +167,24 @@ def _begun(
     steps: StepControl,
     downward: Array,
     way: _Way,
-) -> Rows:
+) -> StateRows:
     def begun(job: tuple, wanted: Array) -> Tracing:
         status = jnp.where(wanted, RUNNING, int(CurveStatus.NO_START))
         return _first(job, ends, steps, downward, way)._replace(status=status)
 
-    return packed(jax.vmap(begun)(jobs, wanted))
+    return in_rows(jax.vmap(begun)(jobs, wanted))
 
 
 def _advanced(
     jobs: tuple,
-    walks: Rows,
+    walks: StateRows,
     ends: Array,
     steps: StepControl,
     downward: Array,
     idle: Int[Array, ""],
     way: _Way,
     length: int,
-) -> tuple[Rows, tuple, tuple]:
-    def begun(job: tuple) -> Tracing:
-        return _first(job, ends, steps, downward, way)
-
+) -> tuple[StateRows, tuple, tuple]:
     def result(walk: Tracing) -> tuple:
         return walk.status == RUNNING, walk.status, walk.n_solves
 
@@ -195,6 +193,7 @@ def _advanced(
         walk, kept = tracer.corrected(walk) if length == _ALONE else tracer.advanced(walk)
         return walk, (kept, walk.here, walk.tangent)
 
+    begun = partial(_first, ends=ends, steps=steps, downward=downward, way=way)
     return iterated(begun, step, result, jobs, walks, length, idle)
 
 
