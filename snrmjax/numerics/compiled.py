@@ -35,9 +35,8 @@ def compiled(
     Arrays and floating-point numbers anywhere in the arguments, NumPy's too, are arguments of the
     program, so that other values do not compile anew; everything else (whole numbers, truth
     values, text, None) is compiled into it. All results are arrays. Inside another program that
-    one's order of steps rules. Programs of `long_loops` over many points at once take half as long
-    again to compile and run 1.5 times faster; `thoroughly`, the walks of several curves take twice
-    as long and run a tenth faster, but those of many points no longer so fast.
+    one's order of steps rules. `long_loops` over many points at once take half as long again to
+    compile and run 1.5 times faster; walks of many curves `thoroughly` twice, and a tenth faster.
     """
 
     def run(structure: Any, fixed: tuple, arrays: list) -> R:
@@ -94,7 +93,7 @@ def compiled(
         traced = any(isinstance(a, jax.core.Tracer) for a in arrays)
         if traced:
             return inside(structure, fixed, arrays)
-        hurried = jax.config.values["jax_disable_most_optimizations"]
+        hurried = jax.config.read("jax_disable_most_optimizations")
         keeper = program_keeper()
         if keeper is not None:
             shapes = tuple((a.shape, a.dtype, getattr(a, "weak_type", False)) for a in arrays)

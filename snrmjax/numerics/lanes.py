@@ -9,13 +9,15 @@ from typing import Any, TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Int
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float, Int
 
 from snrmjax.numerics.blocks import cores, on_accelerator, over_cores, taken
 
 TOGETHER = 64  # iterations of several lanes, at most, before the host sees them
 Jobs: TypeAlias = Any  # trees of arrays with a leading axis
 States: TypeAlias = Any
+StateRows: TypeAlias = Float[Array, "lane number"]
 
 
 def lanes_for(unknowns: int) -> int:
@@ -30,19 +32,16 @@ def lanes_for(unknowns: int) -> int:
 
 
 def in_lanes(
-    begun: Callable[[Jobs, Bool[np.ndarray, " lane"]], States],
-    advanced: Callable[[Jobs, States, int], tuple[States, tuple]],
-    result: Callable[[States], tuple],
+    begun: Callable[[Jobs, Bool[np.ndarray, " lane"]], StateRows],
+    advanced: Callable[[Jobs, StateRows, int], tuple[StateRows, tuple, tuple]],
     jobs: Jobs,
     lanes: int,
 ) -> tuple[tuple[np.ndarray, ...], list[tuple[np.ndarray, ...]]]:
     """All jobs to their ends, `lanes` at a time on every core.
 
-    Arguments: `begun` gives the states of `lanes` jobs, those of lanes not wanted being at their
-    end; `advanced` takes them some iterations further, as long as more than so many lanes are at
-    work, and gives the rows of each: whether it is kept, then anything, all of shape
-    (iteration, lane, …); `result` says of states which have not ended, and what is wanted of them
-    at their ends. What a job gives does not depend on its lane, nor on its neighbours.
+    Arguments: `begun` gives the states of `lanes` jobs in rows, those of lanes not wanted being at
+    their end; `advanced` is what `iterated` gives of them, with as many lanes as may be idle.
+    What a job gives does not depend on its lane, nor on its neighbours.
     Returns the results, of shape (job, …), and the rows that every job gave on the way.
     """
     n = len(jax.tree.leaves(jobs)[0])
@@ -52,7 +51,7 @@ def in_lanes(
 
     def worked(_: int) -> None:
         member, busy = np.zeros(lanes, dtype=int), np.zeros(lanes, dtype=bool)
-        states: States = None
+        states: Any = None
         while True:
             fresh = np.zeros(lanes, dtype=bool)
             for lane in np.flatnonzero(~busy)[: len(queue)].tolist():
@@ -63,10 +62,11 @@ def in_lanes(
                 return
             if fresh.any():
                 mine = taken(jobs, member)
-                states = _joined(fresh, begun(mine, busy), states)
-            states, rows = advanced(mine, states, lanes // 8 if queue else 0)
+                new = begun(mine, busy)
+                states = new if states is None else np.where(fresh[:, None], new, states)
+            states, rows, told = advanced(mine, states, lanes // 8 if queue else 0)
             kept, *parts = (np.asarray(part) for part in rows)
-            going, *found = (np.asarray(part) for part in result(states))
+            going, *found = (np.asarray(part) for part in told)
             for lane in np.flatnonzero(busy & kept.any(axis=0)).tolist():
                 given[member[lane]].append([part[kept[:, lane], lane] for part in parts])
             over = busy & ~going
@@ -81,31 +81,31 @@ def in_lanes(
     return results, [tuple(map(np.concatenate, zip(*rows, strict=True))) for rows in given]
 
 
-def _joined(fresh: Bool[np.ndarray, " lane"], new: States, old: States) -> States:
-    """New states where lanes have begun, the old ones elsewhere."""
-    if old is None or fresh.all():
-        return new
-
-    def joined(a: Any, b: Any) -> np.ndarray:
-        return np.where(fresh.reshape(-1, *(1,) * (np.ndim(a) - 1)), a, b)
-
-    return jax.tree.map(joined, new, old)
+def in_rows(states: States) -> StateRows:
+    """The states of several lanes, each in a row: one array is handed over faster than many."""
+    return jax.vmap(lambda state: ravel_pytree(state)[0])(states)
 
 
 def iterated(
+    begun: Callable[[Any], Any],
     step: Callable[[Any, Any], tuple[Any, tuple]],
-    running: Callable[[States], Any],
+    result: Callable[[Any], tuple],
     jobs: Jobs,
-    states: States,
+    states: StateRows,
     length: int,
     idle: Int[Array, ""],
-) -> tuple[States, tuple]:
+) -> tuple[StateRows, tuple, tuple]:
     """Iterations of all lanes in one program: `length`, or until `idle` of them or fewer go on.
 
-    `step(job, state)` gives one lane's next state and its row, the first part of which says
-    whether the row is kept. Returns the states and the rows, of shape (iteration, lane, …).
+    Arguments: of one lane, `begun(job)` is the state at first; `step(job, state)` gives the next
+    state and a row, the first part of which says whether it is kept; `result(state)` says whether
+    it goes on, and what is wanted of it at its end. `states` are in rows.
+    Returns the states, the rows given, of shape (iteration, lane, …), and the results.
     """
-    alone = len(jax.tree.leaves(states)[0]) == 1
+    first = jax.eval_shape(begun, jax.tree.map(lambda a: a[0], jobs))
+    whole = ravel_pytree(jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), first))[1]
+
+    alone, states = len(states) == 1, jax.vmap(whole)(states)
 
     def stepped(states: States) -> tuple[States, tuple]:
         if not alone:
@@ -115,7 +115,7 @@ def iterated(
 
     def body(loop: tuple) -> tuple:
         k, states, rows = loop
-        going = running(states)
+        going = jax.vmap(result)(states)[0]
         new, (kept, *given) = stepped(states)
 
         def unless_ended(a: Array, b: Array) -> Array:
@@ -131,6 +131,7 @@ def iterated(
     rows = tuple(jnp.zeros((length, *part.shape), part.dtype) for part in shapes)
 
     def going_on(loop: tuple) -> Array:
-        return (loop[0] < length) & (jnp.sum(running(loop[1])) > idle)
+        return (loop[0] < length) & (jnp.sum(jax.vmap(result)(loop[1])[0]) > idle)
 
-    return jax.lax.while_loop(going_on, body, (jnp.array(0), states, rows))[1:]
+    _, states, rows = jax.lax.while_loop(going_on, body, (jnp.array(0), states, rows))
+    return in_rows(states), rows, jax.vmap(result)(states)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from snrmjax.numerics import lanes as module
-from snrmjax.numerics.lanes import in_lanes, iterated
+from snrmjax.numerics.lanes import in_lanes, in_rows, iterated
 
 START = np.array([27, 1, 2, 97, 7, 3, 16, 6, 19, 1, 54, 12, 5])
 
@@ -22,7 +22,7 @@ def sequence(number):
 
 @jax.jit
 def begun(jobs, wanted):
-    return jnp.where(wanted, jobs, 1), jnp.zeros_like(jobs)
+    return in_rows((jnp.where(wanted, jobs, 1), jnp.zeros_like(jobs)))
 
 
 @jax.jit
@@ -32,18 +32,17 @@ def advanced(jobs, states, idle):
         number = jnp.where(number % 2 == 0, number // 2, 3 * number + 1)
         return (number, count + 1), (number % 2 == 0, number)
 
-    return iterated(step, lambda states: states[0] > 1, jobs, states, 10, idle)
+    def result(state):
+        return state[0] > 1, *state
 
-
-def result(states):
-    return np.asarray(states[0]) > 1, *states
+    return iterated(lambda job: (job, job), step, result, jobs, states, 10, idle)
 
 
 @pytest.mark.parametrize("lanes", [1, 2, 4, 16])
 @pytest.mark.parametrize("cores", [1, 2])
 def test_every_job_comes_to_its_own_end(lanes, cores, monkeypatch):
     monkeypatch.setattr(module, "cores", lambda: cores)
-    (last, count), rows = in_lanes(begun, advanced, result, START, lanes)
+    (last, count), rows = in_lanes(begun, advanced, START, lanes)
     assert last.tolist() == [1] * len(START)
     exact = [sequence(int(number)) for number in START]
     assert count.tolist() == [len(numbers) for numbers in exact]
@@ -57,7 +56,7 @@ def test_lanes_stop_where_few_go_on():
     jobs = jnp.asarray(START[:4])
     states = begun(jobs, jnp.ones(4, dtype=bool))
     # One is at its end from the start, 2 after one step; two lanes are left then.
-    (_, count), _ = advanced(jobs, states, jnp.array(2))
+    _, _, (_, _, count) = advanced(jobs, states, jnp.array(2))
     assert count.tolist() == [1, 0, 1, 1]
-    (_, count), _ = advanced(jobs, states, jnp.array(0))
+    _, _, (_, _, count) = advanced(jobs, states, jnp.array(0))
     assert count.tolist() == [10, 0, 1, 10]

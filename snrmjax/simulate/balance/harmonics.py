@@ -85,12 +85,8 @@ def tangent_blocks(
     sums hold all of the blocks.
     """
     sums = jnp.tensordot(basis.spectrum, samples, axes=1)
-    shape = (*basis.row.shape, *(1,) * (samples.ndim - 1))
-    first, second = (
-        sign * sums[row]
-        for row, sign in zip(basis.row, jnp.asarray(basis.sign).reshape(shape), strict=True)
-    )
-    return first + second
+    sign = jnp.asarray(basis.sign.reshape(*basis.sign.shape, *(1,) * (samples.ndim - 1)))
+    return sign[0] * sums[basis.row[0]] + sign[1] * sums[basis.row[1]]
 
 
 def squared_orders(harmonic_order: int, *, cosine_only: bool = False) -> np.ndarray:

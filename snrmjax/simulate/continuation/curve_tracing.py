@@ -1,6 +1,7 @@
 """Many response curves of one kind: stacked balances, starts, and their walks side by side."""
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, Literal
 
 import equinox as eqx
@@ -12,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import stacked, taken
 from snrmjax.numerics.compiled import compiled
-from snrmjax.numerics.lanes import TOGETHER, in_lanes, iterated
+from snrmjax.numerics.lanes import TOGETHER, StateRows, in_lanes, in_rows, iterated
 from snrmjax.simulate.balance.harmonic_balance import (
     HarmonicBalance,
     linear_coefficients,
@@ -112,17 +113,13 @@ def _walked(
     walk = (np.asarray(ends), steps, np.array(downward))
     further, length = (_advanced_alone, _ALONE) if lanes == 1 else (_advanced_together, TOGETHER)
 
-    def begun(jobs: tuple, wanted: Bool[np.ndarray, " lane"]) -> Tracing:
+    def begun(jobs: tuple, wanted: Bool[np.ndarray, " lane"]) -> StateRows:
         return _begun(jobs, wanted, *walk, way=way)
 
-    def advanced(jobs: tuple, walks: Tracing, idle: int) -> tuple:
+    def advanced(jobs: tuple, walks: StateRows, idle: int) -> tuple:
         return further(jobs, walks, *walk, np.array(idle), way=way, length=length)
 
-    def result(walks: Tracing) -> tuple:
-        status = np.asarray(walks.status)
-        return status == RUNNING, status, walks.n_solves
-
-    (status, n_solves), rows = in_lanes(begun, advanced, result, (balances, starts), lanes)
+    (status, n_solves), rows = in_lanes(begun, advanced, (balances, starts), lanes)
     curves = []
     for k, given in enumerate(rows):
         points, tangents = given or (np.zeros((0, balances.size + 1)),) * 2
@@ -147,6 +144,21 @@ def _tracer(balance: HarmonicBalance, ends: Array, steps: StepControl, way: _Way
     return CurveTracer(linearised, CurveRange(lower=-1.0, upper=1.0), steps, None, False)
 
 
+def _first(job: tuple, ends: Array, steps: StepControl, downward: Array, way: _Way) -> Tracing:
+    """The walk of one job before its first point."""
+    balance, start = job
+    if way == "rising":
+        start = jnp.zeros(balance.size + 1)
+    elif start is None:
+        begin = jnp.where(downward, ends[1], ends[0])
+        order = balance.harmonic_order
+        linear = linear_coefficients(balance.model, balance.force, begin, order)
+        start = balance.point(linear, begin)
+    sense = 1.0 if way == "rising" else jnp.where(downward, -1.0, 1.0)
+    direction = jnp.zeros_like(start).at[-1].set(sense)
+    return _tracer(balance, ends, steps, way).begun(start, direction)
+
+
 @compiled
 def _begun(
     jobs: tuple,
@@ -155,40 +167,34 @@ def _begun(
     steps: StepControl,
     downward: Array,
     way: _Way,
-) -> Tracing:
+) -> StateRows:
     def begun(job: tuple, wanted: Array) -> Tracing:
-        balance, start = job
-        if way == "rising":
-            start = jnp.zeros(balance.size + 1)
-        elif start is None:
-            begin = jnp.where(downward, ends[1], ends[0])
-            order = balance.harmonic_order
-            linear = linear_coefficients(balance.model, balance.force, begin, order)
-            start = balance.point(linear, begin)
-        sense = 1.0 if way == "rising" else jnp.where(downward, -1.0, 1.0)
-        direction = jnp.zeros_like(start).at[-1].set(sense)
-        walk = _tracer(balance, ends, steps, way).begun(start, direction)
-        return walk._replace(status=jnp.where(wanted, RUNNING, int(CurveStatus.NO_START)))
+        status = jnp.where(wanted, RUNNING, int(CurveStatus.NO_START))
+        return _first(job, ends, steps, downward, way)._replace(status=status)
 
-    return jax.vmap(begun)(jobs, wanted)
+    return in_rows(jax.vmap(begun)(jobs, wanted))
 
 
 def _advanced(
     jobs: tuple,
-    walks: Tracing,
+    walks: StateRows,
     ends: Array,
     steps: StepControl,
     downward: Array,
     idle: Int[Array, ""],
     way: _Way,
     length: int,
-) -> tuple[Tracing, tuple]:
+) -> tuple[StateRows, tuple, tuple]:
+    def result(walk: Tracing) -> tuple:
+        return walk.status == RUNNING, walk.status, walk.n_solves
+
     def step(job: tuple, walk: Tracing) -> tuple[Tracing, tuple]:
         tracer = _tracer(job[0], ends, steps, way)
         walk, kept = tracer.corrected(walk) if length == _ALONE else tracer.advanced(walk)
         return walk, (kept, walk.here, walk.tangent)
 
-    return iterated(step, lambda walks: walks.status == RUNNING, jobs, walks, length, idle)
+    begun = partial(_first, ends=ends, steps=steps, downward=downward, way=way)
+    return iterated(begun, step, result, jobs, walks, length, idle)
 
 
 _advanced_alone = compiled(_advanced)

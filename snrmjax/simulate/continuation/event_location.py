@@ -84,13 +84,11 @@ class EventSearch(eqx.Module):
         in_upper = inner & (jnp.sign(found.value) == jnp.sign(low.value))
         in_lower = inner & ~in_upper
         # An end that stays counts less: by the share of its value that the other one lost.
-        left = [1 - value / end.value for end in (low, high)]
-        left_low, left_high = (jnp.where(part > 0, part, 0.5) for part in left)
-        stays_low, stays_high = in_lower & (side == -1), in_upper & (side == 1)
-        low, high = (
-            low._replace(value=low.value * jnp.where(stays_low, left_high, 1.0)),
-            high._replace(value=high.value * jnp.where(stays_high, left_low, 1.0)),
-        )
+        lost = [1 - value / end.value for end in (low, high)]
+        less = [jnp.where(part > 0, part, 0.5) for part in lost]
+        by_low = jnp.where(in_lower & (side == -1), less[1], 1.0)
+        by_high = jnp.where(in_upper & (side == 1), less[0], 1.0)
+        low, high = (e._replace(value=e.value * by) for e, by in ((low, by_low), (high, by_high)))
         low = chosen(in_upper | is_low, found, low)
         high = chosen(in_lower | is_high, found, high)
         differ = low.value * high.value <= 0

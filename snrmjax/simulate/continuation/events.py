@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from snrmjax.numerics.blocks import over_cores, taken
 from snrmjax.numerics.compiled import compiled
-from snrmjax.numerics.lanes import TOGETHER, in_lanes, iterated, lanes_for
+from snrmjax.numerics.lanes import TOGETHER, StateRows, in_lanes, in_rows, iterated, lanes_for
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance
 from snrmjax.simulate.continuation.continuation import CurveEvent, StepControl, TracedCurve
 from snrmjax.simulate.continuation.event_location import Bracket, EventSearch
@@ -62,21 +62,24 @@ def _search(job: tuple, steps: StepControl) -> EventSearch:
 
 
 @compiled
-def _begun(jobs: tuple, wanted: Bool[Array, " lane"], steps: StepControl) -> Bracket:
+def _begun(jobs: tuple, wanted: Bool[Array, " lane"], steps: StepControl) -> StateRows:
     def begun(job: tuple, wanted: Array) -> Bracket:
         return _search(job, steps).begun()._replace(ended=~wanted)
 
-    return jax.vmap(begun)(jobs, wanted)
+    return in_rows(jax.vmap(begun)(jobs, wanted))
 
 
 @compiled
 def _advanced(
-    jobs: tuple, states: Bracket, steps: StepControl, idle: Int[Array, ""]
-) -> tuple[Bracket, tuple]:
+    jobs: tuple, states: StateRows, steps: StepControl, idle: Int[Array, ""]
+) -> tuple[StateRows, tuple, tuple]:
+    def result(end: Bracket) -> tuple:
+        return ~end.ended, end.last.point, end.last.tangent, end.resolved, end.missed
+
     def step(job: tuple, state: Bracket) -> tuple[Bracket, tuple]:
         return _search(job, steps).advanced(state), (jnp.array(False),)
 
-    return iterated(step, lambda states: ~states.ended, jobs, states, TOGETHER, idle)
+    return iterated(lambda j: _search(j, steps).begun(), step, result, jobs, states, TOGETHER, idle)
 
 
 def _searched(jobs: tuple, steps: StepControl) -> tuple[np.ndarray, ...]:
@@ -85,17 +88,13 @@ def _searched(jobs: tuple, steps: StepControl) -> tuple[np.ndarray, ...]:
     Point and tangent, whether that is the event, and whether there is one that was not found.
     """
 
-    def begun(jobs: tuple, wanted: Bool[np.ndarray, " lane"]) -> Bracket:
+    def begun(jobs: tuple, wanted: Bool[np.ndarray, " lane"]) -> StateRows:
         return _begun(jobs, wanted, steps)
 
-    def advanced(jobs: tuple, states: Bracket, idle: int) -> tuple[Bracket, tuple]:
+    def advanced(jobs: tuple, states: StateRows, idle: int) -> tuple[StateRows, tuple, tuple]:
         return _advanced(jobs, states, steps, np.array(idle))
 
-    def result(states: Bracket) -> tuple:
-        end = jax.tree.map(np.asarray, states)  # on the host, where nothing is compiled
-        return ~end.ended, end.last.point, end.last.tangent, end.resolved, end.missed
-
-    return in_lanes(begun, advanced, result, jobs, lanes_for(jobs[0].size + 1))[0]
+    return in_lanes(begun, advanced, jobs, lanes_for(jobs[0].size + 1))[0]
 
 
 @compiled

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from snrmjax.numerics.blocks import mapped
+from snrmjax.numerics.blocks import on_accelerator
 
 T = TypeVar("T")
 Point = Float[Array, " unknown"]
@@ -36,7 +36,9 @@ def _solved_side_by_side(count: int, batched: list[bool], columns: Array) -> tup
     A factorisation of many matrices at once spreads over the threads of a pool and waits for them:
     called from as many threads itself, it waits for ever (jaxlib 0.10).
     """
-    return mapped(solved_behind.fun, columns), True
+    if on_accelerator():
+        return jax.vmap(solved_behind.fun)(columns), True
+    return jax.lax.map(solved_behind, columns), True
 
 
 class Trial(NamedTuple):

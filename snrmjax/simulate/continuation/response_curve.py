@@ -179,7 +179,7 @@ def assembled(
         if stability:
             (truncation,) = by_blocks(
                 lambda x, w: (_truncation(balance, x, w),),
-                *(256, motions["coefficients"], motions["frequency"]),
+                *(128, motions["coefficients"], motions["frequency"]),
             )
         return ResponseCurve(
             **motions,
