@@ -18,7 +18,7 @@ import numpy as np
 from harness import medians, options, seconds_of, teller
 
 import snrmjax as sj
-from snrmjax.model.beams import (
+from snrmjax.model.builders.beams import (
     CURVED_BEAM_FORCES,
     FLAT_BEAM_FORCES,
     curved_beam,

@@ -34,7 +34,7 @@ from snrmjax.condense import (
     static_cases,
 )
 from snrmjax.io import calculix
-from snrmjax.model.beams import curved_beam, flat_beam
+from snrmjax.model.builders.beams import curved_beam, flat_beam
 from snrmjax.model.potential import monomial_key
 from snrmjax.model.structures import Structure
 

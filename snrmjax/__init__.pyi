@@ -18,8 +18,8 @@ from .identify.calibrate.calibration import calibrate_model
 from .identify.inference.identification import identify_backbone
 from .identify.inference.optimal_design import next_measurements
 from .identify.joint.joint_fit import fit_jointly
-from .io.compilation_cache import use_compilation_cache
 from .io.models import read_model
+from .io.programs.compilation_cache import use_compilation_cache
 from .io.tables import read_steady_states
 from .report.writing import write_results
 from .simulate.solutions.forced_response import forced_response

@@ -1,5 +1,6 @@
 """One way of compiling and one store of compiled programs for all that the tests start."""
 
+import ctypes
 import gc
 import os
 import shutil
@@ -12,22 +13,53 @@ from pathlib import Path
 import pytest
 
 _STORE = "JAX_COMPILATION_CACHE_DIR"
+_LEAST_TIME = "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"
 _ROOM = 3 * 2**30  # bytes of a worker, beyond which it forgets its programs
-# Compiles in two thirds of the time, and by one thread: each worker has one core.
-_QUICK = "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
+_QUICK = " ".join(
+    (
+        # Two thirds of the time, and by one thread: each worker has one core.
+        "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1",
+        # Another fifth: loops within loops are copied for every look into how often they turn and
+        # what does not change in them, and what is known of memory is for optimisations alone.
+        "--xla_disable_hlo_passes=while-loop-invariant-code-motion,while-loop-trip-count-annotator",
+        "--xla_llvm_enable_alias_scope_metadata=false --xla_llvm_enable_noalias_metadata=false",
+        "--xla_llvm_enable_invariant_load_metadata=false",
+    )
+)
+
+
+def _knows_quick() -> bool:
+    """Whether this version of XLA has the flags: it ends a process that sets one it has not."""
+    tried = subprocess.run(
+        [sys.executable, "-c", "import jax; jax.devices()"],
+        env=os.environ | {"XLA_FLAGS": _QUICK, "JAX_PLATFORMS": "cpu"},
+        capture_output=True,
+        check=False,
+    )
+    return tried.returncode == 0
+
+
+# Before JAX is imported, which a folder's own conftest does, and before workers, which inherit the
+# environment, are started. Compiling is most of the time: hardly a program of a test runs long
+# enough to be worth optimising.
+os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # further threads wait for work at full speed
+if "XLA_FLAGS" not in os.environ:
+    os.environ["XLA_FLAGS"] = _QUICK if _knows_quick() else ""
+# Tracing makes many small objects that live: looking for garbage less often saves a twentieth.
+gc.set_threshold(200_000, 50, 100)
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Before JAX is imported, and before workers, which inherit the environment, are started."""
-    # Compiling is most of the time: no program of a test runs long enough to be worth optimising.
-    os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
-    if _STORE not in os.environ:
-        os.environ[_STORE] = _store(config)
-        os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.1"
-    # Tracing makes many small objects that live: looking for garbage less often saves a twentieth.
-    gc.set_threshold(200_000, 50, 100)
-    if "XLA_FLAGS" not in os.environ:
-        os.environ["XLA_FLAGS"] = _QUICK if _knows_quick() else ""
+    """Before workers are started."""
+    if _STORE in os.environ:
+        return
+    os.environ[_STORE], os.environ[_LEAST_TIME] = _store(config), "0.1"
+    if "jax" in sys.modules:  # where a single folder is run
+        import jax
+
+        jax.config.update("jax_compilation_cache_dir", os.environ[_STORE])
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 
 
 def _store(config: pytest.Config) -> str:
@@ -40,17 +72,6 @@ def _store(config: pytest.Config) -> str:
         if other != own:
             shutil.rmtree(other, ignore_errors=True)
     return str(own)
-
-
-def _knows_quick() -> bool:
-    """Whether this version of XLA has the flag: it ends a process that sets one it has not."""
-    tried = subprocess.run(
-        [sys.executable, "-c", "import jax; jax.devices()"],
-        env=os.environ | {"XLA_FLAGS": _QUICK, "JAX_PLATFORMS": "cpu"},
-        capture_output=True,
-        check=False,
-    )
-    return tried.returncode == 0
 
 
 def pytest_unconfigure(config: pytest.Config) -> None:
@@ -67,6 +88,18 @@ def no_kept_programs():
     keep_no_programs()
 
 
+@pytest.fixture(scope="module")
+def optimised():
+    """Programs as users have them, for tests of which they run longer than they take to compile."""
+    import jax
+
+    name = "jax_disable_most_optimizations"
+    before = jax.config.values[name]
+    jax.config.update(name, False)
+    yield
+    jax.config.update(name, before)
+
+
 @pytest.fixture(autouse=True, scope="module")
 def bounded_memory():
     """The programs of all modules together would fill gigabytes; the store has them on disk."""
@@ -75,6 +108,7 @@ def bounded_memory():
         import jax
 
         jax.clear_caches()
+        _give_back()
 
 
 def _memory() -> float:
@@ -83,6 +117,15 @@ def _memory() -> float:
     if not status.exists():
         return float("inf")
     return int(status.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def _give_back() -> None:
+    """To the system, what was freed: else all later modules would find no room, and forget too."""
+    gc.collect()
+    if sys.platform == "linux":
+        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc has it
+        if trim is not None:
+            trim(0)
 
 
 def pytest_collection_modifyitems(items):

@@ -83,7 +83,7 @@ def main() -> None:
     # Imports and programs stay to the end: to look for rubbish in them takes a tenth of a command.
     gc.set_threshold(_OBJECTS)
     if sys.argv[1:] and "--help" not in sys.argv:  # help does not wait for the import of JAX
-        from snrmjax.io.compilation_cache import use_compilation_cache
+        from snrmjax.io.programs.compilation_cache import use_compilation_cache
 
         use_compilation_cache()
     try:

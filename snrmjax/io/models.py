@@ -7,18 +7,21 @@ import numpy as np
 import tomli_w
 
 from snrmjax.io.files import FilePath, file_name, read_text, shown, write_atomically
+from snrmjax.io.structure_matrices import listed_sensors, structure_of_matrices
 from snrmjax.io.toml_table import TomlTable, parsed_toml
 from snrmjax.io.units import DEGREE, HERTZ, in_unit
 from snrmjax.model.effect_base import AbstractEffect
 from snrmjax.model.effect_metadata import Entries
-from snrmjax.model.effects import EFFECTS, LAWS, effect_class, make_effect
+from snrmjax.model.effects import effect_class, known_effects, make_effect
 from snrmjax.model.modes import (
     UNSTATED_MODAL_MASS_STD,
+    Beside,
     LinearModes,
     LinearModesStd,
     RigidBodyModes,
     linear_modes,
 )
+from snrmjax.model.places import Row, between, row_over_points
 from snrmjax.model.potential import (
     Monomial,
     PolynomialPotential,
@@ -31,9 +34,10 @@ from snrmjax.numerics.names import near_miss, suggestion
 from snrmjax.numerics.rules import BELOW_ONE, IN_RANGE_HZ, NOT_NEGATIVE, NOT_ZERO, POSITIVE, Rule
 
 _TOP_KEYS = (
-    *("name", "mode_of_interest", "mode", "rigid_body_mode"),
-    *("potential", "effect", "measurement"),
+    *("name", "mode_of_interest", "mode", "rigid_body_mode", "damping_coupling"),
+    *("potential", "effect", "measurement", "sensors", "structure", "force"),
 )
+_OF_MODES = ("mode", "rigid_body_mode", "damping_coupling", "potential")
 
 
 _Rules = dict[str, tuple[Rule, ...]]
@@ -49,6 +53,7 @@ _MODE_STD: _Rules = {
     "damping_ratio_std": (NOT_NEGATIVE,),
     "modal_mass_std": (NOT_NEGATIVE,),
 }
+_MODE_FURTHER: _Rules = {"participation_lag": ()}
 _RIGID_BODY_MODE: _Rules = {"shape": (), "participation": (NOT_ZERO,)}
 _MEASUREMENT: _Rules = dict.fromkeys(
     (
@@ -65,29 +70,65 @@ def read_model(path: FilePath) -> Structure:
     Files are in Hz and degrees and count modes from one; the result is in rad/s and rad and
     counts from zero. The sensors are those of the modes' shapes, in the first mode's order; a
     model without a name takes the file's. A mode may state the 1σ of its linear test:
-    `frequency_std_hz`, `damping_ratio_std` and, relative, `modal_mass_std`.
+    `frequency_std_hz`, `damping_ratio_std` and, relative, `modal_mass_std`. Effects act on the mode
+    of interest, or at points by `at` or `between`, in N and m. In place of modes a file may have
+    matrices (see `from_matrices`; or `file`, an NPZ or MAT file with such arrays):
+
+        [structure]
+        points = ["a", "b"]
+        mass = [[1.0, 0.0], [0.0, 1.0]]            # kg
+        stiffness = [[2.0, -1.0], [-1.0, 2.0]]     # N/m
+        damping_ratio = 0.01                       # or damping, a matrix in N s/m
+        [force]
+        at = { a = 1.0 }                           # newtons per newton of the recorded force
+        [[effect]]
+        kind = "one_sided_stop"
+        between = ["b", "a"]                       # acts on x_b − x_a
+        stiffness = 100.0
+        gap = 0.01
 
     Returns the structure. Raises `ValueError` that names file, table, key, value and what was
     expected; a near miss is suggested for an unknown name.
     """
-    return _read(read_text(path), file_name(path), Path(path).stem)
+    return _read(read_text(path), file_name(path), Path(path))
 
 
-def _read(text: str, file: str, stem: str) -> Structure:
+def _read(text: str, file: str, path: Path) -> Structure:
     top = parsed_toml(text, file)
     top.check_keys((), _TOP_KEYS)
-    modes = _modes(top, file)
     errors = _numbers(top.table("measurement", f"[measurement] of {file}"), {}, _MEASUREMENT)
+    effects = tuple(_effect(table) for table in top.tables("effect", file))
+    if "structure" in top.entries:
+        for key in _OF_MODES:
+            if key in top.entries:
+                raise ValueError(f"{file} has both [structure] and `{key}`: matrices or modes.")
+        made = structure_of_matrices(top, file, path.parent, effects)
+        modes, potential = made.modes, made.potential
+    else:
+        if "force" in top.entries:
+            raise ValueError(f"{file} has [force] without [structure]: modes have participations.")
+        modes = _modes(top, file)
+        potential = _potential(top.table("potential", f"[potential] of {file}"), modes.n_modes)
+        for k, effect in enumerate(effects, 1):
+            for point, _ in getattr(effect, "at", None) or ():
+                _check_point(modes, point, f"effect {k} of {file}")
     return structure(
         modes,
-        _potential(top.table("potential", f"[potential] of {file}"), modes.n_modes),
-        effects=tuple(_effect(table) for table in top.tables("effect", file)),
+        potential,
+        effects=effects,
         level_gain_std=errors.get("level_gain_std", 0.0),
         level_phase_std=errors.get("level_phase_std_deg", 0.0) * DEGREE,
         level_frequency_std=errors.get("level_frequency_std_hz", 0.0) * HERTZ,
         level_damping_std=errors.get("level_damping_ratio_std", 0.0),
-        name=top.text("name", stem),
+        name=top.text("name", path.stem),
     )
+
+
+def _check_point(modes: LinearModes, point: str, place: str) -> None:
+    try:
+        modes.shape_at(point)
+    except ValueError as error:
+        raise ValueError(f"{place} cannot be read: {error}") from error
 
 
 def _numbers(table: TomlTable, required: _Rules, optional: _Rules) -> dict[str, float]:
@@ -99,7 +140,7 @@ def _numbers(table: TomlTable, required: _Rules, optional: _Rules) -> dict[str, 
 
 def _modes(top: TomlTable, file: str) -> LinearModes:
     tables, rigid_tables = top.tables("mode", file), top.tables("rigid_body_mode", file)
-    flexible = [_numbers(table, _MODE, _MODE_STD) for table in tables]
+    flexible = [_numbers(table, _MODE, _MODE_STD | _MODE_FURTHER) for table in tables]
     rigid = [_numbers(table, _RIGID_BODY_MODE, {}) for table in rigid_tables]
     if not flexible:
         raise ValueError(f"{file} must have at least one mode with a shape, under [[mode]].")
@@ -129,6 +170,19 @@ def _modes(top: TomlTable, file: str) -> LinearModes:
             f"({of_interest}) is zero at every sensor."
         )
 
+    names, watched = sensors, listed_sensors(top, file)
+    if watched is not None:
+        for sensor in watched:
+            if sensor not in names:
+                near = suggestion(sensor, names)
+                raise ValueError(
+                    f"[sensors] of {file} lists {shown(sensor)}, which no mode has{near}."
+                )
+        sensors = tuple(watched)
+    seen = [names.index(sensor) for sensor in sensors]
+    others = {name: row for name, row in zip(names, mode_shape, strict=True) if name not in sensors}
+    mode_shape = mode_shape[seen]
+
     def stds(key: str, default: float = 0.0) -> list[float]:
         return [mode.get(key, default) for mode in flexible]
 
@@ -148,6 +202,28 @@ def _modes(top: TomlTable, file: str) -> LinearModes:
             stds("damping_ratio_std"),
             stds("modal_mass_std", UNSTATED_MODAL_MASS_STD) if known_mass else None,
         ),
+        beside=Beside(
+            {name: row[: len(flexible)].tolist() for name, row in others.items()},
+            _coupling(top, len(flexible)),
+            lag if any(lag := stds("participation_lag")) else None,
+        ),
+    )
+
+
+def _coupling(top: TomlTable, n_modes: int) -> np.ndarray | None:
+    """Damping between modes, 1/s."""
+    if "damping_coupling" not in top.entries:
+        return None
+    rows = top.entries["damping_coupling"]
+    if not isinstance(rows, list) or len(rows) != n_modes:
+        raise top.refusal("damping_coupling", f"{n_modes} rows of numbers, one a mode", rows)
+    return np.array(
+        [
+            TomlTable({"damping_coupling": row}, f"{top.place}, row {k},").numbers(
+                "damping_coupling", each="mode", count=n_modes
+            )
+            for k, row in enumerate(rows, 1)
+        ]
     )
 
 
@@ -191,13 +267,13 @@ def _potential(table: TomlTable, n_modes: int) -> PolynomialPotential:
 def _effect(table: TomlTable) -> AbstractEffect:
     if "kind" not in table.entries:
         raise ValueError(f"{table.place} lacks the key `kind`.")
-    kind, known_kinds = table.text("kind"), (*EFFECTS, *LAWS)
+    kind, known_kinds = table.text("kind"), tuple(known_effects())
     if kind not in known_kinds:
         near = suggestion(kind, known_kinds) or f" (known are {', '.join(sorted(known_kinds))})"
         raise ValueError(f"{table.place} has the unknown kind {shown(kind)}{near}.")
     wanted = effect_class(kind).parameters()
     table = TomlTable(table.entries, f"{table.place} ({kind})")
-    table.check_keys(("kind", *wanted))
+    table.check_keys(("kind", *wanted), ("at", "between"))
     values: dict[str, float | np.ndarray] = {
         name: table.number(name, *parameter.rules)
         if parameter.entries is Entries.ONE
@@ -205,9 +281,25 @@ def _effect(table: TomlTable) -> AbstractEffect:
         for name, parameter in wanted.items()
     }
     try:
-        return make_effect(kind, values)
+        return make_effect(kind, values, at=_row(table))
     except ValueError as error:
         raise ValueError(f"{table.place} cannot be read: {error}") from error
+
+
+def _row(table: TomlTable) -> Row | None:
+    """Where an effect acts: `at` a point or points with weights, `between` two points."""
+    if "at" in table.entries and "between" in table.entries:
+        raise ValueError(f"{table.place} has both `at` and `between`.")
+    if "between" in table.entries:
+        two = table.entries["between"]
+        if not isinstance(two, list) or len(two) != 2 or not all(isinstance(p, str) for p in two):
+            raise table.refusal("between", "two points", two)
+        return between(*two)
+    at = table.entries.get("at")
+    if at is None or isinstance(at, str):
+        return None if at is None else row_over_points(at)
+    weights = table.table("at", f"`at` of {table.place}")
+    return row_over_points({point: weights.number(point) for point in weights.entries})
 
 
 def write_model(path: FilePath, model: Structure) -> None:
@@ -222,15 +314,19 @@ def write_model(path: FilePath, model: Structure) -> None:
     if model.modes.natural_frequency.ndim != 1:
         raise ValueError("`model` must be one structure, but is a batch of them.")
     text = tomli_w.dumps(_entries(jax.tree.map(np.asarray, model)))
-    _read(text, file_name(path), Path(path).stem)
+    _read(text, file_name(path), Path(path))
     write_atomically(path, text)
 
 
 def _entries(model: Structure) -> dict[str, object]:
     modes, potential = model.modes, model.potential
+    names = (*modes.sensors, *modes.points)
+    shapes = np.asarray(modes.mode_shape)
+    if modes.point_shape is not None:
+        shapes = np.concatenate([shapes, np.asarray(modes.point_shape)])
 
     def shape(of: object) -> dict[str, float]:
-        return dict(zip(modes.sensors, np.asarray(of).tolist(), strict=True))
+        return dict(zip(names, np.asarray(of).tolist(), strict=False))
 
     flexible: list[dict[str, object]] = []
     for k in range(modes.n_modes):
@@ -246,7 +342,9 @@ def _entries(model: Structure) -> dict[str, object]:
         }
         if modes.modal_mass_std is not None:
             entry["modal_mass_std"] = modes.modal_mass_std.item(k)
-        flexible.append({**entry, "shape": shape(modes.mode_shape[:, k])})
+        if modes.participation_lag is not None:
+            entry["participation_lag"] = modes.participation_lag.item(k)
+        flexible.append({**entry, "shape": shape(shapes[:, k])})
     rigid = [
         {"participation": float(participation), "shape": shape(modes.rigid_body_shape[:, k])}
         for k, participation in enumerate(modes.rigid_body_participation)
@@ -275,14 +373,21 @@ def _entries(model: Structure) -> dict[str, object]:
         },
         "effect": [_effect_entry(effect) for effect in model.effects],
         "measurement": {key: value for key, value in errors.items() if value},
+        "sensors": {"points": list(modes.sensors)} if modes.points else {},
+        "damping_coupling": []
+        if modes.damping_coupling is None
+        else np.asarray(modes.damping_coupling).tolist(),
     }
     return {name: value for name, value in parts.items() if value not in ([], {})}
 
 
 def _effect_entry(effect: AbstractEffect) -> dict[str, object]:
-    if effect.kind not in (*EFFECTS, *LAWS):
+    if effect.kind not in known_effects():
         raise ValueError(f"an effect to be written must be of a known kind, not {effect.kind!r}.")
     entry: dict[str, object] = {"kind": effect.kind}
+    at = getattr(effect, "at", None)
+    if at is not None:
+        entry |= {"at": at[0][0] if len(at) == 1 and at[0][1] == 1 else dict(at)}
     for name, parameter in effect_class(effect.kind).parameters().items():
         value = getattr(effect, name)
         entry[name] = (

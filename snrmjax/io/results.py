@@ -39,7 +39,8 @@ def write_response(
     """Write simulated responses: frequency, velocity at one sensor, stability and events.
 
     `stable` is 1 where a motion is known to be stable and else 0; where stability was not
-    computed, `event` says so with "stability_not_computed".
+    computed, `event` says so with "stability_not_computed". Of several sensors the fundamentals
+    follow in columns with their names.
 
     Arguments: `sensor` is the name of one, by default the first.
     Raises `ValueError` when there is no such sensor or the file cannot be written.
@@ -47,6 +48,12 @@ def write_response(
     r = _place(curves[0].sensors, sensor) if curves else 0
     force = np.concatenate([np.full(len(c.frequency), c.force) for c in curves])
     velocity = np.concatenate([c.velocity[:, :, r] for c in curves])
+    named = {}
+    if curves and len(curves[0].sensors) > 1:
+        for place, name in enumerate(curves[0].sensors):
+            fundamental = np.concatenate([c.velocity[:, 1, place] for c in curves])
+            named[f"velocity_h1_{name}_re_m_s"] = fundamental.real
+            named[f"velocity_h1_{name}_im_m_s"] = fundamental.imag
     write_table(
         path,
         {
@@ -58,6 +65,7 @@ def write_response(
             "velocity_peak_m_s": velocity_peaks(velocity),
             "stable": np.concatenate([c.is_stable for c in curves]),
             "event": [event for c in curves for event in _events(c)],
+            **named,
         },
     )
 

@@ -1,6 +1,7 @@
-from .arches import ArchSettings, shallow_arch
 from .averaging import averaged_effect
-from .beams import CURVED_BEAM_FORCES, FLAT_BEAM_FORCES, curved_beam, flat_beam
+from .builders.arches import ArchSettings, shallow_arch
+from .builders.beams import CURVED_BEAM_FORCES, FLAT_BEAM_FORCES, curved_beam, flat_beam
+from .builders.matrices import Matrices, beam, chain, from_matrices
 from .effect_base import (
     AbstractForce,
     AbstractHysteresis,
@@ -22,7 +23,7 @@ from .effect_metadata import (
     parameter,
 )
 from .effect_shape import shape_of
-from .effects import EFFECTS, LAWS, make_effect, register_effect
+from .effects import EFFECTS, ELEMENTS, LAWS, make_effect, register_effect
 from .modes import (
     LinearModes,
     LinearModesStd,
@@ -32,12 +33,14 @@ from .modes import (
     residual_velocity,
 )
 from .parameters import parameter_values, with_parameters
+from .places import between
 from .potential import PolynomialPotential, polynomial_potential
 from .structures import Structure, equilibria, structure
 
 __all__ = [
     "CURVED_BEAM_FORCES",
     "EFFECTS",
+    "ELEMENTS",
     "FLAT_BEAM_FORCES",
     "LAWS",
     "AbstractForce",
@@ -52,6 +55,7 @@ __all__ = [
     "Imitation",
     "LinearModes",
     "LinearModesStd",
+    "Matrices",
     "MotionScales",
     "Parameter",
     "Part",
@@ -62,9 +66,13 @@ __all__ = [
     "Structure",
     "Symmetry",
     "averaged_effect",
+    "beam",
+    "between",
+    "chain",
     "curved_beam",
     "equilibria",
     "flat_beam",
+    "from_matrices",
     "linear_modes",
     "linear_response",
     "make_effect",

@@ -1,8 +1,10 @@
 """Base classes of effects, one for each way in which a model may be incomplete.
 
-A force acts on the mode of interest: f is added on the left of q̈ + 2ζω₀q̇ + ω₀²q + … = p, with
-q in kg^1/2 m. Other effects change the linear terms, add a mode, add harmonics to the force or
-change what the instruments record.
+A force acts on the mode of interest, or at points of the structure. On the mode of interest f is
+added on the left of q̈ + 2ζω₀q̇ + ω₀²q + … = p, with q in kg^1/2 m. At points it acts on their
+displacement x in m and is a force in N, which is then what its parameters are in. Other effects
+change the linear terms, add a mode, add harmonics to the force or change what the instruments
+record.
 """
 
 import dataclasses
@@ -25,7 +27,9 @@ from snrmjax.model.effect_metadata import (
     Part,
     Shape,
 )
+from snrmjax.model.kinks import Kinks, with_kinks
 from snrmjax.model.modes import LinearModes
+from snrmjax.model.places import Row, checked_row
 from snrmjax.model.potential import PolynomialPotential
 
 Scalar = Float[Array, ""]
@@ -41,7 +45,8 @@ class AbstractEffect(eqx.Module):
     """One physical effect, defined once: its equation, and what a diagnosis must know about it.
 
     Effects act on the mode of interest alone: on its modal coordinate q, its linear terms, or
-    what is recorded of it. A nonlinearity that couples modes belongs in the potential.
+    what is recorded of it. Forces may act at points instead (`AbstractForce`) and then couple
+    modes, as the potential does.
 
     The parameters are the fields without a default, the first of them the effect's strength: at
     zero the effect does nothing. `parameter` gives a field its unit, rules and prior; a field
@@ -135,14 +140,23 @@ class AbstractEffect(eqx.Module):
 
 
 class AbstractForce(AbstractEffect):
-    """A force on the mode of interest, known over one cycle of a steady motion."""
+    """A force on the mode of interest or at points, known over one cycle of a steady motion.
+
+    `at` says where: a point, `between("tip", "root")` for their relative motion, or points with
+    weights b; the force then acts on x = Σ b x_point and, by b, on every point. Such a force is the
+    whole element: the linear modes hold no part of it. Without `at` it acts on the mode of
+    interest.
+    """
+
+    at: Row | None = eqx.field(default=None, static=True, kw_only=True, converter=checked_row)
 
     @abstractmethod
     def cycle_force(self, displacement: Samples, velocity: Samples) -> Samples:
         """The force at equally spaced samples of one period of a steady motion.
 
-        Arguments: q in kg^1/2 m and q̇ in kg^1/2 m/s; sample 0 is at phase 0 of the force and the
-        end of the period is left out. Returns kg^1/2 m/s², on the left of the modal equation.
+        Arguments: q in kg^1/2 m and q̇ in kg^1/2 m/s (at points: m, m/s); sample 0 is at phase 0
+        of the force and the end of the period is left out. Returns kg^1/2 m/s² (at points: N), on
+        the left of the equations of motion.
         """
 
     def quick_cycle_force(self, displacement: Samples, velocity: Samples) -> Samples:
@@ -173,40 +187,17 @@ class AbstractMemoryless(AbstractForce):
 class AbstractKinked(AbstractMemoryless):
     """A memoryless force whose slope jumps where a contact opens or closes.
 
-    In time integration the kink is sharp. Over a cycle it is rounded over a hundredth of half the
-    range of q to either side: harmonic balance evaluates a cycle at samples, and a sharp kink
-    would jump from one sample to the next. The equivalent stiffness changes by less than 1e-4 of
-    the contact's.
+    Harmonic balance evaluates a cycle at samples, of which a contact that opens between two of them
+    would make jumps; `cycle_force` therefore finds these times (see `with_kinks`).
     """
 
     @abstractmethod
-    def rounded_force(self, displacement: Scalar, velocity: Scalar, width: Scalar) -> Scalar:
-        """The force with its kinks rounded over ±`width` (kg^1/2 m) of displacement."""
-
-    def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
-        """The force with sharp kinks."""
-        return self.rounded_force(displacement, velocity, jnp.zeros(()))
+    def kinks(self) -> Kinks:
+        """Where the slope jumps; elsewhere the force is smooth, and everywhere continuous."""
 
     def cycle_force(self, displacement: Samples, velocity: Samples) -> Samples:
-        """The force with kinks rounded by the cycle's own range of q."""
-        width = 0.5 * KINK_WIDTH * (jnp.max(displacement) - jnp.min(displacement))
-        return jax.vmap(lambda q, v: self.rounded_force(q, v, width))(displacement, velocity)
-
-
-KINK_WIDTH = 0.02  # over which a kink is rounded, to either side, over half the range of q
-
-
-def ramp(beyond: Scalar, width: Scalar) -> Scalar:
-    """max(x, 0), rounded over ±`width` so that the first two derivatives are continuous.
-
-    >>> ramp(jnp.array([-1.0, 0.0, 3.0]), jnp.array(0.0))
-    Array([0., 0., 3.], dtype=float64)
-    """
-    sharp = jnp.maximum(beyond, 0.0)
-    safe = jnp.where(width > 0, width, 1.0)
-    share = jnp.clip(beyond / safe, -1.0, 1.0)
-    rounded = safe * (1 + share) ** 3 * (3 - share) / 16
-    return jnp.where((width > 0) & (jnp.abs(beyond) < width), rounded, sharp)
+        """The force over one period, such that Fourier sums over its samples are integrals."""
+        return with_kinks(super().cycle_force(displacement, velocity), displacement, self.kinks())
 
 
 class AbstractHysteresis(AbstractForce):

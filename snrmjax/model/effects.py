@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from snrmjax.model.effect_base import AbstractEffect
+from snrmjax.model.effect_base import AbstractEffect, AbstractForce
 from snrmjax.model.effect_metadata import Entries
 from snrmjax.model.library.damping import CubicDamping, QuadraticDamping, VanDerPolDamping
 from snrmjax.model.library.free_laws import (
@@ -24,6 +24,7 @@ from snrmjax.model.library.internal_resonances import (
     InternalResonanceOneToThree,
     InternalResonanceOneToTwo,
 )
+from snrmjax.model.library.joints import FourParameterIwan, RegularisedFriction, SpringLinkage
 from snrmjax.model.library.linear_changes import (
     AddedMass,
     FrequencyDrift,
@@ -49,6 +50,7 @@ from snrmjax.model.library.stiffness import (
     QuinticStiffness,
     StaticPreload,
 )
+from snrmjax.model.places import Row, row_over_points
 from snrmjax.numerics.kept_programs import keep_no_programs
 from snrmjax.numerics.rules import require
 
@@ -124,6 +126,11 @@ LAWS: dict[str, type[AbstractLaw]] = {
 }
 """The laws given by a table of knots, by their kind: drawn where no effect of the library holds."""
 
+ELEMENTS: dict[str, type[AbstractEffect]] = EffectTable(
+    (element.kind, element) for element in (RegularisedFriction, SpringLinkage, FourParameterIwan)
+)
+"""Further forces for points of a structure, by their kind; a diagnosis does not look for them."""
+
 # `help(EFFECTS)` shows the docstring of its class.
 EffectTable.__doc__ = f"{EffectTable.__doc__}\n\n{EFFECTS!r}"
 
@@ -148,7 +155,7 @@ def register_effect(effect: type[AbstractEffect]) -> type[AbstractEffect]:
     Returns the class. Raises `ValueError` for a kind that exists already and for a class without
     parameters.
     """
-    if effect.kind in (*EFFECTS, *LAWS):
+    if effect.kind in known_effects():
         raise ValueError(f"there is an effect of the kind {effect.kind!r} already.")
     if not effect.parameters():
         raise ValueError(f"{effect.kind!r} must have a parameter: a field without a default.")
@@ -158,11 +165,16 @@ def register_effect(effect: type[AbstractEffect]) -> type[AbstractEffect]:
 
 
 def effect_class(kind: str) -> type[AbstractEffect]:
-    """The class of a kind of effect, of the library, of a user or a drawn law.
+    """The class of a kind of effect, of the library, of a user, an element or a drawn law.
 
     Raises `KeyError` for an unknown kind.
     """
-    return EFFECTS[kind] if kind in EFFECTS else LAWS[kind]
+    return known_effects()[kind]
+
+
+def known_effects() -> dict[str, type[AbstractEffect]]:
+    """All classes of effects by their kinds: `EFFECTS`, `ELEMENTS` and `LAWS`."""
+    return {**EFFECTS, **ELEMENTS, **LAWS}
 
 
 def effect_parameters(kind: str) -> tuple[str, ...]:
@@ -170,19 +182,28 @@ def effect_parameters(kind: str) -> tuple[str, ...]:
     return tuple(effect_class(kind).parameters())
 
 
-def make_effect(kind: str, parameters: Mapping[str, float | Array | np.ndarray]) -> AbstractEffect:
+def make_effect(
+    kind: str,
+    parameters: Mapping[str, float | Array | np.ndarray],
+    *,
+    at: str | Mapping[str, float] | Row | None = None,
+) -> AbstractEffect:
     """Build an effect from its kind and its parameters by name.
+
+    `at` is a point, a row such as `between("tip", "root")`, or points with weights: there a force
+    acts, with parameters in N and m; without it on the mode of interest.
 
     Raises `ValueError` for an unknown kind, for an unknown, a missing and a non-finite parameter,
     for one out of its range (traced parameters are not looked at), and for a law whose tables
-    have not two knots or more, or different numbers of them, or knots that do not rise.
+    have not two knots or more, or different numbers of them, or knots that do not rise, and for a
+    place of an effect that is no force.
 
     >>> drag = make_effect("quadratic_damping", {"coefficient": 2.0})
     >>> drag.cycle_force(jnp.array([1.0, 0.0]), jnp.array([0.0, -3.0]))
     Array([  0., -18.], dtype=float64)
     """
-    if kind not in (*EFFECTS, *LAWS):
-        raise ValueError(f"unknown effect kind {kind!r}; known are {sorted((*EFFECTS, *LAWS))}.")
+    if kind not in known_effects():
+        raise ValueError(f"unknown effect kind {kind!r}; known are {sorted(known_effects())}.")
     wanted = effect_class(kind).parameters()
     if set(parameters) != set(wanted):
         raise ValueError(f"{kind} takes the parameters {list(wanted)}, not {sorted(parameters)}.")
@@ -190,7 +211,11 @@ def make_effect(kind: str, parameters: Mapping[str, float | Array | np.ndarray])
         require(f"`{name}` of {kind}", value, *wanted[name].rules)
     arrays = {k: jnp.asarray(v, dtype=jnp.float64) for k, v in parameters.items()}
     _check_tables(kind, arrays)
-    return effect_class(kind)(**arrays)
+    if at is None:
+        return effect_class(kind)(**arrays)
+    if not issubclass(effect_class(kind), AbstractForce):
+        raise ValueError(f"{kind} is no force: it cannot act at a point.")
+    return effect_class(kind)(**arrays, at=row_over_points(at))
 
 
 def _check_tables(kind: str, arrays: Mapping[str, Array]) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, Shaped
 
 from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.names import suggestion
 from snrmjax.numerics.rules import BELOW_ONE, POSITIVE, require
 from snrmjax.numerics.units import HERTZ
 
@@ -39,6 +40,13 @@ class LinearModes(eqx.Module):
     mode_of_interest: int = eqx.field(static=True, default=0)
     # 1σ, relative, of the modal masses 1/(Φ_r Φᵀb); None where nobody stated any.
     modal_mass_std: Float[Array, " mode"] | None = None
+    # Points that no sensor watches, at which forces may act.
+    points: tuple[str, ...] = eqx.field(static=True, default=())
+    point_shape: Float[Array, "point mode"] | None = None  # kg^-1/2
+    # ΦᵀCΦ less the 2ζω of its diagonal, 1/s; None for modal damping.
+    damping_coupling: Float[Array, "mode mode"] | None = None
+    # Of a force that acts on several points with different phases: the part of Φᵀb that lags by 90°
+    participation_lag: Float[Array, " mode"] | None = None  # kg^-1/2
 
     def __repr__(self) -> str:
         """A line for every mode; within `jax.jit` and for a batch, the fields' shapes."""
@@ -61,6 +69,19 @@ class LinearModes(eqx.Module):
         """Number of flexible modes."""
         return self.natural_frequency.shape[-1]
 
+    def shape_at(self, point: str) -> Float[Array, " mode"]:
+        """The modes' shape at a sensor or another point, kg^-1/2.
+
+        Raises `ValueError` for an unknown one.
+        """
+        if point in self.sensors:
+            return self.mode_shape[..., self.sensors.index(point), :]
+        if point in self.points and self.point_shape is not None:
+            return self.point_shape[..., self.points.index(point), :]
+        known = (*self.sensors, *self.points)
+        near = suggestion(point, known) or f"; known are {', '.join(known[:_SHOWN])}"
+        raise ValueError(f"a force acts at {point!r}, where the modes have no shape{near}.")
+
     @property
     def own_modal_mass_std(self) -> Float[Array, ""] | None:
         """1σ, relative, of the modal mass of the mode of interest; None where nobody stated it."""
@@ -78,6 +99,16 @@ def have_values(tree: object) -> bool:
     leaves = jax.tree.leaves(tree)
     kinds = (np.ndarray, jax.Array)
     return all(isinstance(a, kinds) and not isinstance(a, jax.core.Tracer) for a in leaves)
+
+
+class Beside(NamedTuple):
+    """What linear modes may have beside frequencies, damping ratios, shapes and participations."""
+
+    # Shapes at points that no sensor watches, kg^-1/2.
+    points: dict[str, Shaped[np.ndarray | Array, " mode"] | list[float]] | None = None
+    # Damping beside that of the damping ratios: ΦᵀCΦ less the 2ζω of its diagonal, 1/s.
+    damping_coupling: Shaped[np.ndarray | Array, "mode mode"] | None = None
+    participation_lag: Shaped[np.ndarray | Array, " mode"] | list[float] | None = None  # kg^-1/2
 
 
 class RigidBodyModes(NamedTuple):
@@ -107,13 +138,15 @@ def linear_modes(
     mode_of_interest: int = 0,
     rigid_body: RigidBodyModes | None = None,
     std: LinearModesStd | None = None,
+    beside: Beside | None = None,
 ) -> LinearModes:
     """Build `LinearModes` from arrays or lists, checking shapes and ranges.
 
     Arguments: natural frequencies in rad/s, damping as a fraction of critical, shapes at the
     sensors and participations Φᵀb in kg^-1/2; `rigid_body` modes likewise; `std` has the 1σ of
     frequencies and damping ratios, without which they are known exactly, and of modal masses
-    (relative), without which they are as `UNSTATED_MODAL_MASS_STD` says.
+    (relative), without which they are as `UNSTATED_MODAL_MASS_STD` says; `beside` has shapes at
+    points without a sensor, damping that couples the modes, and the part of a force that lags.
     Raises `ValueError` that names the argument whose shape or value is wrong. Numbers that are
     traced (within `jax.jit` and derivatives) are taken as they are.
 
@@ -165,7 +198,22 @@ def linear_modes(
             numbers[f"{name}_std"] = _vector(f"std.{name}", values, n_modes)
         elif name != "modal_mass":
             numbers[f"{name}_std"] = np.zeros(n_modes)
-    modes = LinearModes(**numbers, sensors=tuple(names), mode_of_interest=mode_of_interest)
+    further = beside or Beside()
+    points = further.points or {}
+    for name in points:
+        if name in names:
+            raise ValueError(f"`beside.points` has {name!r}, which is a sensor.")
+    if points:
+        rows = [_vector(f"beside.points[{k!r}]", row, n_modes) for k, row in points.items()]
+        numbers["point_shape"] = _numbers(rows)
+    if further.damping_coupling is not None:
+        numbers["damping_coupling"] = _coupling(further.damping_coupling, n_modes)
+    if further.participation_lag is not None:
+        lag = _vector("beside.participation_lag", further.participation_lag, n_modes)
+        numbers["participation_lag"] = lag
+    modes = LinearModes(
+        **numbers, sensors=tuple(names), mode_of_interest=mode_of_interest, points=tuple(points)
+    )
     # All at once: one by one they compile, a copy of every shape.
     return jax.device_put(modes, may_alias=False)
 
@@ -174,6 +222,18 @@ def _numbers(value: Any) -> Any:
     """An array of the host, or a traced one."""
     traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(value))
     return jnp.asarray(value, jnp.float64) if traced else np.asarray(value, dtype=np.float64)
+
+
+def _coupling(damping: Any, n_modes: int) -> Any:
+    """The matrix, checked."""
+    matrix = _numbers(damping)
+    require("`beside.damping_coupling`", matrix)
+    if matrix.shape != (n_modes, n_modes):
+        raise ValueError(
+            f"`beside.damping_coupling` must have shape ({n_modes}, {n_modes}), but has "
+            f"{matrix.shape}."
+        )
+    return matrix
 
 
 def _vector(name: str, value: object, size: int | None = None) -> Any:
@@ -226,14 +286,26 @@ def linear_response(
     >>> linear_response(modes, jnp.array(500.0), jnp.array(1.0)).real.round(6)
     Array([0.6], dtype=float64)
     """
-    return _modal_sum(
-        modes.mode_shape,
-        modes.participation,
-        modes.natural_frequency,
-        modes.damping_ratio,
-        frequency,
-        force,
-    ) + _rigid_body_velocity(modes, frequency, force)
+    omega = jnp.asarray(frequency)[..., None]
+    terms = modes.natural_frequency, modes.damping_ratio
+    stiffness = _dynamic_stiffness(*terms, omega)
+    load = phasor_of_load(modes)
+    if modes.damping_coupling is None:
+        modal = load / stiffness
+    else:
+        coupled = 1j * omega[..., None] * modes.damping_coupling
+        matrix = stiffness[..., None] * jnp.eye(modes.n_modes) + coupled
+        modal = jnp.linalg.solve(matrix, jnp.broadcast_to(load, stiffness.shape)[..., None])[..., 0]
+    modal = 1j * omega * modal * jnp.asarray(force)[..., None]
+    return jnp.einsum("...m,sm->...s", modal, modes.mode_shape) + _rigid_body_velocity(
+        modes, frequency, force
+    )
+
+
+def phasor_of_load(modes: LinearModes) -> Complex[Array, " mode"]:
+    """Φᵀb per newton of the recorded force as a phasor, kg^-1/2."""
+    lag = modes.participation_lag
+    return modes.participation - (0j if lag is None else 1j * lag)
 
 
 def reference_sensor(modes: LinearModes) -> int:
@@ -258,11 +330,13 @@ def _modal_sum(
     force: Float[Array, "*batch"],
 ) -> Complex[Array, "*batch sensor"]:
     omega = jnp.asarray(frequency)[..., None]
-    dynamic_stiffness = (
-        natural_frequency**2 - omega**2 + 2j * damping_ratio * natural_frequency * omega
-    )
+    dynamic_stiffness = _dynamic_stiffness(natural_frequency, damping_ratio, omega)
     modal = 1j * omega * participation * jnp.asarray(force)[..., None] / dynamic_stiffness
     return jnp.einsum("...m,sm->...s", modal, shape)
+
+
+def _dynamic_stiffness(natural_frequency: Array, damping_ratio: Array, omega: Array) -> Array:
+    return natural_frequency**2 - omega**2 + 2j * damping_ratio * natural_frequency * omega
 
 
 def _rigid_body_velocity(

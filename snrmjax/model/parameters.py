@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from snrmjax.model.effect_metadata import Entries
+from snrmjax.model.places import unit_at
 from snrmjax.model.potential import monomial_key
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.rules import BELOW_ONE, NOT_ZERO, POSITIVE, Rule
@@ -72,7 +73,8 @@ def parameter_unit(model: Structure, name: str) -> str:
     """The unit of the number that a name of `parameter_names` stands for; "1" for none."""
     part, entry, field, _ = _places(model)[name]
     if part == "effects":
-        return model.effects[entry].parameters()[field].unit
+        effect = model.effects[entry]
+        return unit_at(getattr(effect, "at", None), effect.parameters()[field].unit)
     if part == "potential":
         return f"J/(kg^1/2 m)^{len(model.potential.monomials[entry])}"
     return _MODE_UNITS[field]

@@ -22,7 +22,9 @@ from snrmjax.model.effect_base import (
     AbstractMemoryless,
     checked_effects,
 )
+from snrmjax.model.elements import elements_of
 from snrmjax.model.modes import LinearModes, have_values
+from snrmjax.model.places import row_text, unit_at
 from snrmjax.model.potential import PolynomialPotential, polynomial_potential
 from snrmjax.numerics.compiled import compiled
 
@@ -37,10 +39,24 @@ class LinearTerms(NamedTuple):
     mass: Float[Array, " mode"]  # relative to the modal mass
     damping: Float[Array, " mode"]  # 1/s
     stiffness: Float[Array, " mode"]  # 1/s²
+    coupling: Float[Array, "mode mode"] | None = None  # further damping, between modes, 1/s
+
+    def damped(self, rate: Float[Array, "*batch mode"]) -> Float[Array, "*batch mode"]:
+        """The damping force of velocities."""
+        own = self.damping * rate
+        return own if self.coupling is None else own + rate @ self.coupling.T
+
+    def damping_matrix(self) -> Float[Array, "mode mode"]:
+        """The whole damping matrix."""
+        own = jnp.diag(self.damping)
+        return own if self.coupling is None else own + self.coupling
 
 
 class Structure(eqx.Module):
     """q̈ + 2ζωq̇ + ω²q + ∂V/∂q + Σ effects = Φᵀb F(t), in modal coordinates q (kg^1/2 m).
+
+    A force f at points acts on x = (bΦ)q and adds (bΦ)ᵀ f(x, ẋ); one on the mode of interest adds
+    f(q, q̇) to that mode.
 
     `level_gain_std` (relative) and `level_phase_std` (rad) are 1σ errors that all measurements
     of one level share; `level_frequency_std` (rad/s) and `level_damping_std` (of the damping ratio)
@@ -68,11 +84,13 @@ class Structure(eqx.Module):
         lines = [f"Structure {self.name!r}", *repr(self.modes).splitlines()]
         lines.append(f"polynomial potential: {terms}")
         for effect in self.effects:
+            row = effect.at if isinstance(effect, AbstractForce) else None
             values = [
-                f"{name} {_text(getattr(effect, name))} {parameter.unit}".removesuffix(" 1")
-                for name, parameter in effect.parameters().items()
+                f"{name} {_text(getattr(effect, name))} {unit_at(row, of.unit)}".removesuffix(" 1")
+                for name, of in effect.parameters().items()
             ]
-            lines.append(f"effect {effect.kind}: {', '.join(values)}")
+            where = "" if row is None else f" at {row_text(row)}"
+            lines.append(f"effect {effect.kind}{where}: {', '.join(values)}")
         names = ("relative gain", "phase (rad)", "natural frequency (rad/s)", "damping ratio")
         stated = [f"{n} {s:.3g}" for n, s in zip(names, self.level_stds, strict=True) if s > 0]
         if stated:
@@ -99,6 +117,11 @@ class Structure(eqx.Module):
         return np.eye(self.n_modes)[self.modes.mode_of_interest]
 
     @property
+    def forces(self) -> tuple[AbstractForce, ...]:
+        """The effects that are forces."""
+        return tuple(e for e in self.effects if isinstance(e, AbstractForce))
+
+    @property
     def memoryless(self) -> tuple[AbstractMemoryless, ...]:
         """The effects whose force depends on the present state alone."""
         return tuple(e for e in self.effects if isinstance(e, AbstractMemoryless))
@@ -115,14 +138,6 @@ class Structure(eqx.Module):
         return tuple(e for e in self.effects if isinstance(e, kinds))
 
     @property
-    def pointwise(self) -> "Structure":
-        """The structure without the effects of `by_cycle`."""
-        by_cycle = {id(e) for e in self.by_cycle}
-        return dataclasses.replace(
-            self, effects=tuple(e for e in self.effects if id(e) not in by_cycle)
-        )
-
-    @property
     def measurement_effects(self) -> tuple[AbstractMeasurementEffect, ...]:
         """The effects that change what is recorded, in the order in which they act."""
         effects = [e for e in self.effects if isinstance(e, AbstractMeasurementEffect)]
@@ -132,14 +147,16 @@ class Structure(eqx.Module):
         """Mass 1, damping 2ζω and stiffness ω² of every mode, with the linear changes."""
         modes, j = self.modes, self.modes.mode_of_interest
         frequency, ratio, on_mode = modes.natural_frequency, modes.damping_ratio, self.own_mode
-        terms = LinearTerms(jnp.ones(self.n_modes), 2 * ratio * frequency, frequency**2)
+        mass, damping, stiffness = jnp.ones(self.n_modes), 2 * ratio * frequency, frequency**2
         for effect in self.effects:
             if isinstance(effect, AbstractLinearChange):
                 added = effect.linear_terms(frequency[j], ratio[j], self.test_order)
-                terms = LinearTerms(
-                    *(term + on_mode * change for term, change in zip(terms, added, strict=True))
+                mass, damping, stiffness = (
+                    mass + on_mode * added[0],
+                    damping + on_mode * added[1],
+                    stiffness + on_mode * added[2],
                 )
-        return terms
+        return LinearTerms(mass, damping, stiffness, modes.damping_coupling)
 
     def load_orders(self) -> Float[Array, " order"]:
         """Cosine amplitudes of the force's harmonics 0 to 3, relative to its fundamental."""
@@ -157,22 +174,23 @@ class Structure(eqx.Module):
 
         Arguments: equally spaced samples of one period.
         """
-        force, j = self.potential.force(displacement), self.modes.mode_of_interest
-        for effect in self.effects:
-            if isinstance(effect, AbstractForce):
-                values = effect.cycle_force(displacement[:, j], velocity[:, j])
-                force = force + values[:, None] * self.own_mode
-        return force
+        force = self.potential.force(displacement)
+        if not self.forces:
+            return force
+        elements = elements_of(self.forces, self.modes)
+        x, v = elements.displacement(displacement), elements.displacement(velocity)
+        return force + elements.on_modes(elements.cycle_force(x, v))
 
     def memoryless_force(
         self, displacement: Float[Array, "time mode"], velocity: Float[Array, "time mode"]
     ) -> Float[Array, "time mode"]:
         """The part of `nonlinear_force` without friction, at any samples, in kg^1/2 m/s²."""
-        force, j = self.potential.force(displacement), self.modes.mode_of_interest
-        for effect in self.memoryless:
-            values = jax.vmap(effect.force)(displacement[:, j], velocity[:, j])
-            force = force + values[:, None] * self.own_mode
-        return force
+        force = self.potential.force(displacement)
+        if not self.memoryless:
+            return force
+        elements = elements_of(self.memoryless, self.modes)
+        x, v = elements.displacement(displacement), elements.displacement(velocity)
+        return force + elements.on_modes(elements.force(x, v))
 
     def potential_energy(self, displacement: Float[Array, "*batch mode"]) -> Float[Array, "*batch"]:
         """Energy in J of a structure held at rest: linear, polynomial and of memoryless effects.
@@ -183,35 +201,26 @@ class Structure(eqx.Module):
         """
         linear = 0.5 * (displacement**2 @ self.linear_terms().stiffness)
         energy = linear + self.potential.energy(displacement)
+        if not self.memoryless:
+            return energy
         node, weight = np.polynomial.legendre.leggauss(64)
-        q = displacement[..., self.modes.mode_of_interest, None]
-        path = 0.5 * (jnp.asarray(node) + 1) * q
-        for effect in self.memoryless:
-            values = jnp.vectorize(effect.force)(path, jnp.zeros_like(path))
-            energy = energy + 0.5 * q[..., 0] * (values @ jnp.asarray(weight))
-        return energy
+        elements = elements_of(self.memoryless, self.modes)
+        x = elements.displacement(displacement)
+        path = (0.5 * (jnp.asarray(node) + 1))[:, None] * x[..., None, :]
+        values = elements.force(flat := path.reshape(-1, elements.n_places), jnp.zeros_like(flat))
+        mean = jnp.tensordot(values.reshape(path.shape), 0.5 * jnp.asarray(weight), ([-2], [0]))
+        return energy + jnp.sum(x * mean, axis=-1)
 
-    def tangent_stiffness(
+    def slopes(
         self, displacement: Float[Array, "time mode"], velocity: Float[Array, "time mode"]
-    ) -> Float[Array, "time mode mode"]:
-        """∂(force)/∂q at time samples, in 1/s²: potential and memoryless effects, no friction."""
-        tangent = self.potential.stiffness(displacement)
-        j = self.modes.mode_of_interest
-        for effect in self.memoryless:
-            slope = jax.vmap(jax.grad(effect.force, argnums=0))
-            tangent = tangent.at[:, j, j].add(slope(displacement[:, j], velocity[:, j]))
-        return tangent
-
-    def tangent_damping(
-        self, displacement: Float[Array, "time mode"], velocity: Float[Array, "time mode"]
-    ) -> Float[Array, " time"]:
-        """∂(force)/∂q̇ on the mode of interest at time samples, in 1/s: memoryless effects."""
-        j = self.modes.mode_of_interest
-        tangent = jnp.zeros(displacement.shape[0])
-        for effect in self.memoryless:
-            slope = jax.vmap(jax.grad(effect.force, argnums=1))
-            tangent = tangent + slope(displacement[:, j], velocity[:, j])
-        return tangent
+    ) -> tuple[Float[Array, "time mode mode"], Float[Array, "time mode mode"]]:
+        """∂(force)/∂q in 1/s² and ∂(force)/∂q̇ in 1/s: potential and memoryless effects."""
+        stiffness = self.potential.stiffness(displacement)
+        if not self.memoryless:
+            return stiffness, jnp.zeros_like(stiffness)
+        elements = elements_of(self.memoryless, self.modes)
+        by = elements.slopes(elements.displacement(displacement), elements.displacement(velocity))
+        return stiffness + elements.matrix(by.stiffness), elements.matrix(by.damping)
 
 
 @compiled
@@ -245,8 +254,8 @@ def structure(
     Arguments: `effects` one or several, whose parameters may be plain numbers; `level_gain_std`
     relative, `level_phase_std` in rad, `level_frequency_std` in rad/s, `level_damping_std` of the
     damping ratio.
-    Raises `ValueError` when potential and modes disagree about the number of modes, and for what
-    is no effect, such as a class whose parameters are not given.
+    Raises `ValueError` when potential and modes disagree about the number of modes, for what is no
+    effect, such as a class whose parameters are not given, and for a force at an unknown point.
     """
     if potential is None:
         potential = polynomial_potential({}, modes.n_modes)
@@ -254,10 +263,14 @@ def structure(
         raise ValueError(
             f"`potential` is for {potential.n_modes} modes, but `modes` has {modes.n_modes}."
         )
+    made = checked_effects(effects)
+    for effect in made:
+        for point, _ in getattr(effect, "at", None) or ():
+            modes.shape_at(point)
     return Structure(
         modes=modes,
         potential=potential,
-        effects=checked_effects(effects),
+        effects=made,
         level_gain_std=_number(level_gain_std),
         level_phase_std=_number(level_phase_std),
         level_frequency_std=_number(level_frequency_std),
@@ -362,7 +375,7 @@ def _energy_and_tangent(
     model: Structure, q: Float[Array, " mode"]
 ) -> tuple[Float[Array, ""], Float[Array, "mode mode"]]:
     """Potential energy and tangent stiffness, the linear part included, at rest."""
-    tangent = model.tangent_stiffness(q[None], jnp.zeros((1, q.size)))[0]
+    tangent = model.slopes(q[None], jnp.zeros((1, q.size)))[0][0]
     return model.potential_energy(q), jnp.diag(model.linear_terms().stiffness) + tangent
 
 
@@ -383,16 +396,23 @@ def displacement_scale(model: Structure) -> np.ndarray:
             reached_at = (squared[mode] / (degree * abs(value))) ** (1.0 / (degree - 2))
             scale[mode] = np.fmin(scale[mode], reached_at)
     if model.memoryless:
-        j = model.modes.mode_of_interest
-        grid = np.logspace(-12, 3, 601)
-        q = np.concatenate([[0.0], grid, -grid])
-        values = np.zeros(q.shape)
-        for effect in model.memoryless:
-            values += np.asarray(jax.vmap(effect.force)(jnp.asarray(q), jnp.zeros(q.shape)))
-        change = np.abs(values[1:] - values[0]).reshape(2, -1).max(axis=0)
-        reached = change > 0.1 * squared[j] * grid
-        # A bilinear stiffness is as strong at every displacement and sets no scale.
-        if reached.any() and not reached[0]:
-            scale[j] = np.fmin(scale[j], grid[np.argmax(reached)])
+        scale = np.fmin(scale, _scale_of_elements(model, squared))
     known = scale[np.isfinite(scale)]
     return np.where(np.isfinite(scale), scale, np.median(known) if known.size else 1e-3)
+
+
+def _scale_of_elements(model: Structure, squared: np.ndarray) -> np.ndarray:
+    """The displacement of each mode at which forces without memory change its own by a tenth."""
+    elements = elements_of(model.memoryless, model.modes)
+    rows, grid = np.asarray(elements.rows), np.logspace(-12, 3, 601)
+    q = np.concatenate([[0.0], grid, -grid])
+    scale = np.full(model.n_modes, np.nan)
+    for mode in np.flatnonzero(np.any(rows, axis=0)):
+        x = jnp.asarray(q[:, None] * rows[:, mode])
+        values = np.asarray(elements.force(x, jnp.zeros_like(x))) @ rows[:, mode]
+        change = np.abs(values[1:] - values[0]).reshape(2, -1).max(axis=0)
+        reached = change > 0.1 * squared[mode] * grid
+        # A bilinear stiffness is as strong at every displacement and sets no scale.
+        if reached.any() and not reached[0]:
+            scale[mode] = grid[np.argmax(reached)]
+    return scale

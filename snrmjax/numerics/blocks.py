@@ -3,13 +3,13 @@
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import wraps
+from functools import cache, wraps
 from typing import Any, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
 import numpy as np
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -127,10 +127,18 @@ def on_one_core(function: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(function)
     def alone(*arguments: P.args, **named: P.kwargs) -> R:
-        with threadpool_limits(limits=1, user_api="blas"):
+        with _linear_algebra().limit(limits=1, user_api="blas"):
             return function(*arguments, **named)
 
     return alone
+
+
+@cache
+def _linear_algebra() -> ThreadpoolController:
+    """The libraries of linear algebra: to look for them takes longer than many a small problem."""
+    import scipy.linalg  # noqa: F401  # brings a library of its own, which must be there by then
+
+    return ThreadpoolController()
 
 
 def as_arrays(tree: T) -> T:

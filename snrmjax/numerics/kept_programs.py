@@ -1,4 +1,4 @@
-"""The one door to programs that are kept on disk; `snrmjax.io.program_store` stands behind it."""
+"""The one door to programs that are kept on disk; `snrmjax.io.programs` stands behind it."""
 
 from collections.abc import Callable
 from typing import Any, Protocol

@@ -19,7 +19,7 @@ import jax
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from snrmjax.io.compilation_cache import WORTH_KEEPING, default_cache_folder
+from snrmjax.io.programs.compilation_cache import WORTH_KEEPING, default_cache_folder
 from snrmjax.study.computations.base import COMPLETE, Failure, MemberStatus, joined, with_refused
 from snrmjax.study.store import StudyFolder, write_chunk
 from snrmjax.study.study import Ensemble

@@ -42,6 +42,8 @@ from snrmjax.diagnose.search.model_search import find_effects
 from snrmjax.model.effects import EFFECTS
 from snrmjax.numerics.facts import Fact
 
+pytestmark = pytest.mark.usefixtures("optimised")
+
 
 @functools.cache
 def blind(name):

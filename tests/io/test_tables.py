@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from snrmjax.io.tables import group_states, read_steady_states, write_steady_states, write_table
 from snrmjax.measure.states import SteadyStates, join_steady_states, steady_states
-from snrmjax.model.beams import flat_beam
+from snrmjax.model.builders.beams import flat_beam
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
 

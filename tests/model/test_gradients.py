@@ -59,8 +59,7 @@ def of_structures(relative):
     return numbers(
         *(potential.energy(displacement), potential.force(displacement)),
         *(potential.stiffness(displacement), beam.nonlinear_force(displacement, velocity)),
-        *(beam.potential_energy(displacement), beam.tangent_stiffness(displacement, velocity)),
-        beam.tangent_damping(displacement, velocity),
+        *(beam.potential_energy(displacement), *beam.slopes(displacement, velocity)),
     )
 
 

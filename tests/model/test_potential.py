@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from snrmjax.model.beams import flat_beam
+from snrmjax.model.builders.beams import flat_beam
 from snrmjax.model.potential import (
     monomial_key,
     parse_monomial,

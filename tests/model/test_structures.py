@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from snrmjax.model.beams import flat_beam
+from snrmjax.model.builders.beams import flat_beam
 from snrmjax.model.effect_base import AbstractMemoryless
 from snrmjax.model.effects import EFFECTS, make_effect
 from snrmjax.model.modes import linear_modes
@@ -62,7 +62,7 @@ def test_effects_add_to_the_mode_of_interest_alone():
     model = with_all_effects()
     q = jnp.array([[0.3, -0.8], [1.1, 0.7], [-0.4, 0.1]])
     v = jnp.array([[2.0, 0.4], [-0.3, -1.2], [0.1, 0.9]])
-    force = np.asarray(model.nonlinear_force(q, v))
+    force = np.asarray(model.memoryless_force(q, v))
     # ∂V/∂q by hand.
     x, y = np.asarray(q).T
     by_hand = np.stack([1.5 * x**2 + 1.4 * x * y**2, 1.4 * x**2 * y - 0.6 * y**2], axis=1)
@@ -80,17 +80,15 @@ def test_tangents_against_central_differences():
     q = jnp.array([[0.3, -0.8], [1.1, 0.7], [-0.4, 0.1]])
     v = jnp.array([[2.0, 0.4], [-0.3, -1.2], [0.1, 0.9]])
     step = 1e-5
-    nonlinear_force = partial(eqx.filter_jit(type(model).nonlinear_force), model)
-    stiffness = np.asarray(eqx.filter_jit(type(model).tangent_stiffness)(model, q, v))
-    damping = np.asarray(eqx.filter_jit(type(model).tangent_damping)(model, q, v))
+    force = partial(eqx.filter_jit(type(model).memoryless_force), model)
+    stiffness, damping = map(np.asarray, eqx.filter_jit(type(model).slopes)(model, q, v))
     # h²/6·|f'''| ≤ 1e-10/6·120 and rounding 10·1e-16/1e-5.
     for mode in range(2):
         shift = step * jnp.eye(2)[mode]
-        slope = (nonlinear_force(q + shift, v) - nonlinear_force(q - shift, v)) / (2 * step)
+        slope = (force(q + shift, v) - force(q - shift, v)) / (2 * step)
         np.testing.assert_allclose(stiffness[:, :, mode], slope, rtol=0, atol=3e-9)
-        slope = (nonlinear_force(q, v + shift) - nonlinear_force(q, v - shift)) / (2 * step)
-        wanted = np.zeros((3, 2)) if mode == 0 else np.stack([np.zeros(3), damping], axis=1)
-        np.testing.assert_allclose(slope, wanted, rtol=0, atol=3e-9)
+        slope = (force(q, v + shift) - force(q, v - shift)) / (2 * step)
+        np.testing.assert_allclose(damping[:, :, mode], slope, rtol=0, atol=3e-9)
 
 
 def test_potential_energy_is_the_work_of_the_forces():
@@ -156,10 +154,11 @@ def test_friction_acts_over_the_cycle_and_nowhere_else():
     np.testing.assert_allclose(added[:, 0], wanted, rtol=0, atol=1e-14)
     assert np.max(np.abs(wanted)) > 1.0
     # Tangents: those of the part without friction.
-    stiffness = eqx.filter_jit(type(model).tangent_stiffness)(model, q, v)
-    damping = eqx.filter_jit(type(model).tangent_damping)(model, q, v)
+    stiffness, damping = eqx.filter_jit(type(model).slopes)(model, q, v)
     np.testing.assert_allclose(stiffness[:, 0, 0], 1.4 * y**2 + 3.9 * x**2, rtol=1e-13)
-    np.testing.assert_allclose(damping, 1.2 * abs(pace), rtol=1e-13)
+    np.testing.assert_allclose(damping[:, 0, 0], 1.2 * abs(pace), rtol=1e-13)
+    assert not np.any(damping[:, :, 1])
+    assert not np.any(damping[:, 1])
 
 
 def test_statics_know_linear_changes_and_no_friction():
@@ -289,12 +288,11 @@ def test_what_is_not_said_is_linear_and_exact():
     model = structure(modes_of(2.0, 3.0))
     q = jnp.ones((4, 2))
     assert not np.any(model.nonlinear_force(q, q))
-    assert model.tangent_stiffness(q, q).shape == (4, 2, 2)
-    assert model.tangent_damping(q, q).shape == (4,)
+    assert [not np.any(by) and by.shape == (4, 2, 2) for by in model.slopes(q, q)] == [True] * 2
     assert (float(model.level_gain_std), float(model.level_phase_std)) == (0.0, 0.0)
     assert float(model.test_order) == 0.0
     assert model.memoryless == model.hysteretic == model.measurement_effects == ()
-    mass, damping, stiffness = model.linear_terms()
+    mass, damping, stiffness, _ = model.linear_terms()
     np.testing.assert_array_equal(mass, [1.0, 1.0])
     np.testing.assert_array_equal(damping, [0.04, 0.06])
     np.testing.assert_array_equal(stiffness, [4.0, 9.0])

@@ -4,7 +4,12 @@ import numpy as np
 import pytest
 from truths.periodic_motions import NumpyBalance, TimeDomain, initial_state, spectrum_distance
 
-from snrmjax.model.beams import CURVED_BEAM_FORCES, FLAT_BEAM_FORCES, curved_beam, flat_beam
+from snrmjax.model.builders.beams import (
+    CURVED_BEAM_FORCES,
+    FLAT_BEAM_FORCES,
+    curved_beam,
+    flat_beam,
+)
 from snrmjax.simulate.solutions.forced_response import forced_response
 
 

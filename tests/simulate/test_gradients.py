@@ -88,7 +88,7 @@ def assert_gradients(function, failed):
 
 
 def test_periodic_motion(curve):
-    # Each condition by itself, without a member that fails: `solutions/test_periodic_motion.py`.
+    # The other conditions, without a member that fails: `solutions/test_periodic_motion.py`.
     coefficients, frequency = curve.point(int(curve.at_events("phase_resonance")[0]))
     # A start that is not finite, between two that are: nothing is found from it.
     starts = np.stack([coefficients, np.full_like(coefficients, np.nan), 1.001 * coefficients])
@@ -103,6 +103,10 @@ def test_periodic_motion(curve):
         return numbers_of(jax.vmap(motion_from)(jnp.asarray(starts)))
 
     assert_gradients(motions, failed=[1])
+    found, _, real, imaginary = np.asarray(motions(np.zeros(len(NAMES))))[0]
+    # The curve's own event: located with tangents late by 1e-6.
+    assert found == pytest.approx(frequency, rel=1e-6)
+    assert np.angle(real + 1j * imaginary) == pytest.approx(0.0, abs=1e-12)
 
 
 def test_periodic_motion_with_a_force_that_is_not_finite(curve):
@@ -111,13 +115,16 @@ def test_periodic_motion_with_a_force_that_is_not_finite(curve):
     @jax.jit
     def motions(shifts):
         force, model = changed(shifts)
+        value = 1.001 * start[1] * (1 + shifts[0])  # the frequency moves with the force
 
         def one(load):
-            return periodic_motion(model, load, start, value=start[1])
+            return periodic_motion(model, load, start, value=value)
 
         return numbers_of(jax.vmap(one)(jnp.stack([force, jnp.asarray(np.nan), 1.01 * force])))
 
     assert_gradients(motions, failed=[1])
+    found = np.asarray(motions(np.zeros(len(NAMES))))
+    assert found[0, 0] == pytest.approx(1.001 * start[1], rel=1e-14)
 
 
 def test_prescribed_motion():

@@ -4,7 +4,7 @@ import pytest
 from scipy import stats
 
 from snrmjax.identify.calibrate.calibrated_model import CalibratedModel
-from snrmjax.model.beams import curved_beam
+from snrmjax.model.builders.beams import curved_beam
 from snrmjax.model.parameters import with_stated_std
 from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
 from snrmjax.study.sampling import Sampling, drawn_members, member_seed, number_of_members

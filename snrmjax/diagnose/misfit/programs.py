@@ -209,9 +209,8 @@ def _where(
 
 
 def _samples(force: AbstractForce) -> int:
-    if isinstance(force, AbstractKinked):
-        return 512
-    return 128 if isinstance(force, AbstractMemoryless) else 256
+    plain = isinstance(force, AbstractMemoryless) and not isinstance(force, AbstractKinked)
+    return 128 if plain else 256
 
 
 def _quick(effect: AbstractEffect, harmonics: int, *, quick: bool) -> AbstractForce:

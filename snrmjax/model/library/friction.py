@@ -2,13 +2,16 @@
 
 A slider with the stuck stiffness k_t and the slip displacement x_s is a spring k_t to a block
 that rests on a friction surface. The block's position z is pushed along where the spring's
-stretch q − z would exceed ±x_s (the "play" of q). The linear frequency is that of the stuck
-structure, so what a slider adds is k_t (q − z) − k_t q = −k_t z: nothing before the first slip.
+stretch q − z would exceed ±x_s (the "play" of q). On the mode of interest the linear frequency is
+that of the stuck structure, so that a slider adds k_t (q − z) − k_t q = −k_t z: nothing before the
+first slip. At points it is the whole force k_t (x − z), of which the structure holds no part.
 
 Reference: Iwan, ASME J. Appl. Mech. 33 (1966), 893, doi:10.1115/1.3625199.
 """
 
+import dataclasses
 from abc import abstractmethod
+from collections.abc import Callable
 from typing import ClassVar, NamedTuple, Self
 
 import equinox as eqx
@@ -105,12 +108,17 @@ class AbstractSliders(AbstractHysteresis):
     def sliders(self) -> Sliders:
         """The sliders, for integration in time."""
 
+    def added_stiffness(self) -> Scalar:
+        """What the stuck sliders add to the structure: of a force at points all their springs."""
+        return jnp.zeros(()) if self.at is None else jnp.sum(self.sliders().stiffness)
+
     def initial_states(self) -> States:
         return jnp.zeros_like(self.sliders().slip_displacement)
 
     def state_force(self, displacement: Scalar, velocity: Scalar, states: States) -> Scalar:
         """Errors of an integrator's positions are removed."""
-        return -jnp.sum(self.sliders().stiffness * self.moved_states(displacement, states))
+        lost = jnp.sum(self.sliders().stiffness * self.moved_states(displacement, states))
+        return self.added_stiffness() * displacement - lost
 
     def state_rate(self, displacement: Scalar, velocity: Scalar, states: States) -> States:
         """The velocity q̇ while a slider is dragged, otherwise 0."""
@@ -132,12 +140,19 @@ class AbstractSliders(AbstractHysteresis):
         return settled_positions(displacement, self.sliders().slip_displacement)
 
     def cycle_force(self, displacement: Samples, velocity: Samples) -> Samples:
-        return self.settled_states(displacement, velocity) @ -self.sliders().stiffness
+        return self.for_cycle(displacement)._force_on(displacement, settled_positions)
 
     def quick_cycle_force(self, displacement: Samples, velocity: Samples) -> Samples:
         """Over a cycle between two turning points."""
-        sliders = self.sliders()
-        return slipped_position(displacement, sliders.slip_displacement) @ -sliders.stiffness
+        return self.for_cycle(displacement)._force_on(displacement, slipped_position)
+
+    def for_cycle(self, displacement: Samples) -> Self:
+        """The sliders that resolve a cycle; the effect itself where they do not depend on it."""
+        return self
+
+    def _force_on(self, displacement: Samples, positions: Callable[..., Array]) -> Samples:
+        stiffness, slip = self.sliders()
+        return self.added_stiffness() * displacement - positions(displacement, slip) @ stiffness
 
 
 class JenkinsSlider(AbstractSliders):
@@ -226,8 +241,11 @@ class IwanMicroslip(AbstractSliders):
 
         They hold for motions with |q| up to `largest`: beyond it, slip is missing.
         """
-        fields = (self.coefficient, self.exponent, jnp.asarray(largest, dtype=jnp.float64))
-        return type(self)(*fields)
+        return dataclasses.replace(self, largest_slip=jnp.asarray(largest, dtype=jnp.float64))
+
+    def added_stiffness(self) -> Scalar:
+        """Nothing: its sliders never all stick, and what slip takes away is all that is stated."""
+        return jnp.zeros(())
 
     def sliders(self) -> Sliders:
         """Raises `ValueError` before `with_thresholds`."""
@@ -316,7 +334,8 @@ class CoulombFriction(AbstractHysteresis):
         return jnp.where(moving, self.force * jnp.tanh(velocity / width), 0.0)
 
     def scaled_for(self, displacement: Scalar, velocity: Scalar) -> Self:
-        return type(self)(self.force, SMOOTHING * jnp.asarray(velocity, dtype=jnp.float64))
+        width = SMOOTHING * jnp.asarray(velocity, dtype=jnp.float64)
+        return dataclasses.replace(self, smoothing_velocity=width)
 
     def initial_states(self) -> States:
         return jnp.zeros(0)

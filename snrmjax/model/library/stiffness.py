@@ -5,7 +5,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 import numpy as np
 
-from snrmjax.model.effect_base import AbstractKinked, AbstractMemoryless, Scalar, Starts, ramp
+from snrmjax.model.effect_base import AbstractKinked, AbstractMemoryless, Scalar, Starts
 from snrmjax.model.effect_metadata import (
     NOT_BELOW_ZERO,
     Argument,
@@ -17,6 +17,7 @@ from snrmjax.model.effect_metadata import (
     Symmetry,
     parameter,
 )
+from snrmjax.model.kinks import Kinks
 from snrmjax.model.library.confusions import (
     ONE_SIDED_OR_TWO_SIDED,
     STRUCTURE_OR_FORCE_SPECTRUM,
@@ -111,8 +112,12 @@ class BilinearStiffness(AbstractKinked):
         """A twentieth of the linear stiffness, with either sign."""
         return [(0.05 * scales.frequency**2,), (-0.05 * scales.frequency**2,)]
 
-    def rounded_force(self, displacement: Scalar, velocity: Scalar, width: Scalar) -> Scalar:
-        return 0.5 * self.stiffness * (ramp(displacement, width) + ramp(-displacement, width))
+    def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
+        return 0.5 * self.stiffness * jnp.abs(displacement)
+
+    def kinks(self) -> Kinks:
+        stiffness = jnp.asarray(self.stiffness)[None]
+        return Kinks(jnp.zeros_like(stiffness), stiffness)
 
 
 class GapStiffness(AbstractKinked):
@@ -138,9 +143,13 @@ class GapStiffness(AbstractKinked):
         """Gaps at several shares of the largest amplitude."""
         return _contact_starts(scales, 3.0)
 
-    def rounded_force(self, displacement: Scalar, velocity: Scalar, width: Scalar) -> Scalar:
-        above = ramp(displacement - self.gap, width)
-        return self.stiffness * (above - ramp(-displacement - self.gap, width))
+    def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
+        above = jnp.maximum(displacement - self.gap, 0.0)
+        return self.stiffness * (above - jnp.maximum(-displacement - self.gap, 0.0))
+
+    def kinks(self) -> Kinks:
+        gap, stiffness = jnp.asarray(self.gap), jnp.asarray(self.stiffness)
+        return Kinks(jnp.stack([gap, -gap]), jnp.stack([stiffness, -stiffness]))
 
 
 class OneSidedStop(AbstractKinked):
@@ -163,8 +172,11 @@ class OneSidedStop(AbstractKinked):
         """Gaps at several shares of the largest amplitude."""
         return _contact_starts(scales, 6.0)
 
-    def rounded_force(self, displacement: Scalar, velocity: Scalar, width: Scalar) -> Scalar:
-        return self.stiffness * ramp(displacement - self.gap, width)
+    def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
+        return self.stiffness * jnp.maximum(displacement - self.gap, 0.0)
+
+    def kinks(self) -> Kinks:
+        return Kinks(jnp.asarray(self.gap)[None], jnp.asarray(self.stiffness)[None])
 
 
 class StaticPreload(AbstractMemoryless):

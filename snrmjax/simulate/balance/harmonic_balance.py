@@ -10,8 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from snrmjax.model.averaging import AveragedForce, averaged_effect
-from snrmjax.model.effect_base import AbstractForce, AbstractKinked
+from snrmjax.model.averaging import AveragedForce
+from snrmjax.model.effect_base import AbstractHysteresis, AbstractKinked
+from snrmjax.model.elements import elements_of
+from snrmjax.model.modes import phasor_of_load
 from snrmjax.model.structures import Structure, linear_terms_of
 from snrmjax.numerics.compiled import compiled
 from snrmjax.simulate.balance.harmonics import (
@@ -20,6 +22,8 @@ from snrmjax.simulate.balance.harmonics import (
     squared_orders,
     tangent_blocks,
 )
+
+_BY_CYCLE = (AbstractHysteresis, AbstractKinked)  # whose force needs the whole cycle
 
 
 class HarmonicBalance(eqx.Module):
@@ -81,6 +85,9 @@ class HarmonicBalance(eqx.Module):
         orders = np.arange(min(len(spectrum), self.harmonic_order + 1))
         cosines = np.eye(self.n_coefficients)[:, np.maximum(2 * orders - 1, 0)]
         load = jnp.outer(cosines @ spectrum[: len(orders)], model.modes.participation)
+        if model.modes.participation_lag is not None:
+            sine = np.eye(self.n_coefficients)[2] * spectrum[1]
+            load = load + jnp.outer(sine, model.modes.participation_lag)
         return load.reshape(-1) / (self.frequency_scale**2 * self.displacement_scale)
 
     def residual(self, point: Float[Array, " unknown"]) -> Float[Array, " equation"]:
@@ -98,7 +105,7 @@ class HarmonicBalance(eqx.Module):
         n, size = model.n_modes, self.n_coefficients
         basis = harmonic_basis(self.harmonic_order, self.n_samples, cosine_only=self.cosine_only)
         terms = model.linear_terms()
-        stiffness, damping = terms.stiffness / fs**2, terms.damping / fs
+        stiffness = terms.stiffness / fs**2
         h2 = squared_orders(self.harmonic_order, cosine_only=self.cosine_only)[:, None]
         inertia = h2 * terms.mass
         x, omega = point[:-1].reshape(size, n), point[-1]
@@ -108,50 +115,59 @@ class HarmonicBalance(eqx.Module):
         rate = omega * by_omega
         unit = fs**2 * self.displacement_scale
         internal = jnp.asarray(basis.analysis) @ (model.nonlinear_force(samples, rate) / unit)
-        balance = (stiffness - omega**2 * inertia) * x + omega * damping * slope + internal
+        damped = terms.damped(slope) / fs
+        balance = (stiffness - omega**2 * inertia) * x + omega * damped + internal
         residual = balance.reshape(-1) - self.force * self.load()
         if not with_jacobian:
             return residual, jnp.zeros((0,))
-        tangent = model.pointwise.tangent_stiffness(samples, rate) / fs**2 + jnp.diag(stiffness)
         # Adding zeros beside the diagonal is faster than writing to its entries one by one.
-        squared, once = np.diag(h2[:, 0])[..., None, None], basis.derivative[..., None, None]
-        blocks = tangent_blocks(basis, tangent) - squared * (omega**2 * jnp.diag(terms.mass))
-        blocks = (blocks + once * (omega * jnp.diag(damping))).transpose(0, 2, 1, 3)
-        column = damping * slope - 2 * omega * inertia * x
-        if model.effects:
-            added, by_rate = self._effects(samples, rate, by_omega, omega)
-            j = model.modes.mode_of_interest
-            blocks = blocks.at[:, j, :, j].add(added)
-            column = column.at[:, j].add(by_rate)
+        of_inertia = np.diag(h2[:, 0])[..., None, None]
+        of_damping = basis.derivative[..., None, None]
+        if model.potential.monomials:
+            tangent = model.potential.stiffness(samples) / fs**2 + jnp.diag(stiffness)
+            blocks = tangent_blocks(basis, tangent)
+        else:
+            blocks = jnp.eye(size)[..., None, None] * jnp.diag(stiffness)
+        blocks = blocks - of_inertia * (omega**2 * jnp.diag(terms.mass))
+        blocks = blocks + of_damping * (omega * terms.damping_matrix() / fs)
+        column = damped - 2 * omega * inertia * x
+        if model.forces:
+            added, by_omega = self._elements(samples, by_omega, omega)
+            blocks, column = blocks + added, column + by_omega
+        blocks = blocks.transpose(0, 2, 1, 3)
         by_x = blocks.reshape(size * n, size * n)
         return residual, jnp.concatenate([by_x.T, column.reshape(1, -1)]).T
 
-    def _effects(
-        self, samples: Array, rate: Array, by_omega: Array, omega: Array
-    ) -> tuple[Array, Array]:
-        """What velocity and history add on the mode of interest: the block and the λ column."""
-        model, j = self.model, self.model.modes.mode_of_interest
+    def _elements(
+        self, samples: Array, by_omega: Array, omega: Array
+    ) -> tuple[Float[Array, "coefficient coefficient mode mode"], Float[Array, "coefficient mode"]]:
+        """What forces of effects add to the blocks and to the column of λ."""
+        model, fs = self.model, self.frequency_scale
         basis = harmonic_basis(self.harmonic_order, self.n_samples, cosine_only=self.cosine_only)
-        unit = self.frequency_scale**2 * self.displacement_scale
-        q, v, v_omega = samples[:, j], rate[:, j], by_omega[:, j]
-        viscous = model.pointwise.tangent_damping(samples, rate)
-        viscous_blocks = tangent_blocks(basis, viscous[:, None])[:, :, 0] @ basis.derivative
-        block = viscous_blocks * (omega / self.frequency_scale)
-        change = viscous * v_omega
-        if model.by_cycle:
-
-            def cycle(q: Array, v: Array) -> Array:
-                return sum((e.cycle_force(q, v) for e in model.by_cycle), jnp.zeros_like(q))
+        unit = fs**2 * self.displacement_scale
+        elements = elements_of(model.forces, model.modes)
+        x, v_omega = elements.displacement(samples), elements.displacement(by_omega)
+        v = omega * v_omega
+        slopes = elements.without(_BY_CYCLE).slopes(x, v)
+        block = tangent_blocks(basis, slopes.stiffness / fs**2)
+        viscous = tangent_blocks(basis, slopes.damping / fs)
+        block = block + omega * jnp.einsum("cep,ed->cdp", viscous, basis.derivative)
+        change = slopes.damping * v_omega / unit
+        by_cycle = elements.only(_BY_CYCLE)
+        if by_cycle.groups:
 
             def along(direction: Array, direction_rate: Array) -> Array:
-                return jax.jvp(cycle, (q, v), (direction, direction_rate))[1]
+                return jax.jvp(by_cycle.cycle_force, (x, v), (direction, direction_rate))[1] / unit
 
+            # One direction moves all places: a force feels its own alone.
             shapes = jnp.asarray(basis.synthesis.T) * self.displacement_scale
             rates = jnp.asarray((basis.synthesis @ basis.derivative).T)
-            rates = rates * (omega * self.frequency_scale * self.displacement_scale)
-            block = block + basis.analysis @ jax.vmap(along)(shapes, rates).T / unit
-            change = change + along(jnp.zeros_like(q), v_omega)
-        return block, jnp.asarray(basis.analysis) @ change / unit
+            rates = rates * (omega * fs * self.displacement_scale)
+            every = jnp.ones(elements.n_places)
+            by_shape = jax.vmap(along)(shapes[..., None] * every, rates[..., None] * every)
+            block = block + jnp.einsum("ct,dtp->cdp", basis.analysis, by_shape)
+            change = change + along(jnp.zeros_like(x), v_omega)
+        return elements.matrix(block), elements.on_modes(jnp.asarray(basis.analysis) @ change)
 
 
 def harmonic_balance(
@@ -197,11 +213,10 @@ def samples_for(model: Structure, harmonic_order: int, n_samples: int | None) ->
         )
     if n_samples is None:
         n_samples = alias_free_samples(harmonic_order, max(model.potential.degree - 1, 1))
-        if any(isinstance(effect, AbstractForce) for effect in model.effects):
+        if model.forces:
             n_samples = max(n_samples, 128, 16 * harmonic_order)
         if model.by_cycle:
-            kinked = any(isinstance(e, AbstractKinked) for e in model.effects)
-            n_samples = max(n_samples, 512 if kinked else 256)
+            n_samples = max(n_samples, 256)
     return n_samples
 
 
@@ -221,7 +236,7 @@ def truncation_error(
     x = jnp.moveaxis(coefficients, 0, 2)
     synthesis = basis.synthesis[:, : 2 * order + 1]
     samples = jnp.tensordot(synthesis, x, axes=1)  # (time, mode, point)
-    if any(isinstance(effect, AbstractForce) for effect in model.effects):
+    if model.forces:
         slopes = (basis.synthesis @ basis.derivative)[:, : 2 * order + 1]
         rate = frequency * jnp.tensordot(slopes, x, axes=1)
         values = jax.vmap(model.nonlinear_force, in_axes=2, out_axes=2)(samples, rate)
@@ -244,9 +259,12 @@ def linear_coefficients(
     model: Structure, force: Float[Array, ""], frequency: Float[Array, ""], harmonic_order: int
 ) -> Float[Array, "coefficient mode"]:
     """Displacement coefficients of the linear response: where a forced response starts."""
-    terms = model.linear_terms()
+    terms, load = model.linear_terms(), force * phasor_of_load(model.modes)
     stiffness = terms.stiffness - terms.mass * frequency**2 + 1j * terms.damping * frequency
-    phasor = force * model.modes.participation / stiffness
+    if terms.coupling is None:
+        phasor = load / stiffness
+    else:
+        phasor = jnp.linalg.solve(jnp.diag(stiffness) + 1j * frequency * terms.coupling, load)
     start = jnp.zeros((2 * harmonic_order + 1, model.n_modes))
     return start.at[1].set(phasor.real).at[2].set(-phasor.imag)
 
@@ -259,7 +277,7 @@ def resonance_displacement(model: Structure, force: float) -> float:
     at least the static displacement of every mode, so that no motion is small beside it.
     """
     modes, j = model.modes, model.modes.mode_of_interest
-    mass, damping, stiffness = (np.asarray(part) for part in linear_terms_of(model))
+    mass, damping, stiffness = (np.asarray(part) for part in linear_terms_of(model)[:3])
     participation = np.asarray(modes.participation)
     omega = np.sqrt(stiffness[j] / mass[j])
     least_damping = 1e-4 * omega
@@ -275,19 +293,35 @@ def resonance_displacement(model: Structure, force: float) -> float:
     amplitude = largest * np.logspace(-9, 0, 361)
     needed_stiffness = stiffness[j] + quartic * amplitude**2
     viscous = np.full(amplitude.shape, damping[j])
-    forces = tuple(e for e in model.effects if isinstance(e, AbstractForce))
-    if forces:
-        added = _averages(forces, jnp.asarray(amplitude), jnp.asarray(omega))
-        needed_stiffness = needed_stiffness + np.maximum(np.asarray(added.stiffness), 0.0)
-        viscous = viscous + np.asarray(added.damping)
+    if model.forces:
+        row = np.asarray(elements_of(model.forces, modes).rows)[:, j]
+        there = np.abs(row) * amplitude[:, None]
+        each = jax.vmap(averaged_at_places, (None, 0, None))(model, there, omega)
+        stiffer, damped = (np.asarray(part) @ row**2 for part in each)
+        needed_stiffness = needed_stiffness + np.maximum(stiffer, 0.0)
+        viscous = viscous + damped
     needed = np.maximum(viscous, least_damping) * np.sqrt(needed_stiffness) * amplitude
     return float(np.maximum(static, np.interp(load, np.maximum.accumulate(needed), amplitude)))
 
 
 @compiled
-def _averages(effects: tuple[AbstractForce, ...], amplitude: Array, omega: Array) -> AveragedForce:
-    """What all effects together do to a mode, by averaging."""
-    each = [averaged_effect(effect, amplitude, omega, n_samples=128) for effect in effects]
+def averaged_at_places(
+    model: Structure, amplitude: Float[Array, " place"], frequency: Float[Array, ""]
+) -> AveragedForce:
+    """What the forces of effects add to stiffness and damping at their places, by averaging.
+
+    Arguments: amplitudes of x there, places in the order of `elements_of`; `frequency` in rad/s.
+    Nothing where the amplitude is zero.
+    """
+    elements, beta = (
+        elements_of(model.forces, model.modes),
+        2 * np.pi * np.arange(128)[:, None] / 128,
+    )
+    x, v = amplitude * np.cos(beta), -amplitude * frequency * np.sin(beta)
+    force = elements.cycle_force(x, v)
+    moves = amplitude > 0
+    size = jnp.where(moves, amplitude, 1.0)
+    cosine, sine = 2 * jnp.mean(force * np.cos(beta), 0), 2 * jnp.mean(force * np.sin(beta), 0)
     return AveragedForce(
-        *(sum(part, jnp.zeros_like(amplitude)) for part in zip(*each, strict=True))
+        jnp.where(moves, cosine / size, 0.0), jnp.where(moves, -sine / (size * frequency), 0.0)
     )

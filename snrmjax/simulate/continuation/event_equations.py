@@ -118,10 +118,12 @@ class EventEquations(eqx.Module):
         basis = harmonic_basis(balance.harmonic_order, balance.n_samples)
         terms, eye = balance.model.linear_terms(), jnp.eye(balance.n_coefficients)
         by_rate = 2 * motion[-1] * jnp.kron(jnp.asarray(basis.derivative), jnp.diag(terms.mass))
-        by_rate = by_rate + jnp.kron(eye, jnp.diag(terms.damping / balance.frequency_scale))
-        if balance.model.effects:
-            viscous = tangent_blocks(basis, self._viscous(balance, motion)[:, None])[:, :, 0]
-            by_rate = by_rate + jnp.kron(viscous, jnp.diag(balance.model.own_mode))
+        by_rate = by_rate + jnp.kron(eye, terms.damping_matrix() / balance.frequency_scale)
+        if balance.model.memoryless:
+            size, n = balance.n_coefficients, balance.model.n_modes
+            viscous = self._viscous(balance, motion).reshape(-1, n * n)
+            blocks = tangent_blocks(basis, viscous).reshape(size, size, n, n)
+            by_rate = by_rate + blocks.transpose(0, 2, 1, 3).reshape(by_rate.shape)
         inertia = jnp.diag(jnp.tile(terms.mass, balance.n_coefficients))
         return jacobian[:, :size] + 1j * second * by_rate - point[-2] * inertia
 
@@ -147,22 +149,22 @@ class EventEquations(eqx.Module):
         terms = balance.model.linear_terms()
         rows = vector.reshape(balance.n_coefficients, -1)
         rate = 2 * motion[-1] * terms.mass * (jnp.asarray(basis.derivative) @ rows)
-        rate = rate + terms.damping / balance.frequency_scale * rows
-        if balance.model.effects:
-            j = balance.model.modes.mode_of_interest
-            samples = self._viscous(balance, motion) * (jnp.asarray(basis.synthesis) @ rows[:, j])
-            rate = rate.at[:, j].add(jnp.asarray(basis.analysis) @ samples)
+        rate = rate + terms.damped(rows) / balance.frequency_scale
+        if balance.model.memoryless:
+            samples = jnp.asarray(basis.synthesis) @ rows
+            forces = jnp.einsum("tmn,tn->tm", self._viscous(balance, motion), samples)
+            rate = rate + jnp.asarray(basis.analysis) @ forces
         inertia = terms.mass * rows
         return still + (1j * second * rate - point[-2] * inertia).reshape(-1)
 
-    def _viscous(self, balance: HarmonicBalance, motion: Point) -> Float[Array, " time"]:
+    def _viscous(self, balance: HarmonicBalance, motion: Point) -> Float[Array, "time mode mode"]:
         """∂(force)/∂q̇ over a period, over the frequency's scale."""
         basis = harmonic_basis(balance.harmonic_order, balance.n_samples)
         x = balance.coefficients(motion)
         samples = jnp.asarray(basis.synthesis) @ x
         speed = motion[-1] * balance.frequency_scale
         rate = jnp.asarray(basis.synthesis @ basis.derivative) @ x * speed
-        return balance.model.tangent_damping(samples, rate) / balance.frequency_scale
+        return balance.model.slopes(samples, rate)[1] / balance.frequency_scale
 
     def _doubled(self, point: Point) -> tuple[HarmonicBalance, np.ndarray]:
         """The balance over two periods, and which of its equations are of odd harmonics."""

@@ -8,7 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from snrmjax.model.effect_base import AbstractForce, AbstractHysteresis
+from snrmjax.model.effect_base import AbstractHysteresis, AbstractKinked
+from snrmjax.model.elements import Elements, elements_of
+from snrmjax.model.kinks import crossings
 from snrmjax.model.library.friction import AbstractSliders
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.compiled import compiled
@@ -17,13 +19,19 @@ _MOST_SEGMENTS = 256
 _SEGMENT = 32  # steps whose propagators, or kicks, are computed side by side
 _KICKS = 3  # for every step of Magnus' method
 _LEAST_KICKS = 240
+_CONTACT_SAMPLES = 512  # over a period, among which contacts are looked for
 _GAUSS = np.array([0.5 - np.sqrt(0.15), 0.5, 0.5 + np.sqrt(0.15)])
 
 
-class _Memory(NamedTuple):
-    """Sliders' part in the linearised motion."""
+class _Friction(NamedTuple):
+    """Friction's part in the linearised motion; sliders by the places at which they act."""
 
-    stiffness: Float[Array, "point slider"]
+    begin: Float[Array, " point"]  # phase at which the period begins
+    stuck: Float[Array, "point mode mode"]  # stiffness of springs that the modes do not hold, 1/s²
+    viscous: tuple[tuple[AbstractHysteresis, Elements], ...]  # without memory, one of every point
+    places: Elements  # of the sliders, one force each
+    owner: np.ndarray  # (slider,) the place of each
+    stiffness: Float[Array, "point slider"]  # 1/s²
     dragged: Bool[Array, "step point slider"]
 
 
@@ -36,9 +44,10 @@ def monodromy(
 ) -> Float[Array, "point state state"]:
     """The linearised map of (δq, δq̇ over the fastest natural frequency) over one period.
 
-    NaN where more steps would be needed than any sensible motion needs.
+    Behind them stand the positions of sliders at other places than the first one's, where there
+    are any. NaN where more steps would be needed than any sensible motion needs.
     """
-    if any(isinstance(effect, AbstractForce) for effect in model.effects):
+    if model.forces or model.modes.damping_coupling is not None:
         return _by_magnus(model, coefficients, frequency, steps_per_cycle)
     return _by_kicks(model, coefficients, frequency, steps_per_cycle)
 
@@ -129,60 +138,107 @@ def _by_magnus(
     other.
     Reference: Blanes, Casas & Ros, BIT 40 (2000) 434, Eq. (3.10), doi:10.1023/A:1022311628317.
     """
-    n, j, n_points = model.n_modes, model.modes.mode_of_interest, frequency.shape[0]
+    n, n_points = model.n_modes, frequency.shape[0]
     terms = model.linear_terms()
-    begin, friction, memory = _sliders(model, coefficients, frequency)
+    friction = _friction(model, coefficients, frequency)
     phases = 2 * jnp.pi * jnp.arange(48)[:, None] / 48
     k, c = _tangents(model, friction, coefficients, frequency, phases)
     rate = jnp.sqrt(jnp.max(jnp.sum(jnp.abs(k), axis=-1)))
-    cycles = jnp.nan_to_num(jnp.maximum(rate, 0.5 * jnp.max(c)))
+    cycles = jnp.nan_to_num(jnp.maximum(rate, 0.5 * jnp.max(jnp.sum(jnp.abs(c), axis=-1))))
     n_segments, step = _segments(jnp.maximum(steps_per_cycle * cycles, 512), _MOST_SEGMENTS)
+    contacts = _contacts(model, coefficients, frequency, friction.begin)
     unit = jnp.sqrt(jnp.max(terms.stiffness / terms.mass)) / frequency  # of δq̇, over Ω
-    size = 2 * n + (memory is not None)
+    places, owner, n_places = friction.places, friction.owner, friction.places.n_places
+    size, n_dragged = 2 * n + n_places, len(friction.dragged)
+    of_place = np.eye(n_places)[owner]  # (slider, place)
 
-    def generators(start: Array, held: Array | None) -> Array:
+    def generators(start: Array, length: Array, held: Array) -> Array:
         """The matrices A of y' = A y at the Gauss points of a segment's steps."""
-        tau = start + step * (jnp.arange(_SEGMENT)[:, None] + _GAUSS).reshape(-1)
-        k, c = _tangents(model, friction, coefficients, frequency, begin + tau[:, None])
+        tau = start[:, None] + length[:, None] * _GAUSS[:, None]
+        tau = friction.begin + tau.reshape(-1, n_points)
+        k, c = _tangents(model, friction, coefficients, frequency, tau)
         a = jnp.zeros((len(tau), n_points, size, size))
-        if memory is not None and held is not None:
-            per_mass = memory.stiffness / (terms.mass[j] * frequency**2)[:, None]
-            dragged = jnp.repeat(jnp.sum(jnp.where(held, 0.0, per_mass), axis=2), 3, axis=0)
-            k = k.at[:, :, j, j].add(-dragged)
-            a = a.at[:, :, n + j, 2 * n].set(1.0 / unit)
+        if n_places:
+            loose = jnp.where(held, 0.0, friction.stiffness) @ of_place
+            moving = places.matrix(jnp.repeat(loose, 3, axis=0))
+            k = k - moving / (terms.mass * frequency[:, None] ** 2)[..., None]
+            pulls = jnp.broadcast_to(places.rows.T, (n, n_places)) / terms.mass[:, None]
+            a = a.at[:, :, n : 2 * n, 2 * n :].set(pulls / (unit * frequency**2)[:, None, None])
         modes = np.arange(n)
         a = a.at[:, :, modes, n + modes].set(unit[:, None])
         a = a.at[:, :, n : 2 * n, :n].set(-k / unit[:, None, None])
-        a = a.at[:, :, n + modes, n + modes].set(-c)
+        a = a.at[:, :, n : 2 * n, n : 2 * n].set(-c)
         return a.reshape(_SEGMENT, 3, n_points, size, size)
 
     def segment(number: Array, state: tuple) -> tuple:
-        held = None
-        if memory is not None:
-            index = (number * _SEGMENT + jnp.arange(_SEGMENT)) * len(memory.dragged)
-            held = ~memory.dragged[index // (n_segments * _SEGMENT)]
-        start = number * _SEGMENT * step
-        propagators = _magnus(generators(start, held), step)
+        index = (number * _SEGMENT + jnp.arange(_SEGMENT)) * n_dragged
+        held = ~friction.dragged[index // (n_segments * _SEGMENT)]
+        ends = _step_ends(number * _SEGMENT + jnp.arange(_SEGMENT + 1), step, contacts)
+        length = ends[1:] - ends[:-1]
+        per_step = generators(ends[:-1], length, held)
+        propagators = _magnus(per_step, length[..., None, None])
 
         def advance(state: tuple, item: tuple) -> tuple[tuple, None]:
             y, z = state
             propagator, stuck = item
-            if memory is None:
+            if not n_places:
                 return (propagator @ y, z), None
-            per_mass = memory.stiffness / (terms.mass[j] * frequency**2)[:, None]
-            pull = jnp.sum(jnp.where(stuck, per_mass, 0.0)[:, :, None] * z, axis=1)
-            y = propagator[:, :-1, :-1] @ y + propagator[:, :-1, -1:] * pull[:, None, :]
-            return (y, jnp.where(stuck[:, :, None], z, y[:, j, None, :])), None
+            held_by = jnp.where(stuck, friction.stiffness, 0.0)[:, :, None] * z
+            pull = of_place.T @ held_by
+            y = propagator[:, : 2 * n, : 2 * n] @ y + propagator[:, : 2 * n, 2 * n :] @ pull
+            return (y, jnp.where(stuck[:, :, None], z, sliding(y))), None
 
         return jax.lax.scan(advance, state, (propagators, held))[0]
 
-    y = jnp.broadcast_to(jnp.eye(2 * n), (n_points, 2 * n, 2 * n))
-    z = jnp.zeros((n_points, 0, 2 * n))
-    if memory is not None:
-        slips = jnp.any(memory.dragged, axis=0)
-        z = jnp.where(slips[:, :, None], y[:, j, None, :], 0.0)
-    y, _ = jax.lax.fori_loop(0, n_segments, segment, (y, z))
-    return jnp.where(n_segments > 0, y, jnp.nan)
+    def sliding(y: Array) -> Array:
+        """The motion of every slider's place."""
+        there = places.displacement(jnp.swapaxes(y[:, :n], 1, 2))
+        return jnp.swapaxes(there, 1, 2)[:, owner]
+
+    # Sliders at the first place follow from its motion; others have positions of their own.
+    free = np.flatnonzero(owner > 0)
+    y = jnp.broadcast_to(jnp.eye(2 * n, 2 * n + free.size), (n_points, 2 * n, 2 * n + free.size))
+    z = jnp.zeros((n_points, owner.size, 2 * n + free.size))
+    slips = jnp.any(friction.dragged, axis=0)[:, :, None]
+    if n_places:
+        start = sliding(y).at[:, free].set(np.eye(2 * n + free.size)[2 * n :])
+        z = jnp.where(slips, start, 0.0)
+    y, z = jax.lax.fori_loop(0, n_segments, segment, (y, z))
+    whole = jnp.concatenate([y, jnp.where(slips, z, 0.0)[:, free]], axis=1)
+    return jnp.where(n_segments > 0, whole, jnp.nan)
+
+
+def _contacts(
+    model: Structure, coefficients: Array, frequency: Array, begin: Array
+) -> Float[Array, "contact point"]:
+    """Phases behind `begin` at which contacts open and close; infinite where there are fewer."""
+    tau = 2 * jnp.pi * jnp.arange(_CONTACT_SAMPLES) / _CONTACT_SAMPLES
+    phases = begin + tau[:, None]
+    q, _ = _states_at(coefficients, frequency, phases)
+    found = [jnp.zeros((0, len(frequency)))]
+    for effect in model.memoryless:
+        if isinstance(effect, AbstractKinked):
+            x = elements_of([effect], model.modes).displacement(q)[..., 0]
+            for place in effect.kinks().displacement:
+                there = jax.vmap(crossings, (1, None), 1)(x, place)
+                phase = (there.interval + there.share) * tau[1]
+                found.append(jnp.where(there.passes, phase, jnp.inf))
+    return jnp.concatenate(found)
+
+
+def _step_ends(number: Array, step: Array, contacts: Array) -> Float[Array, "end point"]:
+    """Phases at the ends of steps: equally spaced, the nearest to each contact moved onto it.
+
+    No step then holds a jump of the stiffness but one of two contacts closer than half a step.
+    """
+    even = number * step
+    if not len(contacts):
+        return jnp.broadcast_to(even[:, None], (len(number), contacts.shape[1]))
+    near = jnp.round(contacts / step) == number[:, None, None]
+    inner = (number > 0) & (even < 2 * jnp.pi - 0.5 * step)
+    chosen = jnp.take_along_axis(contacts[None], jnp.argmax(near, axis=1)[:, None], axis=1)[:, 0]
+    moved = jnp.any(near, axis=1) & inner[:, None]
+    return jnp.where(moved, chosen, even[:, None])
 
 
 def _magnus(
@@ -216,68 +272,80 @@ def _exponential(matrix: Float[Array, "*batch state state"]) -> Float[Array, "*b
     return result
 
 
-def _sliders(
-    model: Structure, coefficients: Array, frequency: Array
-) -> tuple[Array, list, _Memory | None]:
-    """Where a period begins, friction without memory, and the sliders along the motions.
+def _friction(model: Structure, coefficients: Array, frequency: Array) -> _Friction:
+    """Friction along the motions.
 
-    The period begins at the largest displacement: there every slider that slips at all is being
-    dragged, so that its position is no state of its own.
+    The period begins at the largest displacement of the first sliders' place: there every one of
+    them that slips at all is being dragged, so that its position is no state of its own.
     """
+    n_points, n = len(frequency), model.n_modes
+    sliders = [e for e in model.hysteretic if isinstance(e, AbstractSliders)]
+    others = [e for e in model.hysteretic if not isinstance(e, AbstractSliders)]
+    distinct = list({effect.at: effect for effect in reversed(sliders)}.values())[::-1]
+    places = elements_of(distinct, model.modes)
+    nothing = jnp.zeros((n_points, n, n))
+    begin = jnp.zeros_like(frequency)
+    no_sliders = jnp.zeros((n_points, 0)), jnp.zeros((1, n_points, 0), bool)
     if not model.hysteretic:
-        return jnp.zeros_like(frequency), [], None
-    j, n_samples = model.modes.mode_of_interest, 512
+        return _Friction(begin, nothing, (), places, np.zeros(0, int), *no_sliders)
+    n_samples = 512
     tau = 2 * jnp.pi * jnp.arange(n_samples) / n_samples
-    phases = jnp.broadcast_to(tau[:, None], (n_samples, len(frequency)))
-    q, v = (part[:, :, j] for part in _states_at(coefficients, frequency, phases))
-    largest = jnp.argmax(q, axis=0)
-    half_range = 0.5 * (jnp.max(q, axis=0) - jnp.min(q, axis=0))
-    typical = jnp.sqrt(jnp.mean(v**2, axis=0))
-    turned = jax.vmap(lambda row, k: jnp.roll(row, -k), in_axes=(1, 0))(q, largest)
-    friction, stiffness, dragged = [], [], []
-    for effect in model.hysteretic:
-        scaled = jax.vmap(effect.scaled_for)(half_range, typical)
-        if isinstance(effect, AbstractSliders):
-            sliders = jax.vmap(lambda e: e.sliders())(scaled)
-            position = jax.vmap(lambda e, q: e.settled_states(q, q))(scaled, turned)
-            moved = position != jnp.roll(position, -1, axis=1)
-            stiffness.append(sliders.stiffness)
-            dragged.append(jnp.moveaxis(moved, 1, 0))
-        else:
-            friction.append(scaled)
-    memory = None
-    if stiffness:
-        memory = _Memory(jnp.concatenate(stiffness, axis=1), jnp.concatenate(dragged, axis=2))
-    return tau[largest], friction, memory
+    phases = jnp.broadcast_to(tau[:, None], (n_samples, n_points))
+    motions = _states_at(coefficients, frequency, phases)
+
+    def scaled(effect: AbstractHysteresis) -> tuple[AbstractHysteresis, Elements, Array]:
+        """The effect as set for every point, where it is, and its displacement."""
+        there = elements_of([effect], model.modes)
+        x, v = (there.displacement(part)[..., 0] for part in motions)
+        half_range = 0.5 * (jnp.max(x, axis=0) - jnp.min(x, axis=0))
+        typical = jnp.sqrt(jnp.mean(v**2, axis=0))
+        return jax.vmap(effect.scaled_for)(half_range, typical), there, x
+
+    viscous = tuple(scaled(effect)[:2] for effect in others)
+    if not sliders:
+        return _Friction(begin, nothing, viscous, places, np.zeros(0, int), *no_sliders)
+    largest = jnp.argmax(scaled(sliders[0])[2], axis=0)
+    stiffness, dragged, owner, stuck = [], [], [], nothing
+    for effect in sliders:
+        each, there, x = scaled(effect)
+        turned = jax.vmap(lambda row, k: jnp.roll(row, -k), in_axes=(1, 0))(x, largest)
+        position = jax.vmap(lambda e, x: e.settled_states(x, x))(each, turned)
+        dragged.append(jnp.moveaxis(position != jnp.roll(position, -1, axis=1), 1, 0))
+        stiffness.append(jax.vmap(lambda e: e.sliders().stiffness)(each))
+        owner += [[e.at for e in distinct].index(effect.at)] * stiffness[-1].shape[1]
+        stuck = stuck + there.matrix(jax.vmap(lambda e: e.added_stiffness())(each)[:, None])
+    return _Friction(
+        *(tau[largest], stuck, viscous, places, np.array(owner)),
+        *(jnp.concatenate(stiffness, axis=1), jnp.concatenate(dragged, axis=2)),
+    )
 
 
 def _tangents(
-    model: Structure, friction: list, coefficients: Array, frequency: Array, tau: Array
-) -> tuple[Float[Array, "time point mode mode"], Float[Array, "time point mode"]]:
-    """K/mΩ² and C/mΩ (by mode) of all points at phases τ (time,) or (time, point)."""
-    j, (n_points, _, n) = model.modes.mode_of_interest, coefficients.shape
+    model: Structure, friction: _Friction, coefficients: Array, frequency: Array, tau: Array
+) -> tuple[Float[Array, "time point mode mode"], Float[Array, "time point mode mode"]]:
+    """K/mΩ² and C/mΩ of all points at phases τ (time,) or (time, point), stuck sliders included."""
+    n_points, _, n = coefficients.shape
     terms = model.linear_terms()
     q, v = _states_at(coefficients, frequency, jnp.broadcast_to(tau.T, (n_points, len(tau))).T)
-    flat_q, flat_v = q.reshape(-1, n), v.reshape(-1, n)
-    k = model.tangent_stiffness(flat_q, flat_v).reshape(*q.shape, n)
-    viscous = model.tangent_damping(flat_q, flat_v).reshape(q.shape[:2])
-    for effect in friction:
-        viscous = viscous + _viscous_slope(effect, q[..., j], v[..., j])
-    c = jnp.broadcast_to(terms.damping, q.shape).at[..., j].add(viscous)
-    per_mass = terms.mass * frequency[:, None]
-    k = (k + jnp.diag(terms.stiffness)) / (per_mass * frequency[:, None])[:, :, None]
-    return k, c / per_mass
+    k, c = model.slopes(q.reshape(-1, n), v.reshape(-1, n))
+    k = k.reshape(*q.shape, n) + jnp.diag(terms.stiffness) + friction.stuck
+    c = c.reshape(*q.shape, n) + terms.damping_matrix()
+    for effect, there in friction.viscous:
+        x, rate = there.displacement(q)[..., 0], there.displacement(v)[..., 0]
+        c = c + there.matrix(_viscous_slope(effect, x, rate)[..., None])
+    per_mass = (terms.mass * frequency[:, None])[:, :, None]
+    return k / (per_mass * frequency[:, None, None]), c / per_mass
 
 
 def _viscous_slope(
-    effects: AbstractHysteresis, q: Float[Array, "time point"], v: Float[Array, "time point"]
+    effects: AbstractHysteresis, x: Float[Array, "time point"], v: Float[Array, "time point"]
 ) -> Float[Array, "time point"]:
-    """∂f/∂q̇ of friction without memory, one effect for every point."""
+    """∂f/∂ẋ of friction without memory, one effect for every point."""
 
-    def slope(effect: AbstractHysteresis, q: Array, v: Array) -> Array:
-        return jax.grad(effect.state_force, argnums=1)(q, v, effect.initial_states())
+    def slope(effect: AbstractHysteresis, x: Array, v: Array) -> Array:
+        return jax.grad(effect.state_force, argnums=1)(x, v, effect.initial_states())
 
-    return jax.vmap(lambda q, v: jax.vmap(slope)(effects, q, v))(q, v)
+    return jax.vmap(lambda x, v: jax.vmap(slope)(effects, x, v))(x, v)
 
 
 def _states_at(coefficients: Array, frequency: Array, tau: Array) -> tuple[Array, Array]:

@@ -61,7 +61,7 @@ def floquet_multipliers(
         found = monodromy(model, rows, speed, float(steps_per_cycle))
         maps = np.asarray(found)[: len(values[here])]
         known = np.all(np.isfinite(values[here]), axis=(1, 2))[:, None, None]
-        return _eigenvalues(np.where(known, maps, np.nan))
+        return _eigenvalues(np.where(known, maps, np.nan), 2 * model.n_modes)
 
     return np.concatenate(over_cores(block, range(0, len(values), size)))
 
@@ -85,7 +85,7 @@ def many_multipliers(
         index = index[np.minimum(np.arange(size), len(index) - 1)]
         models = taken(balances.model, owner[index[:, 0]])
         maps = _monodromies(models, coefficients[index], frequency[index])
-        found[index] = _eigenvalues(np.asarray(maps))
+        found[index] = _eigenvalues(np.asarray(maps), found.shape[1])
 
     over_cores(block, range(0, len(rows), size))
     return found
@@ -104,11 +104,18 @@ def _monodromies(
 
 
 def _eigenvalues(
-    maps: Float[np.ndarray, "*batch state state"],
-) -> Complex[np.ndarray, "*batch state"]:
-    """Eigenvalues of maps, NaN of those that are not finite."""
+    maps: Float[np.ndarray, "*batch state state"], number: int
+) -> Complex[np.ndarray, "*batch multiplier"]:
+    """The largest eigenvalues of maps, NaN of those that are not finite.
+
+    States beyond `number` are positions of sliders, which the motion sets anew in each period.
+    """
     finite = np.all(np.isfinite(maps), axis=(-2, -1))[..., None]
-    return np.where(finite, np.linalg.eigvals(np.where(finite[..., None], maps, 0.0)), np.nan)
+    found: np.ndarray = np.linalg.eigvals(np.where(finite[..., None], maps, 0.0))
+    if found.shape[-1] > number:
+        largest = np.argsort(-np.abs(found), axis=-1)[..., :number]
+        found = np.take_along_axis(found, largest, axis=-1)
+    return np.where(finite, found, np.nan)
 
 
 def stability_of(

@@ -8,14 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from snrmjax.model.averaging import averaged_effect
-from snrmjax.model.effect_base import AbstractForce
-from snrmjax.model.structures import Structure, simulated_structure
+from snrmjax.model.elements import elements_of
+from snrmjax.model.structures import Structure, linear_terms_of, simulated_structure
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.result import quantity
 from snrmjax.simulate.balance.given_numbers import frequency_range, positive
 from snrmjax.simulate.balance.harmonic_balance import (
     HarmonicBalance,
+    averaged_at_places,
     harmonic_balance,
     linear_coefficients,
     resonance_displacement,
@@ -32,6 +32,8 @@ from snrmjax.simulate.continuation.continuation import (
 from snrmjax.simulate.continuation.response_curve import MotionCurve, motions_of
 
 DEFAULT_STEPS = StepControl(max_points=2000)
+_SMALL = 0.01  # of the largest amplitude: where a damped mode begins
+_PASSES = 8  # in which shape and averages of a small motion agree
 
 
 class DampedModeBranch(MotionCurve):
@@ -81,7 +83,8 @@ def damped_normal_mode(
     balance = harmonic_balance(
         model, 0.0, scale, harmonic_order=harmonic_order, n_samples=n_samples
     )
-    curve = on_host(_trace_damped(balance, steps))
+    start = _quasi_linear_motion(balance, _SMALL)
+    curve = on_host(_trace_damped(balance, start, steps))
     # ξ/(2Ω), both over the same natural frequency.
     return DampedModeBranch(
         **motions_of(balance, np.delete(curve.points, -2, axis=1)),
@@ -90,10 +93,46 @@ def damped_normal_mode(
     )
 
 
+def _quasi_linear_motion(balance: HarmonicBalance, share: float) -> Float[np.ndarray, " unknown"]:
+    """The mode of the structure with what averaging makes of its forces in a small motion.
+
+    Arguments: `share` of the balance's scale that the mode of interest moves. Returns the unknowns
+    of `_trace_damped`: friction sticks in a small motion and changes shape, frequency and damping.
+    """
+    model, j = balance.model, balance.model.modes.mode_of_interest
+    terms, n = linear_terms_of(model), model.n_modes
+    mass, coupled = np.asarray(terms.mass)[:, None], terms.coupling
+    damping = np.diag(np.asarray(terms.damping)) + (0 if coupled is None else np.asarray(coupled))
+    stiffness = np.diag(np.asarray(terms.stiffness))
+    elements = elements_of(model.forces, model.modes)
+    rows, amplitude = np.asarray(elements.rows), share * float(balance.displacement_scale)
+    shape, value = np.eye(n)[j].astype(complex), 1j * float(balance.frequency_scale)
+    for _ in range(_PASSES if model.forces else 1):
+        there = amplitude * np.abs(rows @ shape)
+        added = averaged_at_places(model, there, value.imag)
+        k = stiffness + rows.T @ (np.asarray(added.stiffness)[:, None] * rows)
+        c = damping + rows.T @ (np.asarray(added.damping)[:, None] * rows)
+        values, shapes = np.linalg.eig(
+            np.block([[np.zeros((n, n)), np.eye(n)], [-k / mass, -c / mass]])
+        )
+        swings = np.flatnonzero(values.imag > 0)
+        if not swings.size:
+            break
+        parts = np.abs(shapes[:n, swings])
+        place = swings[np.argmax(parts[j] / np.linalg.norm(parts, axis=0))]
+        value, shape = values[place], shapes[:n, place] / shapes[j, place]
+    frequency, unit = abs(value), float(balance.frequency_scale)
+    x = np.zeros((balance.n_coefficients, n))
+    x[1], x[2] = share * shape.real, -share * shape.imag
+    return np.concatenate([x.ravel(), [-2 * value.real / unit, frequency / unit]])
+
+
 @compiled
-def _trace_damped(balance: HarmonicBalance, steps: StepControl) -> Curve:
+def _trace_damped(
+    balance: HarmonicBalance, start: Float[Array, " unknown"], steps: StepControl
+) -> Curve:
     model, j, n = balance.model, balance.model.modes.mode_of_interest, balance.model.n_modes
-    terms, fs = model.linear_terms(), balance.frequency_scale
+    terms = model.linear_terms()
     basis = harmonic_basis(balance.harmonic_order, balance.n_samples)
     turn = jnp.kron(jnp.asarray(basis.derivative), jnp.diag(terms.mass))
     sine = 2 * n + j
@@ -110,16 +149,6 @@ def _trace_damped(balance: HarmonicBalance, steps: StepControl) -> Curve:
         equations = jnp.append(residual - excitation * omega * slope, x[sine])
         return equations, jnp.concatenate([top, phase[None]])
 
-    # What averaging says of a small motion; friction may damp that one most.
-    small = 0.01
-    stiffness, damping = terms.stiffness[j], terms.damping[j]
-    for effect in model.effects:
-        if isinstance(effect, AbstractForce):
-            average = averaged_effect(effect, small * balance.displacement_scale, fs)
-            stiffness, damping = stiffness + average.stiffness, damping + average.damping
-    begin = jnp.sqrt(stiffness / terms.mass[j]) / fs
-    start = jnp.zeros(balance.size + 2).at[n + j].set(small)
-    start = start.at[-2].set(damping / (terms.mass[j] * fs)).at[-1].set(begin)
     outward = jnp.zeros_like(start).at[n + j].set(1.0)
     within = CurveRange(lower=0.0, upper=np.inf, largest_amplitude=1.0)
     return trace_curve(linearised, start, outward, within, steps, start_across=outward)

@@ -9,6 +9,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from snrmjax.model.effect_base import AbstractHysteresis
+from snrmjax.model.elements import elements_of
 from snrmjax.model.library.friction import AbstractSliders
 from snrmjax.model.structures import Structure
 
@@ -25,8 +26,8 @@ class CyclePoint(NamedTuple):
     memory: Memory
     step: Float[Array, ""]  # of the phase Ωt
     size: Float[Array, ""]  # largest |q| over the last cycle, kg^1/2 m
-    range: Float[Array, ""]  # half the range of the mode of interest over it, kg^1/2 m
-    speed: Float[Array, ""]  # rms q̇ of the mode of interest over it, kg^1/2 m/s
+    range: Float[Array, " friction"]  # half that of what each friction acts on over it
+    speed: Float[Array, " friction"]  # its rms rate over it, per second
 
 
 def integrated_cycle(
@@ -40,8 +41,10 @@ def integrated_cycle(
     """One cycle of the force, and the displacements at equally spaced samples of it."""
     diffrax = _diffrax()
     solver = diffrax.Tsit5(scan_kind="lax")
-    j, terms = model.modes.mode_of_interest, model.linear_terms()
+    rows, terms = friction_rows(model), model.linear_terms()
     load, orders = force * model.modes.participation, model.load_orders()
+    lag = model.modes.participation_lag
+    lagging = jnp.zeros_like(load) if lag is None else force * orders[1] * lag
     # What the linear modes would do: the scale before the first cycle, and against rest.
     receptance = terms.stiffness - terms.mass * frequency**2 + 1j * terms.damping * frequency
     linear = jnp.max(jnp.abs(load) / jnp.maximum(jnp.abs(receptance), 1e-3 * terms.stiffness))
@@ -50,9 +53,10 @@ def integrated_cycle(
     start = jnp.maximum(jnp.max(jnp.abs(point.q)), jnp.max(jnp.abs(point.v)) / frequency)
     first = jnp.maximum(linear, start)
     size = jnp.maximum(jnp.where(fresh, first, point.size), 1e-2 * static)
-    reach = jnp.maximum(jnp.where(fresh, first, point.range), 1e-3 * static)
-    speed = jnp.where(fresh, first * frequency / np.sqrt(2), point.speed)
-    speed = jnp.maximum(speed, 1e-2 * static * frequency)
+    share = jnp.sum(jnp.abs(rows), axis=1)
+    reach = jnp.maximum(jnp.where(fresh, share * first, point.range), 1e-3 * share * static)
+    speed = jnp.where(fresh, share * first * frequency / np.sqrt(2), point.speed)
+    speed = jnp.maximum(speed, 1e-2 * share * static * frequency)
     effects = scaled_friction(model, reach, speed)
     memory = point.memory
     if effects:
@@ -65,6 +69,7 @@ def integrated_cycle(
     def slope(phase: Array, state: Array, _: None) -> Array:
         q, v, memory = whole(state)
         drive = load * (orders @ jnp.cos(jnp.arange(len(orders)) * phase))
+        drive = drive + lagging * jnp.sin(phase)
         inner, rates = inner_force(model, effects, q, v, memory)
         return ravel_pytree((v, (drive - inner) / terms.mass, rates))[0] / frequency
 
@@ -94,7 +99,7 @@ def integrated_cycle(
             step = jnp.where(good, longer, taken * factor)
             if effects:
                 (q0, v0, _), (q1, v1, held) = whole(state), whole(new)
-                ends = (q0[j], v0[j]), (q1[j], v1[j])
+                ends = (rows @ q0, rows @ v0), (rows @ q1, rows @ v1)
                 states = memory_after_step(effects, held, *ends, taken / frequency)
                 new = ravel_pytree((q1, v1, states))[0]
             return jnp.where(good, to, phase), jnp.where(good, new, state), step, count + 1
@@ -103,28 +108,35 @@ def integrated_cycle(
         phase, new, step, _ = jax.lax.while_loop(going, advance, (begin, state, step, 0))
         new = jnp.where(phase >= end, new, jnp.nan)
         step = jnp.where(jnp.isfinite(step), jnp.minimum(step, 1.0), 1e-3)
-        return (new, step), (state[:n], state[n + j])
+        return (new, step), (state[:n], rows @ state[n : 2 * n])
 
     (end, step), (samples, speeds) = jax.lax.scan(sample, (flat, point.step), jnp.arange(n_samples))
-    own, (q, v, memory) = samples[:, j], whole(end)
+    own, (q, v, memory) = samples @ rows.T, whole(end)
     after = CyclePoint(
         q=q,
         v=v,
         memory=memory,
         step=step,
         size=jnp.max(jnp.abs(samples)),
-        range=jnp.maximum(0.5 * (jnp.max(own) - jnp.min(own)), 1e-3 * static),
-        speed=jnp.sqrt(jnp.mean(speeds**2)),
+        range=jnp.maximum(0.5 * (jnp.max(own, 0) - jnp.min(own, 0)), 1e-3 * share * static),
+        speed=jnp.sqrt(jnp.mean(speeds**2, axis=0)),
     )
     return after, samples
 
 
+def friction_rows(model: Structure) -> Float[Array, "friction mode"]:
+    """The rows over the modes of what the effects with a memory act on."""
+    rows = [elements_of([effect], model.modes).rows[0] for effect in model.hysteretic]
+    return jnp.stack(rows) if rows else jnp.zeros((0, model.n_modes))
+
+
 def scaled_friction(
-    model: Structure, displacement: Array | float, velocity: Array | float = 1.0
+    model: Structure, displacement: Float[Array, " friction"], velocity: Float[Array, " friction"]
 ) -> tuple[AbstractHysteresis, ...]:
-    """The effects with a memory, set for integration in time."""
-    values = jnp.asarray(displacement), jnp.asarray(velocity)
-    return tuple(effect.scaled_for(*values) for effect in model.hysteretic)
+    """The effects with a memory, set for integration in time of motions of these sizes."""
+    return tuple(
+        effect.scaled_for(displacement[k], velocity[k]) for k, effect in enumerate(model.hysteretic)
+    )
 
 
 def memory_at_rest(effect: AbstractHysteresis, displacement: Array) -> Array:
@@ -153,40 +165,42 @@ def inner_force(
 
     Sliders are held through a step: see `memory_after_step`.
     """
-    terms, j = model.linear_terms(), model.modes.mode_of_interest
-    inner = terms.stiffness * q + terms.damping * v + model.memoryless_force(q[None], v[None])[0]
+    terms = model.linear_terms()
+    inner = terms.stiffness * q + terms.damped(v) + model.memoryless_force(q[None], v[None])[0]
     rates = []
     for effect, states in zip(effects, memory, strict=True):
-        inner = inner.at[j].add(effect.state_force(q[j], v[j], states))
+        there = elements_of([effect], model.modes)
+        x, rate = there.displacement(q)[0], there.displacement(v)[0]
+        inner = inner + there.on_modes(effect.state_force(x, rate, states)[None])
         held = isinstance(effect, AbstractSliders)
-        rates.append(jnp.zeros_like(states) if held else effect.state_rate(q[j], v[j], states))
+        rates.append(jnp.zeros_like(states) if held else effect.state_rate(x, rate, states))
     return inner, tuple(rates)
 
 
 def memory_after_step(
     effects: tuple[AbstractHysteresis, ...],
     memory: Memory,
-    begin: tuple[Array, Array],
-    end: tuple[Array, Array],
+    begin: tuple[Float[Array, " friction"], Float[Array, " friction"]],
+    end: tuple[Float[Array, " friction"], Float[Array, " friction"]],
     time: Array,
 ) -> Memory:
     """Memory after a step of an integrator through which sliders were held.
 
-    Arguments: `memory` as the integrator leaves it; q (kg^1/2 m) and q̇ (kg^1/2 m/s) of the mode
-    of interest at the `begin` and at the `end` of the step, of length `time` in s. A turning point
-    within the step is passed; other effects than sliders keep what the integrator found.
+    Arguments: `memory` as the integrator leaves it; what each friction acts on and its rate at the
+    `begin` and at the `end` of the step, of length `time` in s. A turning point within the step is
+    passed; other effects than sliders keep what the integrator found.
     """
-    (q0, v0), (q1, v1) = begin, end
+    (x0, v0), (x1, v1) = begin, end
     turns = v0 * v1 < 0
     until = time * v0 / jnp.where(turns, v0 - v1, 1.0)
-    turning = jnp.where(turns, q0 + 0.5 * v0 * until, q0)
+    turning = jnp.where(turns, x0 + 0.5 * v0 * until, x0)
 
-    def after(effect: AbstractHysteresis, states: Array) -> Array:
+    def after(effect: AbstractHysteresis, states: Array, turn: Array, end: Array) -> Array:
         if not isinstance(effect, AbstractSliders):
             return states
-        return effect.moved_states(q1, effect.moved_states(turning, states))
+        return effect.moved_states(end, effect.moved_states(turn, states))
 
-    return tuple(map(after, effects, memory))
+    return tuple(map(after, effects, memory, turning, x1))
 
 
 def _diffrax() -> Any:

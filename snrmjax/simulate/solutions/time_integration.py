@@ -20,6 +20,7 @@ from snrmjax.simulate.balance.harmonics import harmonic_basis, velocity_phasors
 from snrmjax.simulate.balance.labelled import HERTZ, batch_variables
 from snrmjax.simulate.solutions.hysteresis_cycles import (
     CyclePoint,
+    friction_rows,
     integrated_cycle,
     memory_at_rest,
     scaled_friction,
@@ -232,11 +233,10 @@ def _stepped(
 ) -> IntegratedMotion:
     """The motions at all steps, of the structure as simulated."""
     q, v = start
-    memory = tuple(
-        memory_at_rest(effect, q[model.modes.mode_of_interest])
-        for effect in scaled_friction(model, 1.0)
-    )
-    begin = CyclePoint(q, v, memory, jnp.asarray(0.01), *jnp.zeros((3,)))
+    rows = friction_rows(model)
+    unscaled = jnp.ones(len(rows))
+    memory = tuple(map(memory_at_rest, scaled_friction(model, unscaled, unscaled), rows @ q))
+    begin = CyclePoint(q, v, memory, jnp.asarray(0.01), jnp.zeros(()), 0 * unscaled, 0 * unscaled)
 
     def dwell(point: CyclePoint, step: tuple[Array, Array]) -> tuple[CyclePoint, IntegratedMotion]:
         frequency, order = step

@@ -81,7 +81,7 @@ def spread_in_phase(
     return places
 
 
-def between(values: np.ndarray, point: int, share: float) -> np.ndarray:
+def on_the_way(values: np.ndarray, point: int, share: float) -> np.ndarray:
     """Linear interpolation between a point of a curve and the next."""
     return values[point] + share * (values[point + 1] - values[point])
 

@@ -29,9 +29,12 @@ from snrmjax.model.effect_base import (
     AbstractKinked,
     AbstractMeasurementEffect,
 )
+from snrmjax.model.elements import elements_of
+from snrmjax.model.library.friction import AbstractSliders
 from snrmjax.model.modes import reference_sensor
 from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.simulate.solutions.hysteresis_cycles import (
+    friction_rows,
     inner_force,
     memory_after_step,
     memory_at_rest,
@@ -166,7 +169,8 @@ class Laboratory(eqx.Module):
     def at_rest(self, controller: AbstractController) -> LabState:
         """The state before anything moves."""
         n = simulated_structure(self.structure).n_modes
-        memory = tuple(memory_at_rest(e, jnp.zeros(())) for e in self.friction())
+        friction = self.friction()
+        memory = tuple(map(memory_at_rest, friction, jnp.zeros(len(friction))))
         sections = len(filter_sections(self.instruments, self.sampling_rate * self.substeps))
         return LabState(
             LabMotion(jnp.zeros(n), jnp.zeros(n), memory),
@@ -188,8 +192,8 @@ class Laboratory(eqx.Module):
         """The effects with a memory, set for motions up to `largest_displacement`."""
         if not self.structure.hysteretic:
             return ()
-        speed = self.reach() * self.frequency / np.sqrt(2)
-        return scaled_friction(self.structure, self.reach(), speed)
+        reach = self.reach() * jnp.sum(jnp.abs(friction_rows(self.structure)), axis=1)
+        return scaled_friction(self.structure, reach, reach * self.frequency / np.sqrt(2))
 
 
 def run_test(
@@ -237,7 +241,7 @@ def _run(
     period = jnp.asarray(1 / laboratory.sampling_rate)
     steps, limit = laboratory.substeps, laboratory.shaker.largest_voltage
     slope = _equations(laboratory.shaker, laboratory.attached, structure, friction)
-    step = _integrator(slope, friction, j, period / steps)
+    step = _integrator(slope, friction, friction_rows(structure), period / steps)
     cubic = _between_samples(np.arange(2 * steps + 1) / (2 * steps))
 
     def channels(motion: LabMotion, voltage: Array) -> Array:
@@ -310,7 +314,7 @@ def _equations(
 def _integrator(
     slope: Callable[[LabMotion, Array], tuple[LabMotion, Array]],
     friction: tuple[AbstractHysteresis, ...],
-    j: int,
+    rows: Float[Array, "friction mode"],
     h: Array,
 ) -> Callable[[LabMotion, Float[Array, "3"]], LabMotion]:
     """One step of length h by the classical method of Runge and Kutta, sliders moved after it."""
@@ -327,7 +331,7 @@ def _integrator(
         four = slope(after(h, three), last)[0]
         mean = jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, one, two, three, four)
         moved = after(h, mean)
-        way = [(at.displacement[j], at.velocity[j]) for at in (motion, moved)]
+        way = [(rows @ at.displacement, rows @ at.velocity) for at in (motion, moved)]
         memory = memory_after_step(friction, moved.memory, way[0], way[1], h)
         return moved._replace(memory=memory)
 
@@ -364,14 +368,18 @@ def _filtered(
 def _fastest(structure: Structure, shaker: Shaker) -> float:
     """Largest |eigenvalue| (rad/s) of structure and shaker, closed contacts included."""
     model = simulated_structure(structure)
-    n, j = model.n_modes, model.modes.mode_of_interest
-    mass, damping, stiffness = (np.diag(np.asarray(term)) for term in model.linear_terms())
+    n, terms = model.n_modes, model.linear_terms()
+    mass, stiffness = np.diag(np.asarray(terms.mass)), np.diag(np.asarray(terms.stiffness))
+    damping = np.asarray(terms.damping_matrix())
     grid = np.logspace(-12, 3, 301)
-    q = jnp.asarray(np.concatenate([-grid, grid]))
-    for effect in model.memoryless:
+    x = jnp.asarray(np.concatenate([-grid, grid]))
+    for effect in model.forces:
+        row = np.asarray(elements_of([effect], model.modes).rows[0])
         if isinstance(effect, AbstractKinked):
-            slope = jax.vmap(jax.grad(effect.force))(q, jnp.zeros_like(q))
-            stiffness[j, j] += float(jnp.max(slope))
+            slope = jax.vmap(jax.grad(effect.force))(x, jnp.zeros_like(x))
+            stiffness = stiffness + float(jnp.max(slope)) * np.outer(row, row)
+        elif isinstance(effect, AbstractSliders):
+            stiffness = stiffness + float(effect.added_stiffness()) * np.outer(row, row)
     drive = np.asarray(model.modes.participation)
     coil = shaker.damping + shaker.motor_constant**2 / shaker.resistance
     coupling = np.outer(drive, drive)

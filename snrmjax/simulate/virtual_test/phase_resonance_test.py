@@ -16,8 +16,8 @@ from snrmjax.simulate.continuation.response_curve import ResponseCurve
 from snrmjax.simulate.solutions.forced_response import ResponseSettings, forced_response_batch
 from snrmjax.simulate.virtual_test.appropriation import (
     around,
-    between,
     mode_phase,
+    on_the_way,
     phase_limits,
     spread_in_phase,
     states_near,
@@ -166,7 +166,7 @@ def _along_curves(
             near = reached & _around_resonance(curve, phase, limits[1])
             for place in spread_in_phase(phase, near, *limits, points_per_level):
                 columns = (curve.frequency, curve.coefficients, phase)
-                at = (between(column, *place) for column in columns)
+                at = (on_the_way(column, *place) for column in columns)
                 rows.append((level, curve.force, *at))
     curves = tuple(curve for parts in batch.curves for curve in parts)
     if not rows:

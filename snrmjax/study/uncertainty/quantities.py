@@ -86,8 +86,9 @@ def response_quantities(
     >>> from snrmjax.model import flat_beam
     >>> from snrmjax.study.variations import Normal
     >>> beam, varied = flat_beam(), [Normal("mode_1.damping_ratio", 0.05, 0.005)]
-    >>> found = response_quantities(beam, varied, 480.0, 520.0, force=2e-4, harmonic_order=1)
-    >>> found.names[:2]
+    >>> settings = {"force": 2e-4, "kinds": ["peak"], "harmonic_order": 1}
+    >>> found = response_quantities(beam, varied, 480.0, 520.0, **settings)
+    >>> found.names
     ('peak_frequency_hz', 'peak_velocity_m_s')
     """
     for kind in kinds:

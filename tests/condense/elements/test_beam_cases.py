@@ -10,7 +10,7 @@ from snrmjax.condense.elements.beam_modes import beam_modes
 from snrmjax.condense.elements.statics import static_cases
 from snrmjax.condense.load_set import modal_loads
 from snrmjax.condense.potential_fit import fit_potential
-from snrmjax.model.arches import ArchSettings, shallow_arch
+from snrmjax.model.builders.arches import ArchSettings, shallow_arch
 
 _FLAT = {"young": 204.8e9, "density": 7870.0}
 

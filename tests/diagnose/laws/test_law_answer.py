@@ -16,6 +16,7 @@ from snrmjax.diagnose.misfit.weighted_misfit import weighted_misfit
 from snrmjax.io.diagnosis_results import summarise_diagnosis
 from snrmjax.io.models import read_model, write_model
 
+pytestmark = pytest.mark.usefixtures("optimised")
 # Of benchmarks/blind_sets (seed 11, integrated in time by code of its own): a cable that goes
 # slack, f = k w [ln(1 + e^((−y−g)/w)) − ln(1 + e^(−g/w)) + y/(1 + e^(g/w))] with y = q/Q and f in
 # units of ω₀²Q, and the mode's frequency and shape at the sensor.

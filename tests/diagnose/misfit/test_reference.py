@@ -1,6 +1,7 @@
 """What the measured states show by themselves, against the curves and errors that made them."""
 
 import dataclasses
+import functools
 
 import jax
 import numpy as np
@@ -45,9 +46,15 @@ def predicted(model=None, *, shift=SHIFT, change=quadratic, stated=False):
     return predictions_of(model or linear_model(), data if stated else silent(data))
 
 
+@functools.cache
+def with_levels_apart(stated=False):
+    """What those predictions refer to."""
+    return referred(predicted(stated=stated))
+
+
 @pytest.mark.parametrize("stated", [True, False])
 def test_levels_differ_by_what_was_put_in(stated):
-    found = referred(predicted(stated=stated))
+    found = with_levels_apart(stated)
     put_in = 2 * SHIFT * np.random.default_rng([SEED, 1]).normal(size=N_LEVELS)
     # Known but for the mean and a smooth change with amplitude.
     assert found.level_sizes[2] == pytest.approx(np.std(put_in, ddof=1), rel=0.35)
@@ -81,7 +88,7 @@ def test_stated_errors_of_levels_are_kept():
 
 
 def test_errors_of_whole_levels_are_told_by_their_kind():
-    noise = weighted_misfit(referred(predicted())).noise
+    noise = weighted_misfit(with_levels_apart()).noise
     kinds = noise.shared_kind.tolist()
     # Natural frequency and damping ratio of the linear test, then one error a level.
     assert kinds == [-1, -1] + [2] * N_LEVELS
@@ -136,7 +143,7 @@ def test_a_sensor_without_phases_is_no_hindrance():
 
 
 def test_other_records_of_the_same_states_are_weighed_alike():
-    one = referred(predicted())
+    one = with_levels_apart()
     none = np.zeros_like(np.asarray(one.chosen.states.error))
     data = silent(balanced(quadratic, seed=SEED, levels=N_LEVELS, shift=SHIFT))
     faster = dataclasses.replace(data, velocity=1.1 * data.velocity)

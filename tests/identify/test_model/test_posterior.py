@@ -1,5 +1,6 @@
 """The posterior of a test, against curves and errors that made its states."""
 
+import functools
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +14,7 @@ from snrmjax.numerics.blocks import on_one_core
 
 LEVELS, PER_LEVEL, NOISE, SPREAD = 6, 15, 0.005, 0.005
 fitted = on_one_core(fit_test)
+unasked = functools.partial(fitted, compare_levels=False)  # half the time
 
 
 def loss(x):
@@ -28,7 +30,7 @@ class Made(NamedTuple):
     gain: np.ndarray
 
     def fit(self, **settings):
-        return fitted(self.states, **settings)
+        return unasked(self.states, **settings)
 
 
 def made(seed, *, spread=SPREAD, gain=0.0, noise=NOISE, stated=True, outliers=0, tips=(2e-4, 2e-3)):
@@ -82,7 +84,7 @@ def known():
 
 @pytest.fixture(scope="module")
 def found(known):
-    return known.fit()
+    return known.fit(compare_levels=True)
 
 
 def test_curves_levels_and_noise_are_those_that_made_the_states(known, found):
@@ -112,14 +114,14 @@ def test_bands_hold_the_curves_of_other_tests_too(seed):
 
 
 def test_levels_that_agree_are_not_said_to_differ():
-    found = made(3, spread=0.0).fit()
+    found = made(3, spread=0.0).fit(compare_levels=True)
     assert found.differing == (False,) * 4
     assert off(found)[2].max() < 0.02
 
 
 def test_a_gain_of_levels_is_told_from_their_stiffness():
     test = made(1, spread=0.0, gain=0.03)
-    found = test.fit()
+    found = test.fit(compare_levels=True)
     assert found.differing[0]
     assert not found.differing[2]
     assert np.corrcoef(found.level_errors[:, 0], test.gain)[0, 1] > 0.95
@@ -147,8 +149,8 @@ def test_units_and_the_order_of_rows_change_nothing(known, found):
         name: getattr(states, name)[order]
         for name in ("level", "frequency", "force", "velocity", "errors")
     }
-    shuffled = fitted(states._replace(**rows))
-    scaled = fitted(states._replace(velocity=1e3 * states.velocity, force=1e3 * states.force))
+    shuffled = unasked(states._replace(**rows))
+    scaled = unasked(states._replace(velocity=1e3 * states.velocity, force=1e3 * states.force))
     both = found.curves(AT)
     for one, length in ((shuffled, 1.0), (scaled, 1e3)):
         curves = one.curves(length * AT)
@@ -201,17 +203,17 @@ def test_few_levels_widen_a_band_as_students_t_does(n_levels):
     assert np.mean(np.abs(draws.mean(axis=1)) < band) == pytest.approx(wanted, abs=0.006)
 
 
-def test_states_that_err_alike_count_as_fewer(known):
+def test_states_that_err_alike_count_as_fewer(known, found):
     """A slow misfit of 3 % along every level: the curves' bands must not shrink with its states."""
     slow = 0.03 * np.sin(np.tile(np.linspace(-4, 4, PER_LEVEL), LEVELS))
     states = known.states._replace(velocity=known.states.velocity * np.exp(slow), stated=False)
     states = states._replace(errors=np.tile([0.1, 1.0, 1.0], (len(slow), 1)))
-    plain, tempered = (fitted(states, tempered=one) for one in (False, True))
+    plain, tempered = (unasked(states, tempered=one) for one in (False, True))
     wide, narrow = (np.median(off(one)[2], axis=0) for one in (tempered, plain))
     assert wide[1] > 1.15 * narrow[1]
     assert wide[0] > narrow[0]
-    white = fitted(known.states, tempered=True)
-    same = np.median(off(white)[2], axis=0) / np.median(off(known.fit())[2], axis=0)
+    white = unasked(known.states, tempered=True)
+    same = np.median(off(white)[2], axis=0) / np.median(off(found)[2], axis=0)
     assert same == pytest.approx(1.0, abs=0.15)
 
 
@@ -233,22 +235,22 @@ def test_a_natural_frequency_that_moves_along_the_test_is_a_trend():
         velocity=states.velocity * factor,
         force=states.force * factor**2,
     )
-    without = fitted(moved)
-    found = fitted(moved._replace(trend=place, trend_std=0.1))
+    without = unasked(moved)
+    found = unasked(moved._replace(trend=place, trend_std=0.1))
     trend, std = found.trend
     assert abs(trend - 2 * change) < 3 * std + change**2
     assert found.log_evidence > without.log_evidence + 12
     # Of a test without drift nothing is said that was not there.
-    still, std = fitted(states._replace(trend=place, trend_std=0.1)).trend
+    still, std = unasked(states._replace(trend=place, trend_std=0.1)).trend
     assert abs(still) < 3 * std
-    assert fitted(states).trend == (0.0, 0.0)
+    assert unasked(states).trend == (0.0, 0.0)
 
 
 def test_levels_bandwidths_apart_are_found_by_the_start_that_has_them_apart():
     """Natural frequencies 2 % apart, where 2ζ is 1 %: the noise that is left is what was put in."""
     states = made(0, spread=0.02).states
     four = Rounds(most=4)
-    found = fitted(states, rounds=four._replace(levels_apart=True), compare_levels=False)
+    found = unasked(states, rounds=four._replace(levels_apart=True))
     assert found.hyper.noise == pytest.approx(1.0, abs=0.15)  # 180 rows say it to 5 %
-    assert found.log_evidence >= fitted(states, rounds=four).log_evidence - 0.1
+    assert found.log_evidence >= unasked(states, rounds=four).log_evidence - 0.1
     assert found.differing == (False,) * 4

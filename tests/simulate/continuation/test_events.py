@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from snrmjax.model.beams import CURVED_BEAM_FORCES, FLAT_BEAM_FORCES, curved_beam, flat_beam
+from snrmjax.model.builders.beams import (
+    CURVED_BEAM_FORCES,
+    FLAT_BEAM_FORCES,
+    curved_beam,
+    flat_beam,
+)
 from snrmjax.model.modes import linear_modes
 from snrmjax.model.potential import polynomial_potential
 from snrmjax.model.structures import structure

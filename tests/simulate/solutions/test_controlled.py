@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from snrmjax.model.beams import CURVED_BEAM_FORCES, curved_beam, flat_beam
+from snrmjax.model.builders.beams import CURVED_BEAM_FORCES, curved_beam, flat_beam
 from snrmjax.model.effects import make_effect
 from snrmjax.model.modes import linear_modes
 from snrmjax.model.potential import polynomial_potential

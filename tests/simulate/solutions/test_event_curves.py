@@ -9,7 +9,12 @@ import scipy.linalg
 import scipy.optimize
 
 import snrmjax as sj
-from snrmjax.model.beams import CURVED_BEAM_FORCES, FLAT_BEAM_FORCES, curved_beam, flat_beam
+from snrmjax.model.builders.beams import (
+    CURVED_BEAM_FORCES,
+    FLAT_BEAM_FORCES,
+    curved_beam,
+    flat_beam,
+)
 from snrmjax.model.effects import make_effect
 from snrmjax.simulate.solutions.event_curves import (
     EventCurveEnd,

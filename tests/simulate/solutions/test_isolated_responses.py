@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from snrmjax.model.beams import curved_beam
+from snrmjax.model.builders.beams import curved_beam
 from snrmjax.model.effects import make_effect
 from snrmjax.model.modes import linear_modes
 from snrmjax.model.potential import polynomial_potential

@@ -10,7 +10,7 @@ from scipy.integrate import quad
 from scipy.optimize import brentq
 from scipy.special import ellipk
 
-from snrmjax.model.beams import curved_beam, flat_beam
+from snrmjax.model.builders.beams import curved_beam, flat_beam
 from snrmjax.model.effects import make_effect
 from snrmjax.model.modes import linear_modes
 from snrmjax.model.potential import polynomial_potential

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from snrmjax.model.beams import curved_beam, flat_beam
+from snrmjax.model.builders.beams import curved_beam, flat_beam
 from snrmjax.model.effects import make_effect
 from snrmjax.model.modes import linear_modes, linear_response
 from snrmjax.model.potential import polynomial_potential

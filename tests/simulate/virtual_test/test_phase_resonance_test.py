@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from snrmjax.model.beams import CURVED_BEAM_FORCES, curved_beam
+from snrmjax.model.builders.beams import CURVED_BEAM_FORCES, curved_beam
 from snrmjax.model.effects import make_effect
 from snrmjax.model.modes import RigidBodyModes, linear_modes, linear_response
 from snrmjax.model.structures import structure

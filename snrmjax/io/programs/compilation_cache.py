@@ -6,7 +6,7 @@ from pathlib import Path
 import jax
 import platformdirs
 
-from snrmjax.io.program_store import keep_programs, processor_digest
+from snrmjax.io.programs.program_store import keep_programs, processor_digest
 
 WORTH_KEEPING = 0.05  # seconds of compilation: reading a program back takes a fifth of that
 

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 import snrmjax as sj
-from snrmjax.io import program_store
-from snrmjax.io.program_store import key_of, version_of
+from snrmjax.io.programs import program_store
+from snrmjax.io.programs.program_store import key_of, version_of
 from snrmjax.model.modes import linear_response
 from snrmjax.model.structures import Structure, linear_terms_of
 from snrmjax.numerics.kept_programs import NotKept

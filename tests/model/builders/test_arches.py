@@ -8,7 +8,7 @@ from scipy.integrate import solve_bvp
 from scipy.special import ellipk
 
 import snrmjax as sj
-from snrmjax.model.beams import curved_beam, flat_beam
+from snrmjax.model.builders.beams import curved_beam, flat_beam
 
 HZ = 2 * np.pi
 PLACE, WEIGHT = (np.polynomial.legendre.leggauss(40) + np.array([[1.0], [0.0]])) / 2

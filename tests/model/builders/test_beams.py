@@ -6,7 +6,12 @@ import pytest
 from scipy.integrate import quad
 from scipy.optimize import brentq
 
-from snrmjax.model.beams import CURVED_BEAM_FORCES, FLAT_BEAM_FORCES, curved_beam, flat_beam
+from snrmjax.model.builders.beams import (
+    CURVED_BEAM_FORCES,
+    FLAT_BEAM_FORCES,
+    curved_beam,
+    flat_beam,
+)
 from snrmjax.model.modes import linear_response
 from snrmjax.model.structures import equilibria
 

@@ -1,0 +1,236 @@
+"""Published problems with elements at points, each number beside what its source prints.
+
+Run: OMP_NUM_THREADS=1 python benchmarks/published_elements.py
+
+Sources: NLvib's examples 1 to 5 and 9 (Krack and Gross; their numbers, or those of an independent
+harmonic balance where none are printed), SSMTool's three oscillators and its cantilever on a
+spring (spectral submanifolds of order 3 and 7, collocation), closed forms of a Jenkins element and
+of Segalman's four-parameter Iwan joint. `published` is what the source has, to its digits;
+`difference` is relative. Seconds are those of the second run, programs compiled.
+"""
+
+import dataclasses
+from collections.abc import Callable, Iterator
+
+import jax.numpy as jnp
+import numpy as np
+from harness import options, seconds_of, teller
+
+import snrmjax as sj
+from snrmjax.simulate.continuation.continuation import StepControl
+
+tell = teller(__file__)
+Rows = Iterator[tuple[str, float, float]]  # quantity, found, published
+LONG = StepControl(max_points=4000)
+FINE = StepControl(max_points=20000, largest=0.002)
+
+
+def _element(kind: str, at: object, **parameters: float) -> sj.model.AbstractForce:
+    return sj.model.make_effect(kind, parameters, at=at)
+
+
+def _height(model: sj.model.Structure, motions: object, point: str) -> np.ndarray:
+    """Amplitudes of the fundamental at a point, m."""
+    x = motions.coefficients[:, 1:3] @ np.asarray(model.modes.shape_at(point))
+    return np.hypot(x[:, 0], x[:, 1])
+
+
+def _at_energy(branch: object, energy: float) -> float:
+    return float(np.interp(np.log(energy), np.log(branch.energy), branch.frequency))
+
+
+def _events(curves: list, kind: str) -> np.ndarray:
+    return np.concatenate([c.frequency[c.at_events(kind)] for c in curves])
+
+
+def _nearest(found: np.ndarray, wanted: float) -> float:
+    return float(found[np.argmin(np.abs(found - wanted))]) if len(found) else np.nan
+
+
+def _duffing() -> Rows:
+    spring = _element("cubic_stiffness", "x1", coefficient=0.1)
+    model = sj.model.from_matrices([[1.0]], [[0.05]], [[1.0]], force="x1", effects=spring)
+    for order, folds, peak in ((1, (1.26754, 1.11559), 2.84162), (7, (1.26960, 1.11570), 2.83019)):
+        curve = sj.forced_response(model, 0.18, 0.5, 1.6, harmonic_order=order, steps=FINE)[0]
+        for fold in folds:
+            yield f"fold, H {order}", _nearest(_events([curve], "fold"), fold), fold
+        yield f"largest amplitude, H {order}", float(_height(model, curve, "x1").max()), peak
+
+
+def _two_cubic_springs() -> Rows:
+    springs = (
+        _element("cubic_stiffness", "x1", coefficient=1.0),
+        _element("cubic_stiffness", sj.model.between("x1", "x2"), coefficient=0.0042),
+    )
+    chain = sj.model.chain([1.0, 0.05], [1.0, 0.0453, 0.0], [0.002, 0.013, 0.0])
+    model = sj.model.from_matrices(*chain, force="x1", effects=springs)
+    curves = sj.forced_response(model, 0.11, 0.8, 1.4, harmonic_order=7, steps=FINE)
+    for fold in (1.21463, 1.20622):
+        yield "fold", _nearest(_events(curves, "fold"), fold), fold
+    for place in (1.11271, 1.19574):
+        yield "Neimark-Sacker", _nearest(_events(curves, "neimark_sacker"), place), place
+    amplitude = _height(model, curves[0], "x1")
+    for low, high, peak in ((0.8, 1.12, 0.5918), (1.19, 1.4, 0.57847)):
+        inside = (curves[0].frequency > low) & (curves[0].frequency < high)
+        yield "largest amplitude", float(amplitude[inside].max()), peak
+
+
+def _unilateral_spring() -> Rows:
+    stop = _element("one_sided_stop", "x1", stiffness=100.0, gap=1.0)
+    chain = sj.model.chain([1.0, 1.0], [0.0, 1.0, 1.0], [0.0, 0.03, 0.03])
+    model = sj.model.from_matrices(*chain, force="x2", effects=stop)
+    curves = sj.forced_response(model, 0.1, 0.5, 0.8, harmonic_order=21, steps=FINE)
+    x = curves[0].coefficients @ np.asarray(model.modes.shape_at("x1"))
+    rms = np.sqrt(0.5 * np.sum(x**2, axis=1))  # the mean counts half, as the source has it
+    yield "largest rms", float(rms.max()), 0.98093
+    yield "its frequency", float(curves[0].frequency[np.argmax(rms)]), 0.7541
+    yield "grazing, a fold", _nearest(_events(curves, "fold"), 0.6534401), 0.6534401
+    touching = np.flatnonzero(np.diff(np.sign(_height(model, curves[0], "x1") - 1.0)))
+    yield "grazing", float(curves[0].frequency[touching[0]]), 0.5818996
+
+
+def _mode_of_two_masses() -> Rows:
+    spring = _element("cubic_stiffness", "x1", coefficient=0.5)
+    chain = sj.model.chain([1.0, 1.0], [1.0, 1.0, 1.0])
+    model = sj.model.from_matrices(*chain, force="x1", effects=spring)
+    first = sj.nonlinear_normal_mode(model, 1.37616, harmonic_order=9, steps=FINE)
+    keep = np.cumsum(first.frequency > 1.4) == 0  # before the tongue
+    rising = dataclasses.replace(
+        first, frequency=first.frequency[keep], energy=first.energy[keep], tongues=()
+    )
+    frequencies = (1.000933, 1.00895, 1.065728, 1.206856, 1.316432, 1.376155)
+    for energy, published in zip((0.01, 0.1, 1, 10, 100, 1000), frequencies, strict=True):
+        yield f"in phase at {energy} J", _at_energy(rising, energy), published
+    swapped = sj.model.from_matrices(*chain, force="x1", effects=spring, mode_of_interest=1)
+    second = sj.nonlinear_normal_mode(swapped, 3.3, harmonic_order=9, steps=FINE)
+    frequencies = (1.732231, 1.73387, 1.751563, 2.02933, 3.29435)
+    for energy, published in zip((0.01, 0.1, 1, 10, 100), frequencies, strict=True):
+        yield f"out of phase at {energy} J", _at_energy(second, energy), published
+
+
+def _regularised_friction() -> Rows:
+    friction = _element("regularised_friction", "x1", force_limit=5.0, velocity=0.05)
+    chain = sj.model.chain([0.02, 1.0], [0.0, 40.0, 600.0])
+    model = sj.model.from_matrices(*chain, force="x1", effects=friction)
+    natural = np.asarray(model.modes.natural_frequency)
+    yield "free, first", float(natural[0]), 24.15620
+    yield "free, second", float(natural[1]), 45.34841
+    shape = abs(float(np.max(np.abs(np.asarray(model.modes.mode_shape)[:, 0]))))
+    mode = sj.simulate.damped_normal_mode(model, 10 * natural[0] * shape, harmonic_order=21)
+    yield "small motions, stuck", float(mode.frequency[0]), 25.29822
+    yield "large motions, free", float(mode.frequency[-1]), 24.15620
+
+
+def _cubic_at_a_tip() -> Rows:
+    area, second = 0.014**2, 0.014**4 / 12
+    spring = _element("cubic_stiffness", "w19", coefficient=6e9)
+    matrices = sj.model.beam(205e9 * second, 7800 * area, 0.7, 19)
+    model = sj.model.from_matrices(
+        *matrices, force="w19", effects=spring, n_modes=10, residuals=False, sensors=["w19"]
+    )
+    hertz = np.asarray(model.modes.natural_frequency) / (2 * np.pi)
+    for found, published in zip(hertz, (23.6615, 148.284, 415.208), strict=False):
+        yield "natural frequency, Hz", float(found), published
+    mode = sj.nonlinear_normal_mode(
+        model, 2 * np.pi * 47, harmonic_order=5, tongues="skip", steps=FINE
+    )
+    published = (1.148e-4, 4.962e-4, 1.478e-3, 3.643e-3, 9.97e-3, 2.208e-2, 4.61e-2)
+    for frequency, energy in zip((24, 25, 27, 30, 35, 40, 45), published, strict=True):
+        found = np.exp(np.interp(2 * np.pi * frequency, mode.frequency, np.log(mode.energy)))
+        yield f"energy at {frequency} Hz", float(found), energy
+
+
+def _three_oscillators() -> Rows:
+    springs = [
+        _element("cubic_stiffness", sj.model.between(a, b), coefficient=1e-3)
+        for a, b in (("x1", "x2"), ("x2", "x3"))
+    ]
+    damping = np.diag([5e-4, 1e-3, 1.5e-3])
+    model = sj.model.from_matrices(np.eye(3), damping, np.eye(3), force="x1", effects=springs)
+    curves = sj.forced_response(model, 5e-3, 0.995, 1.016, harmonic_order=5, steps=LONG)
+    for fold in (1.0025, 1.0018, 1.0150, 1.0031):
+        yield "fold", _nearest(_events(curves, "fold"), fold), fold
+    yield "Neimark-Sacker", _nearest(_events(curves, "neimark_sacker"), 1.0021), 1.0021
+
+
+def _cantilever_on_a_spring() -> Rows:
+    matrices = sj.model.beam(
+        *(45e6 * 10**4 / 12, 1780e-9 * 100, 2700.0, 40),
+        springs={"w40": 27.0},
+        stiffness_damping=2.5e-5,
+        mass_damping=1.25e-4,
+    )
+    spring = _element("cubic_stiffness", "w40", coefficient=60.0)
+    model = sj.model.from_matrices(
+        *matrices, force="w40", effects=spring, n_modes=12, sensors=["w40"]
+    )
+    natural = np.asarray(model.modes.natural_frequency)
+    for found, published in zip(natural, (15.603256, 46.576613, 123.774), strict=False):
+        yield "natural frequency, rad/s", float(found), published
+    # The force is along the first mode alone.
+    along = jnp.asarray(np.eye(len(natural))[0] * natural[0] ** 2)
+    model = dataclasses.replace(model, modes=dataclasses.replace(model.modes, participation=along))
+    curves = sj.forced_response(model, 2e-3, 15.3, 15.9, harmonic_order=5, steps=LONG)
+    for fold in (15.58314, 15.59292):
+        yield "fold", _nearest(_events(curves, "fold"), fold), fold
+    for place in (15.587, 15.590, 15.665, 15.863):
+        yield "Neimark-Sacker", _nearest(_events(curves, "neimark_sacker"), place), place
+    below = curves[0].frequency < 15.6
+    yield "largest tip there", float(_height(model, curves[0], "w40")[below].max()), 0.16188
+
+
+def _jenkins() -> Rows:
+    slider = _element("jenkins_slider", "x1", stiffness=0.25, slip_displacement=0.8)
+    model = sj.model.from_matrices([[1.0]], [[0.01]], [[0.75]], force="x1", effects=slider)
+    mode = sj.simulate.damped_normal_mode(model, 4.0, harmonic_order=1, steps=FINE)
+    amplitude = _height(model, mode, "x1")
+    for x, frequency, damping in (
+        (1.0, 0.982041, 0.031496),
+        (1.6, 0.935414, 0.050818),
+        (3.2, 0.893798, 0.042949),
+    ):
+        yield f"frequency at {x}", float(np.interp(x, amplitude, mode.frequency)), frequency
+        yield f"damping at {x}", float(np.interp(x, amplitude, mode.damping_ratio)), damping
+
+
+def _iwan() -> Rows:
+    joint = _element(
+        *("four_parameter_iwan", "x1"), slip_force=10.0, stiffness=0.6, exponent=-0.5, ratio=0.0
+    )
+    yield "displacement of macroslip", float(joint.end), 50.0
+    angle = 2 * np.pi * np.arange(4096) / 4096
+    for u in (0.1, 1.0, 10.0, 40.0):
+        force = np.asarray(joint.cycle_force(jnp.asarray(u * np.cos(angle)), jnp.zeros(4096)))
+        loss = float(np.sum(force * -u * np.sin(angle)) * angle[1])
+        yield f"loss per cycle at {u}", loss, 0.045255 * u**2.5
+
+
+PROBLEMS: dict[str, Callable[[], Rows]] = {
+    "1 Duffing": _duffing,
+    "2 two masses, two cubic springs": _two_cubic_springs,
+    "3 two masses, unilateral spring": _unilateral_spring,
+    "4 normal modes of two masses": _mode_of_two_masses,
+    "5 regularised friction, damped mode": _regularised_friction,
+    "9 cubic spring at a tip": _cubic_at_a_tip,
+    "13 three oscillators, 1:1:1": _three_oscillators,
+    "14 cantilever on a spring, 1:3": _cantilever_on_a_spring,
+    "18 Jenkins element, damped mode": _jenkins,
+    "19 four-parameter Iwan joint": _iwan,
+}
+
+if __name__ == "__main__":
+    chosen = options(__doc__, only=["all"]).only
+    for name, problem in PROBLEMS.items():
+        if "all" not in chosen and name.split()[0] not in chosen:
+            continue
+        list(problem())
+        seconds, rows = seconds_of(lambda: list(problem()))  # noqa: B023
+        for quantity, found, published in rows:
+            tell(
+                problem=name,
+                quantity=quantity,
+                found=f"{found:.7g}",
+                published=f"{published:.7g}",
+                difference=found / published - 1,
+            )
+        tell(problem=name, seconds=seconds)

@@ -1,0 +1,1 @@
+"""Compiled programs on disk: the compiler's own store, and whole programs of commands."""

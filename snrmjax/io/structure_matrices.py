@@ -1,0 +1,137 @@
+"""Structures of a model file that are given by matrices, under [structure]."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.io
+import scipy.sparse
+from jaxtyping import Float
+
+from snrmjax.io.files import shown
+from snrmjax.io.toml_table import TomlTable
+from snrmjax.io.units import DEGREE
+from snrmjax.model.builders.matrices import from_matrices
+from snrmjax.model.effect_base import AbstractEffect
+from snrmjax.model.structures import Structure
+from snrmjax.numerics.rules import BELOW_ONE, NOT_ZERO
+
+_MATRICES = ("mass", "stiffness", "damping")
+
+
+def structure_of_matrices(
+    top: TomlTable, file: str, folder: Path, effects: tuple[AbstractEffect, ...]
+) -> Structure:
+    """The structure of [structure], [force] and [sensors].
+
+    Matrices stand in the table or in a file beside it: NPZ or MAT with arrays `mass`, `stiffness`,
+    `points` and perhaps `damping`. Raises `ValueError` that names file, table and key.
+    """
+    table = top.table("structure", f"[structure] of {file}")
+    table.check_keys((), (*_MATRICES, "points", "file", "damping_ratio", "modes"))
+    parts = dict(table.entries)
+    if "file" in parts:
+        for key in (*_MATRICES, "points"):
+            if key in parts:
+                raise ValueError(f"{table.place} has both `file` and `{key}`.")
+        parts |= _arrays(folder / table.text("file"), table)
+    if "damping" in parts and "damping_ratio" in parts:
+        raise ValueError(f"{table.place} has both `damping` and `damping_ratio`.")
+    for key in ("mass", "stiffness", "points"):
+        if key not in parts:
+            raise ValueError(f"{table.place} lacks the key `{key}`.")
+    matrices = {key: _matrix(key, parts[key], table) for key in _MATRICES if key in parts}
+    points = parts["points"]
+    if not isinstance(points, list) or not all(isinstance(p, str) and p.strip() for p in points):
+        raise table.refusal("points", "a list of names, one for each unknown", points)
+    damping: Any = matrices.get("damping")
+    if "damping_ratio" in parts:
+        damping = table.number("damping_ratio", BELOW_ONE)
+    try:
+        return from_matrices(
+            *(matrices["mass"], damping, matrices["stiffness"], points),
+            force=_force(top.table("force", f"[force] of {file}")),
+            effects=effects,
+            n_modes=table.whole("modes", 1) if "modes" in parts else None,
+            mode_of_interest=top.whole("mode_of_interest", 1, 1) - 1,
+            sensors=listed_sensors(top, file),
+            name=top.text("name", folder.stem),
+        )
+    except ValueError as error:
+        raise ValueError(f"{table.place} cannot be read: {error}") from error
+
+
+def listed_sensors(top: TomlTable, file: str) -> list[str] | None:
+    """The points that [sensors] lists; None where nothing does."""
+    if "sensors" not in top.entries:
+        return None
+    table = top.table("sensors", f"[sensors] of {file}")
+    table.check_keys(("points",))
+    names = table.entries["points"]
+    if not isinstance(names, list) or not names or not all(isinstance(n, str) for n in names):
+        raise table.refusal("points", "a list of names, at least one", names)
+    if len(set(names)) < len(names):
+        raise table.refusal("points", "different names", names)
+    return names
+
+
+def _arrays(path: Path, table: TomlTable) -> dict[str, Any]:
+    """Arrays of an NPZ or MAT file by name; points as a list of names."""
+    if not path.is_file():
+        raise table.refusal("file", "a file beside the model's", path.name)
+    reading = {".npz": _of_npz, ".mat": scipy.io.loadmat}.get(path.suffix.lower())
+    if reading is None:
+        raise table.refusal("file", "an .npz or .mat file", path.name)
+    try:
+        arrays = dict(reading(path))
+    except (OSError, ValueError, NotImplementedError) as error:
+        kind = f"an {path.suffix[1:].upper()} file of arrays (MAT up to version 7)"
+        raise ValueError(
+            f"{shown(path.name)} of {table.place} cannot be read: it is not {kind}."
+        ) from error
+    found = {key: arrays[key] for key in (*_MATRICES, "points") if key in arrays}
+    if "points" in found:
+        names = np.ravel(found["points"])
+        found["points"] = [
+            str(np.ravel(name)[0] if np.size(name) else "").strip() for name in names
+        ]
+    return found
+
+
+def _of_npz(path: Path) -> Mapping[str, np.ndarray]:
+    with np.load(path) as arrays:
+        return {key: arrays[key] for key in arrays.files}
+
+
+def _matrix(key: str, value: Any, table: TomlTable) -> Float[np.ndarray, "unknown unknown"]:
+    if scipy.sparse.issparse(value):
+        return value
+    try:
+        matrix = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise table.refusal(key, "rows of numbers, all of one length", value) from None
+    if matrix.ndim != 2:
+        raise table.refusal(key, "rows of numbers, all of one length", value)
+    return matrix
+
+
+def _force(table: TomlTable) -> dict[str, complex]:
+    """Newtons at points per newton of the recorded force, as phasors."""
+    table.check_keys(("at",))
+    at = table.entries["at"]
+    if isinstance(at, str):
+        return {at: 1.0}
+    weights = table.table("at", f"`at` in {table.place}")
+    if not weights.entries:
+        raise table.refusal("at", "a point, or points with newtons per newton", at)
+    force: dict[str, complex] = {}
+    for point, value in weights.entries.items():
+        if isinstance(value, dict):
+            entry = weights.table(point, f"{shown(point)} in {weights.place}")
+            entry.check_keys(("amplitude",), ("phase_deg",))
+            phase = entry.number("phase_deg", default=0.0) * DEGREE
+            force[point] = entry.number("amplitude", NOT_ZERO) * np.exp(1j * phase)
+        else:
+            force[point] = weights.number(point, NOT_ZERO)
+    return force

@@ -1,0 +1,1 @@
+"""Structures ready made: beams and arches with known numbers, and from matrices."""

@@ -1,0 +1,332 @@
+"""Structures from their mass, damping and stiffness matrices."""
+
+import functools
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.linalg
+import scipy.sparse
+import scipy.sparse.linalg
+from jaxtyping import Float
+
+from snrmjax.model.effect_base import AbstractEffect, checked_effects
+from snrmjax.model.modes import Beside, RigidBodyModes, linear_modes
+from snrmjax.model.places import Row, row_over_points
+from snrmjax.model.structures import Structure, structure
+from snrmjax.numerics.names import suggestion
+from snrmjax.numerics.rules import POSITIVE, require
+
+_SYMMETRIC = 1e-8  # of the largest entry: what a finite-element program's output may miss by
+_RIGID = 1e-9  # of the largest: natural frequencies squared below are of rigid-body motions
+_DEPENDENT = 1e-10  # of its length: what is left of a vector that others already contain
+_DENSE = 2000  # unknowns, above which only the wanted modes are computed
+_OVERDAMPED = 0.99  # damping ratio, beyond which the rest counts as coupling
+_NO_COUPLING = 1e-12  # of the damping of both modes
+
+Phasor = float | complex
+
+
+class Matrices(NamedTuple):
+    """M ẍ + C ẋ + K x = f, as `from_matrices` takes it."""
+
+    mass: Any  # kg
+    damping: Any  # N s/m
+    stiffness: Any  # N/m
+    points: tuple[str, ...]  # one name for each unknown
+
+
+def from_matrices(
+    mass: Any,
+    damping: Any,
+    stiffness: Any,
+    points: Sequence[str] | None = None,
+    *,
+    force: str | Mapping[str, Phasor],
+    effects: AbstractEffect | Iterable[AbstractEffect] = (),
+    n_modes: int | None = None,
+    residuals: bool = True,
+    mode_of_interest: int = 0,
+    sensors: Sequence[str] | None = None,
+    name: str = "structure",
+) -> Structure:
+    """A structure from matrices, by its linear modes: M ẍ + C ẋ + K x + Σ effects = b F cos Ωt.
+
+    Arguments: `mass` (kg), `damping` (N s/m) and `stiffness` (N/m) of shape (unknown, unknown),
+    dense or sparse of SciPy; `damping` may be a damping ratio of every mode instead, and None for
+    none. `points` names the unknowns ("x1", "x2", … by default). `force` is where the recorded
+    force acts: a point, or newtons per newton at points, complex where they lead by a phase.
+    `effects` act at points by their `at`, in N and m; the matrices hold no part of them.
+    `n_modes` keeps so many modes of lowest frequency, and for every place of an effect and for
+    the force one vector more: what the left out modes give way there statically, exactly, as
+    further modes of high frequency; without `residuals` it does not, as many places want it.
+    `sensors` are the points that are watched, by default all.
+    Damping that couples modes is kept. Modes without stiffness become rigid-body modes.
+
+    Returns a `Structure`. What `n_modes` leaves out is the dynamics of higher modes: a share of
+    about (Ω/ω)² of their static part, ω being the first frequency left out, for each harmonic Ω.
+    Raises `ValueError` for matrices that are not square, finite, symmetric, or of different sizes,
+    a mass that is not positive definite, a stiffness that is negative, unknown or repeated points,
+    a force that no mode feels, and an effect that acts on a rigid-body mode.
+    Reference: MacNeal, Comput. Struct. 1 (1971) 581, doi:10.1016/0045-7949(71)90031-9.
+
+    >>> from snrmjax.model.effects import make_effect
+    >>> spring = make_effect("cubic_stiffness", {"coefficient": 0.5}, at="x1")
+    >>> two = from_matrices(*chain([1.0, 1.0], [1.0, 1.0, 1.0]), force="x1", effects=spring)
+    >>> two.modes.natural_frequency.round(3)
+    Array([1.   , 1.732], dtype=float64)
+    """
+    m, k = _checked("mass", mass), _checked("stiffness", stiffness)
+    size = m.shape[0]
+    if k.shape != m.shape:
+        raise ValueError(f"`mass` has shape {m.shape}, but `stiffness` has {k.shape}.")
+    names = tuple(points) if points is not None else tuple(f"x{i + 1}" for i in range(size))
+    _check_names(names, size)
+    made = checked_effects(effects)
+    places = dict.fromkeys(at for e in made if (at := getattr(e, "at", None)) is not None)
+    rows = [_column(names, row, "an effect") for row in places]
+    load = _column(names, force, "`force`")
+    squared, shapes, rigid = _modes(m, k, n_modes)
+    if n_modes is not None and residuals:
+        parts = [*rows, load.real, *([load.imag] if np.any(load.imag) else [])]
+        squared, shapes = _with_residuals(k, m, squared, shapes, rigid, parts)
+    if not squared.size or not np.any(load @ shapes):
+        raise ValueError("`force` acts where no mode of the structure moves.")
+    for place, row in zip(places, rows, strict=True):
+        if np.any(np.abs(row @ rigid) > 1e-9 * np.linalg.norm(rigid, axis=0)):
+            raise ValueError(
+                f"an effect acts at {' and '.join(point for point, _ in place)}, which moves in a "
+                "rigid-body mode: support the structure, by soft springs where it hangs free."
+            )
+    omega = np.sqrt(squared)
+    ratio, coupling = _damping(damping, shapes, omega)
+    watched = tuple(sensors) if sensors is not None else names
+    for sensor in watched:
+        _place(names, sensor, "`sensors`")
+    seen = [names.index(sensor) for sensor in watched]
+    other = {n: shapes[i] for i, n in enumerate(names) if n not in set(watched)}
+    acting = load @ shapes
+    modes = linear_modes(
+        *(omega, ratio, shapes[seen], acting.real),
+        sensors=watched,
+        mode_of_interest=mode_of_interest,
+        rigid_body=RigidBodyModes(rigid[seen], (load @ rigid).real),
+        beside=Beside(other, coupling, -acting.imag if np.any(acting.imag) else None),
+    )
+    return structure(modes, effects=made, name=name)
+
+
+def _checked(name: str, matrix: Any) -> Any:
+    """A square symmetric matrix, dense up to a size and sparse beyond."""
+    if matrix is None:
+        raise ValueError(f"`{name}` must be a matrix, but is missing.")
+    sparse = scipy.sparse.issparse(matrix)
+    values: Any = matrix.tocsc().astype(float) if sparse else np.asarray(matrix, dtype=np.float64)
+    if values.ndim != 2 or values.shape[0] != values.shape[1] or not values.shape[0]:
+        raise ValueError(f"`{name}` must be a square matrix, but has shape {values.shape}.")
+    require(f"`{name}`", values.data if sparse else values)
+    miss, largest = abs(values - values.T).max(), abs(values).max()
+    if miss > _SYMMETRIC * largest:
+        raise ValueError(f"`{name}` must be symmetric, but its two halves differ by {miss:g}.")
+    values = 0.5 * (values + values.T)
+    return values.toarray() if sparse and values.shape[0] <= _DENSE else values
+
+
+def _check_names(names: tuple[str, ...], size: int) -> None:
+    if len(names) != size:
+        raise ValueError(f"`points` names {len(names)} points, but there are {size} unknowns.")
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"`points` names {name!r} twice.")
+
+
+def _place(names: tuple[str, ...], point: str, what: str) -> int:
+    if point not in names:
+        near = suggestion(point, names) or f"; known are {', '.join(names[:12])}"
+        raise ValueError(f"{what} names the point {point!r}, which does not exist{near}.")
+    return names.index(point)
+
+
+def _column(names: tuple[str, ...], at: str | Mapping[str, Phasor] | Row, what: str) -> np.ndarray:
+    """Weights of all unknowns; complex of a force with phases."""
+    pairs = at.items() if isinstance(at, Mapping) else row_over_points(at)
+    column = np.zeros(len(names), dtype=complex)
+    for point, weight in pairs:
+        column[_place(names, point, what)] += weight
+    return column if np.any(column.imag) else column.real
+
+
+def _modes(m: Any, k: Any, n_modes: int | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Squared frequencies and mass-normalised shapes of flexible modes, and rigid-body shapes."""
+    size = m.shape[0]
+    wanted = size if n_modes is None else n_modes
+    if not 1 <= wanted <= size:
+        raise ValueError(f"`n_modes` must lie between 1 and {size}, but is {n_modes}.")
+    if scipy.sparse.issparse(k) and wanted < size - 1:
+        # A shift below zero keeps the factorised matrix regular where rigid-body modes exist.
+        shift = -1e-3 * abs(k.diagonal()).min() / abs(m.diagonal()).max()
+        squared, shapes = scipy.sparse.linalg.eigsh(k, min(wanted + 6, size - 1), m, sigma=shift)
+        scale = squared.max()
+    else:
+        try:
+            squared, shapes = scipy.linalg.eigh(_dense(k), _dense(m))
+        except np.linalg.LinAlgError as error:
+            raise ValueError("`mass` must be positive definite, but is not.") from error
+        scale = max(squared.max(), np.finfo(float).tiny)
+    order = np.argsort(squared)
+    squared, shapes = squared[order], shapes[:, order]
+    if squared[0] < -_RIGID * scale:
+        raise ValueError(
+            "`stiffness` must not be negative, but one of the squared natural frequencies is "
+            f"{squared[0]:g} 1/s²."
+        )
+    shapes = shapes * np.where(shapes[np.argmax(np.abs(shapes), 0), range(len(order))] < 0, -1, 1)
+    floats = squared <= _RIGID * scale
+    keep = np.flatnonzero(~floats)[:wanted]
+    return squared[keep], shapes[:, keep], shapes[:, floats]
+
+
+def _dense(matrix: Any) -> np.ndarray:
+    return matrix.toarray() if scipy.sparse.issparse(matrix) else matrix
+
+
+def _with_residuals(
+    k: Any,
+    m: Any,
+    squared: np.ndarray,
+    shapes: np.ndarray,
+    rigid: np.ndarray,
+    loads: list[np.ndarray],
+) -> tuple[np.ndarray, np.ndarray]:
+    """The modes, and what the left out ones give way statically under unit loads, as modes."""
+    if shapes.shape[1] + rigid.shape[1] >= len(shapes):
+        return squared, shapes
+    kept = np.concatenate([rigid, shapes], axis=1)
+    columns = np.stack(loads, axis=1)
+    columns = columns - m @ (kept @ (kept.T @ columns))  # nothing that the kept modes carry
+    solve = (
+        scipy.sparse.linalg.splu(k.tocsc()).solve
+        if scipy.sparse.issparse(k)
+        else functools.partial(scipy.linalg.lstsq, k)
+    )
+    answer: Any = solve(columns)
+    ways = answer[0] if isinstance(answer, tuple) else answer
+    vectors = np.zeros((len(shapes), 0))
+    for way in ways.T:
+        left = way
+        for _ in range(2):  # once more against rounding
+            for basis in (kept, vectors):
+                left = left - basis @ (basis.T @ (m @ left))
+        length, whole = np.sqrt(left @ (m @ left)), np.sqrt(way @ (m @ way))
+        if length > _DEPENDENT * max(whole, np.finfo(float).tiny):
+            vectors = np.column_stack([vectors, left / length])
+    if not vectors.shape[1]:
+        return squared, shapes
+    values, mixed = np.linalg.eigh(vectors.T @ (k @ vectors))
+    return np.append(squared, values), np.column_stack([shapes, vectors @ mixed])
+
+
+def _damping(
+    damping: Any, shapes: np.ndarray, omega: np.ndarray
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """Damping ratios, and what of the modal damping matrix they do not hold."""
+    if damping is None or (np.ndim(damping) == 0 and not scipy.sparse.issparse(damping)):
+        return np.full(omega.shape, 0.0 if damping is None else float(damping)), None
+    whole = _checked("damping", damping)
+    if whole.shape[0] != len(shapes):
+        raise ValueError(
+            f"`damping` has shape {whole.shape}, but there are {len(shapes)} unknowns."
+        )
+    modal = shapes.T @ (whole @ shapes)
+    own = np.diag(modal)
+    ratio = np.minimum(own / (2 * omega), _OVERDAMPED)
+    rest = modal - np.diag(2 * ratio * omega)
+    least = _NO_COUPLING * np.sqrt(np.abs(np.outer(own, own)))
+    return ratio, rest if np.any(np.abs(rest) > least) else None
+
+
+def chain(
+    masses: Sequence[float] | Float[np.ndarray, " mass"],
+    springs: Sequence[float] | Float[np.ndarray, " spring"],
+    dampers: Sequence[float] | Float[np.ndarray, " spring"] | float = 0.0,
+) -> Matrices:
+    """Masses in a row between two walls; their points are "x1", "x2", ….
+
+    Arguments: `masses` in kg; `springs` in N/m and `dampers` in N s/m, one more than masses: wall
+    to first, first to second, …, last to wall (0 for none). One number of `dampers` is for all.
+    Raises `ValueError` for numbers that do not fit together.
+
+    >>> chain([1.0, 2.0], [3.0, 4.0, 0.0]).stiffness
+    array([[ 7., -4.],
+           [-4.,  4.]])
+    """
+    weights = np.asarray(masses, dtype=np.float64)
+    size = weights.size
+    parts = []
+    for name, values in (("springs", springs), ("dampers", dampers)):
+        row = np.asarray(values, dtype=np.float64)
+        row = np.full(size + 1, row) if row.ndim == 0 else row
+        if row.shape != (size + 1,):
+            raise ValueError(
+                f"`{name}` must have {size + 1} numbers, one more than masses, but has {row.size}."
+            )
+        parts.append(np.diag(row[:-1] + row[1:]) - np.diag(row[1:-1], 1) - np.diag(row[1:-1], -1))
+    names = tuple(f"x{i + 1}" for i in range(size))
+    return Matrices(np.diag(weights), parts[1], parts[0], names)
+
+
+def beam(
+    bending_stiffness: float,
+    mass_per_length: float,
+    length: float,
+    n_elements: int,
+    *,
+    supports: tuple[str, str] = ("clamped", "free"),
+    springs: Mapping[str, float] | None = None,
+    stiffness_damping: float = 0.0,
+    mass_damping: float = 0.0,
+) -> Matrices:
+    """A straight beam in bending by Euler and Bernoulli's elements, with consistent masses.
+
+    The points are the deflections "w0", "w1", …, "w`n_elements`" (m) and the slopes "r0", "r1", …
+    (rad) of the nodes, but for those that `supports` hold: "clamped", "pinned" or "free" at either
+    end. `springs` (N/m) stand at points, linear; the damping is `mass_damping` (1/s) times the mass
+    and `stiffness_damping` (s) times the stiffness of the beam without springs.
+    Arguments: `bending_stiffness` E I in N m², `mass_per_length` ρ A in kg/m, `length` in m.
+    Raises `ValueError` for numbers that cannot be and unknown supports.
+
+    >>> model = from_matrices(*beam(174.3, 0.78, 0.5, 20), force="w20")
+    >>> round(float(model.modes.natural_frequency[0]), 2)  # 1.8751²/l² √(E I/ρ A)
+    210.24
+    """
+    for name, value in (
+        *(("bending_stiffness", bending_stiffness), ("mass_per_length", mass_per_length)),
+        *(("length", length), ("n_elements", n_elements)),
+    ):
+        require(f"`{name}`", value, POSITIVE)
+    h = length / n_elements
+    bending = np.array([[12, 6 * h, -12, 6 * h], [0, 4 * h**2, -6 * h, 2 * h**2]])
+    bending = np.vstack([bending, [[0, 0, 12, -6 * h], [0, 0, 0, 4 * h**2]]])
+    inertia = np.array([[156, 22 * h, 54, -13 * h], [0, 4 * h**2, 13 * h, -3 * h**2]])
+    inertia = np.vstack([inertia, [[0, 0, 156, -22 * h], [0, 0, 0, 4 * h**2]]])
+    size = 2 * n_elements + 2
+    mass, stiffness = np.zeros((size, size)), np.zeros((size, size))
+    for k in range(n_elements):
+        here = slice(2 * k, 2 * k + 4)
+        mass[here, here] += mass_per_length * h / 420 * inertia
+        stiffness[here, here] += bending_stiffness / h**3 * bending
+    mass, stiffness = (np.triu(part) + np.triu(part, 1).T for part in (mass, stiffness))
+    names = [f"{kind}{k}" for k in range(n_elements + 1) for kind in "wr"]
+    held = {"clamped": 2, "pinned": 1, "free": 0}
+    for end in supports:
+        if end not in held:
+            raise ValueError(f"`supports` must be clamped, pinned or free, but has {end!r}.")
+    gone = [*range(held[supports[0]]), *(size - 2 + k for k in range(held[supports[1]]))]
+    keep = np.setdiff1d(np.arange(size), gone)
+    mass, stiffness = mass[np.ix_(keep, keep)], stiffness[np.ix_(keep, keep)]
+    points = tuple(names[k] for k in keep)
+    damping = mass_damping * mass + stiffness_damping * stiffness
+    for point, value in (springs or {}).items():
+        place = _place(points, point, "`springs`")
+        stiffness[place, place] += value
+    return Matrices(mass, damping, stiffness, points)

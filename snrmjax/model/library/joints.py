@@ -1,0 +1,99 @@
+"""Elements of joints and linkages, for points of a structure: their parameters are in N and m."""
+
+import dataclasses
+from typing import ClassVar, Self
+
+import jax.numpy as jnp
+import numpy as np
+
+from snrmjax.model.effect_base import AbstractMemoryless, Samples, Scalar
+from snrmjax.model.effect_metadata import Argument, Part, Shape, Symmetry, parameter
+from snrmjax.model.library.friction import AbstractSliders, Sliders
+from snrmjax.numerics.rules import ABOVE_MINUS_ONE, NOT_NEGATIVE, POSITIVE
+
+_NODE, _WEIGHT = (0.5 * part for part in np.polynomial.legendre.leggauss(48))
+_NODE = _NODE + 0.5  # on (0, 1)
+
+
+class RegularisedFriction(AbstractMemoryless):
+    """f = F tanh(ẋ/v): dry friction that creeps below the velocity v.
+
+    `force` F and `velocity` v, which is a property of the model, not of the motion: below it the
+    friction is a damper F/v. Coulomb's law proper is `coulomb_friction`.
+    """
+
+    kind: ClassVar[str] = "regularised_friction"
+    description: ClassVar[str] = "Dry friction whose jump is smoothed over a given velocity."
+    shape: ClassVar[Shape] = Shape(Part.DAMPING, Symmetry.ODD, Argument.VELOCITY)
+    force_limit: Scalar = parameter("kg^1/2 m/s²", "friction force", rules=(NOT_NEGATIVE,))
+    velocity: Scalar = parameter("kg^1/2 m/s", "velocity of the jump", rules=(POSITIVE,))
+
+    def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
+        return self.force_limit * jnp.tanh(velocity / self.velocity)
+
+
+class SpringLinkage(AbstractMemoryless):
+    """f = k x (1 − l₀/√(l² + x²)): a spring across the motion, as a pivoted link has it.
+
+    `stiffness` k, `length` l between its ends at x = 0, `free_length` l₀ of the spring without
+    load: above l it is compressed there and pushes outwards, below it pulls back.
+    """
+
+    kind: ClassVar[str] = "spring_linkage"
+    description: ClassVar[str] = "A linear spring that stands across the motion and turns with it."
+    shape: ClassVar[Shape] = Shape(Part.STIFFNESS, Symmetry.ODD, Argument.DISPLACEMENT)
+    stiffness: Scalar = parameter("1/s²", "stiffness of the spring", rules=(NOT_NEGATIVE,))
+    length: Scalar = parameter("kg^1/2 m", "distance of its ends at rest", rules=(POSITIVE,))
+    free_length: Scalar = parameter("kg^1/2 m", "length without load", rules=(NOT_NEGATIVE,))
+
+    def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
+        now = jnp.sqrt(self.length**2 + displacement**2)
+        return self.stiffness * displacement * (1 - self.free_length / now)
+
+
+class FourParameterIwan(AbstractSliders):
+    """Segalman's joint: sliders of density R φ^χ up to φ_max, and some that slip at φ_max together.
+
+    `slip_force` F_s with which the whole joint slips, `stiffness` K_t while all of it sticks,
+    `exponent` χ (from above −1 to 0: the loss per cycle grows with the power χ + 3 of the
+    amplitude) and `ratio` β of the sliders at φ_max to the others in stiffness. Sliders up to the
+    largest displacement of a motion are resolved by Gauss's rule with 48 points, in the power of
+    φ in which they are evenly dense; the others stick.
+    Reference: Segalman, ASME J. Appl. Mech. 72 (2005), 752, doi:10.1115/1.1989354.
+    """
+
+    kind: ClassVar[str] = "four_parameter_iwan"
+    description: ClassVar[str] = (
+        "A bolted joint that slips bit by bit and at a limiting force as a whole."
+    )
+    shape: ClassVar[Shape] = Shape(Part.STIFFNESS_AND_DAMPING, Symmetry.ODD, Argument.HISTORY)
+    slip_force: Scalar = parameter("kg^1/2 m/s²", "force of macroslip", rules=(POSITIVE,))
+    stiffness: Scalar = parameter("1/s²", "stiffness while it sticks", rules=(POSITIVE,))
+    exponent: Scalar = parameter("1", "power of the density", rules=(ABOVE_MINUS_ONE,))
+    ratio: Scalar = parameter("1", "stiffness at the end over the rest", rules=(NOT_NEGATIVE,))
+    largest_slip: Scalar | None = None  # of the sliders that are resolved, in m
+
+    @property
+    def end(self) -> Scalar:
+        """φ_max, the displacement at which the last sliders slip."""
+        mean = (self.exponent + 1) / (self.exponent + 2)
+        return self.slip_force * (1 + self.ratio) / (self.stiffness * (self.ratio + mean))
+
+    def scaled_for(self, displacement: Scalar, velocity: Scalar) -> Self:
+        return dataclasses.replace(self, largest_slip=jnp.asarray(displacement, jnp.float64))
+
+    def sliders(self) -> Sliders:
+        """Sliders up to `largest_slip`, those at φ_max, and one for the others, which stick."""
+        power, end = self.exponent + 1, self.end
+        largest = end if self.largest_slip is None else jnp.minimum(self.largest_slip, end)
+        spread = self.stiffness / (1 + self.ratio)  # of all below φ_max
+        share = jnp.where(largest > 0, largest, 0.0) / end
+        some = jnp.where(share > 0, share, 1.0) ** power * jnp.where(share > 0, spread, 0.0)
+        slip = largest * jnp.asarray(_NODE) ** (1 / power)
+        rest = jnp.stack([self.stiffness - spread, spread - some])
+        return Sliders(
+            jnp.concatenate([some * _WEIGHT, rest]), jnp.concatenate([slip, jnp.stack([end, end])])
+        )
+
+    def for_cycle(self, displacement: Samples) -> Self:
+        return self.scaled_for(jnp.max(jnp.abs(displacement)), jnp.zeros(()))

@@ -1,0 +1,81 @@
+"""Where a force acts: on a row of weights over the points of a structure."""
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+Row = tuple[tuple[str, float], ...]
+"""Points with their weights b: a force acts on Σ b x, and by b on every point."""
+
+
+def between(point: str, other: str) -> Row:
+    """The row of a force between two points: it acts on the first one's motion less the other's.
+
+    >>> between("tip", "root")
+    (('tip', 1.0), ('root', -1.0))
+    """
+    return row_over_points({point: 1.0, other: -1.0} if point != other else [(point, 1.0)] * 2)
+
+
+def row_over_points(at: str | Mapping[str, float] | Iterable[tuple[str, float]]) -> Row:
+    """A row from a point's name, or from points with their weights.
+
+    Raises `ValueError` for no point, a point that is named twice and a weight that is zero or no
+    number.
+    """
+    pairs: Any = (
+        [(at, 1.0)] if isinstance(at, str) else list(at.items() if isinstance(at, Mapping) else at)
+    )
+    if not pairs:
+        raise ValueError("`at` must name at least one point, but is empty.")
+    row: list[tuple[str, float]] = []
+    for name, weight in pairs:
+        if not isinstance(weight, float | int | np.number) or not 0 < abs(float(weight)) < np.inf:
+            raise ValueError(f"the weight of {name!r} in `at` must be a number, but is {weight!r}.")
+        if any(name == other for other, _ in row):
+            raise ValueError(f"`at` names the point {name!r} twice: a force needs two places.")
+        row.append((str(name), float(weight)))
+    return tuple(row)
+
+
+def checked_row(at: Any) -> Row | None:
+    """A row, or None for a force on the mode of interest."""
+    return None if at is None else row_over_points(at)
+
+
+def row_text(row: Row) -> str:
+    """A row in words: "tip", "tip - root" or "2 tip - root"."""
+    parts = [
+        ("- " if weight < 0 else "+ ") + ("" if abs(weight) == 1 else f"{abs(weight):g} ") + name
+        for name, weight in row
+    ]
+    return " ".join(parts).removeprefix("+ ")
+
+
+_UNITS = {
+    "1": "1",
+    "kg^1/2 m": "m",
+    "kg^1/2 m/s": "m/s",
+    "kg^1/2 m/s²": "N",
+    "1/s": "N s/m",
+    "1/s²": "N/m",
+    "1/(kg^1/2 m s²)": "N/m²",
+    "1/(kg m² s²)": "N/m³",
+    "1/(kg² m⁴ s²)": "N/m⁵",
+    "1/(kg^1/2 m)": "N s²/m²",
+    "s/(kg m²)": "N s³/m³",
+    "1/(kg m² s)": "N s/m³",
+    "(kg^1/2 m)^(1-exponent)/s²": "N/m^exponent",
+}
+
+
+def unit_at(row: Row | None, unit: str) -> str:
+    """The unit of a parameter of a force at a row, from that on the mode of interest.
+
+    Of an effect of a user's own it is that with N in place of kg^1/2 m/s² and m of kg^1/2 m.
+
+    >>> unit_at(between("tip", "root"), "1/s²")
+    'N/m'
+    """
+    return unit if row is None else _UNITS.get(unit, f"({unit}, in N and m)")

@@ -1,0 +1,163 @@
+"""Structures from matrices: against the matrices themselves, and what is refused."""
+
+import numpy as np
+import pytest
+import scipy.sparse
+
+import snrmjax as sj
+from snrmjax.model.builders.matrices import chain, from_matrices
+
+MASSES, SPRINGS, DAMPERS = (
+    [1.0, 0.5, 2.0, 1.5],
+    [3.0, 1.0, 2.0, 1.0, 0.5],
+    [0.1, 0.0, 0.3, 0.0, 0.2],
+)
+
+
+def exact(matrices, load, omega):
+    """Velocities of the points under a load, by the matrices."""
+    m, c, k, _ = matrices
+    return 1j * omega * np.linalg.solve(k - omega**2 * m + 1j * omega * c, load)
+
+
+def response(model, omega):
+    return np.asarray(sj.model.linear_response(model.modes, omega, 1.0))
+
+
+def test_the_linear_response_is_that_of_the_matrices():
+    matrices = chain(MASSES, SPRINGS, DAMPERS)
+    force = {"x1": 2.0, "x3": 0.5 * np.exp(0.7j)}
+    model = from_matrices(*matrices, force=force)
+    assert model.modes.damping_coupling is not None
+    for omega in (0.3, 1.1, 2.9):
+        wanted = exact(matrices, [2.0, 0.0, 0.5 * np.exp(0.7j), 0.0], omega)
+        np.testing.assert_allclose(response(model, omega), wanted, rtol=1e-11)
+
+
+def test_forced_responses_of_coupled_damping_and_lagging_forces_are_linear_ones():
+    matrices = chain(MASSES[:2], [1.0, 0.4, 0.7], [0.05, 0.02, 0.0])
+    force = {"x1": 1.0, "x2": 0.8j}
+    model = from_matrices(*matrices, force=force)
+    curve = sj.forced_response(model, 0.3, 0.5, 3.0, harmonic_order=1)[0]
+    for k in (0, len(curve.frequency) // 2, -1):
+        wanted = 0.3 * exact(matrices, [1.0, 0.8j], curve.frequency[k])
+        np.testing.assert_allclose(curve.velocity[k, 1], wanted, rtol=1e-7)
+    # A stable linear structure has the multipliers e^(λT) of its eigenvalues λ.
+    m, c, k, _ = matrices
+    zero, eye = np.zeros((2, 2)), np.eye(2)
+    below = -np.linalg.solve(m, np.hstack([k, c]))
+    values = np.linalg.eigvals(np.vstack([np.hstack([zero, eye]), below]))
+    wanted = np.exp(values * 2 * np.pi / curve.frequency[0])
+    found = curve.multipliers[0]
+    np.testing.assert_allclose(np.sort_complex(found), np.sort_complex(wanted), rtol=1e-7)
+
+
+def test_what_is_left_out_gives_way_statically():
+    """Ten masses of fifty: without residuals the static answer misses, with them it is exact."""
+    size = 50
+    matrices = chain(np.full(size, 0.02), np.full(size + 1, 50.0), 0.0)
+    spring = sj.model.make_effect(
+        "cubic_stiffness", {"coefficient": 1.0}, at=sj.model.between("x7", "x9")
+    )
+    model = from_matrices(*matrices, force="x20", effects=spring, n_modes=10)
+    assert model.n_modes == 12
+    low = response(model, 1e-3) / (1e-3j)
+    static = np.linalg.solve(matrices.stiffness, np.eye(size))
+    np.testing.assert_allclose(low[19].real, static[19, 19], rtol=1e-6)
+    row = np.asarray(model.modes.shape_at("x7") - model.modes.shape_at("x9"))
+    way = row**2 @ (1 / np.asarray(model.modes.natural_frequency) ** 2)
+    along = np.eye(size)[6] - np.eye(size)[8]
+    assert way == pytest.approx(along @ static @ along, rel=1e-9)
+    few = from_matrices(*matrices, force="x20", n_modes=10)
+    assert (
+        abs(row[:10] ** 2 @ (1 / np.asarray(model.modes.natural_frequency[:10]) ** 2) / way - 1)
+        > 0.1
+    )
+    assert few.n_modes == 11
+
+
+def test_sparse_matrices_are_dense_ones():
+    matrices = chain(MASSES, SPRINGS, DAMPERS)
+    sparse = [scipy.sparse.csr_matrix(part) for part in matrices[:3]]
+    one, two = (
+        from_matrices(*parts, matrices.points, force="x2") for parts in (matrices[:3], sparse)
+    )
+    np.testing.assert_allclose(one.modes.natural_frequency, two.modes.natural_frequency, rtol=1e-12)
+
+
+def test_many_unknowns_keep_their_first_modes():
+    """3 000 masses as a rod: ω = 2√(k/m) sin(jπ/(2(n + 1)))."""
+    size = 3000
+    eye = scipy.sparse.diags([-1.0, 2.0, -1.0], [-1, 0, 1], (size, size)) * 1e6
+    model = from_matrices(
+        scipy.sparse.eye(size) * 1e-3, 0.01, eye, force="x1500", n_modes=5, sensors=["x1500"]
+    )
+    wanted = 2 * np.sqrt(1e9) * np.sin(np.arange(1, 6) * np.pi / (2 * (size + 1)))
+    np.testing.assert_allclose(model.modes.natural_frequency[:5], wanted, rtol=1e-9)
+    assert model.modes.sensors == ("x1500",)
+
+
+def test_a_free_structure_has_rigid_body_modes():
+    matrices = chain([1.0, 2.0], [0.0, 3.0, 0.0])
+    model = from_matrices(*matrices, force="x1")
+    assert model.n_modes == 1
+    assert model.modes.rigid_body_shape.shape == (2, 1)
+    wanted = exact(matrices, [1.0, 0.0], 0.9)
+    np.testing.assert_allclose(response(model, 0.9), wanted, rtol=1e-10)
+
+
+M, C, K = chain([1.0, 1.0], [1.0, 1.0, 1.0])[:3]
+
+
+def changed(matrix, entry, value):
+    other = matrix.copy()
+    other[entry] = value
+    return other
+
+
+@pytest.mark.parametrize(
+    ("parts", "settings", "complaint"),
+    [
+        ((M[:, :1], C, K), {}, r"`mass` must be a square matrix"),
+        ((M, C, K[0]), {}, r"`stiffness` must be a square matrix"),
+        ((M, C, changed(K, (0, 1), -1.5)), {}, r"`stiffness` must be symmetric"),
+        ((changed(M, (0, 1), 0.1), C, K), {}, r"`mass` must be symmetric"),
+        ((M, changed(C, (0, 1), 0.1), K), {}, r"`damping` must be symmetric"),
+        ((-M, C, K), {}, r"`mass` must be positive definite"),
+        ((M * 0, C, K), {}, r"`mass` must be positive definite"),
+        ((M, C, -K), {}, r"`stiffness` must not be negative"),
+        ((M, C, K * np.nan), {}, r"`stiffness` must be finite"),
+        ((M, C, np.eye(3)), {}, r"`mass` has shape \(2, 2\), but `stiffness` has \(3, 3\)"),
+        ((M, np.eye(3), K), {}, r"`damping` has shape \(3, 3\), but there are 2"),
+        ((M, 1.5, K), {}, r"`damping_ratio` must be from 0 to below 1"),
+        ((M, C, None), {}, r"`stiffness` must be a matrix"),
+        ((M, C, K), {"points": ["a"]}, r"names 1 points, but there are 2 unknowns"),
+        ((M, C, K), {"points": ["a", "a"]}, r"names 'a' twice"),
+        ((M, C, K), {"force": "x3"}, r"`force` names the point 'x3'.*known are x1, x2"),
+        ((M, C, K), {"force": {}}, r"no mode of the structure moves"),
+        ((M, C, K), {"force": {"x1": 0.0}}, r"no mode of the structure moves"),
+        ((M, C, K), {"sensors": ["tip"]}, r"`sensors` names the point 'tip'"),
+        ((M, C, K), {"n_modes": 0}, r"`n_modes` must lie between 1 and 2"),
+        ((M, C, K), {"n_modes": 3}, r"`n_modes` must lie between 1 and 2"),
+        ((M, C, K), {"mode_of_interest": 2}, r"`mode_of_interest` must lie between 0 and 1"),
+        ((M, C, K * 0), {}, r"no mode of the structure moves"),
+    ],
+)
+def test_what_is_no_structure_is_refused(parts, settings, complaint):
+    with pytest.raises(ValueError, match=complaint):
+        from_matrices(*parts, **{"force": "x1", **settings})
+
+
+def test_an_effect_on_a_structure_that_hangs_free_is_refused():
+    spring = sj.model.make_effect("cubic_stiffness", {"coefficient": 1.0}, at="x1")
+    with pytest.raises(ValueError, match="x1, which moves in a rigid-body mode"):
+        from_matrices(*chain([1.0, 2.0], [0.0, 3.0, 0.0]), force="x1", effects=spring)
+
+
+@pytest.mark.parametrize(
+    ("springs", "dampers", "complaint"),
+    [([1.0, 1.0], 0.0, "`springs` must have 3"), ([1.0] * 3, [0.1], "`dampers` must have 3")],
+)
+def test_a_chain_of_other_lengths_is_refused(springs, dampers, complaint):
+    with pytest.raises(ValueError, match=complaint):
+        chain([1.0, 1.0], springs, dampers)

@@ -1,0 +1,79 @@
+"""Kinks of a force over a cycle: passings and sums against exact integrals."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from snrmjax.model.kinks import Kinks, crossings, with_kinks
+
+N = 256
+TAU = 2 * np.pi * np.arange(N) / N
+
+
+def motion(tau, shift=0.0):
+    t = tau + shift
+    return np.cos(t) + 0.6 * np.cos(2 * t + 0.3) + 0.25 * np.sin(5 * t)
+
+
+def contact(x, place=0.4):
+    return jnp.maximum(x - place, 0.0)
+
+
+def coefficients(shift, order, place=0.4):
+    """Fourier coefficients of a sampled contact, and by 2¹⁹ samples."""
+    x = jnp.asarray(motion(TAU, shift))
+    kinks = Kinks(jnp.array([place]), jnp.array([1.0]))
+    sampled = np.asarray(with_kinks(contact(x, place), x, kinks))
+    fine = 2 * np.pi * np.arange(2**19) / 2**19
+    exact = np.maximum(motion(fine, shift) - place, 0.0)
+    return np.mean(sampled * np.exp(1j * order * TAU)), np.mean(exact * np.exp(1j * order * fine))
+
+
+@pytest.mark.parametrize(("order", "miss"), [(0, 3e-7), (1, 3e-7), (7, 3e-7), (20, 2e-6)])
+def test_sums_are_integrals_wherever_the_kinks_lie(order, miss):
+    for shift in np.linspace(0, 2 * np.pi / N, 5):
+        found, wanted = coefficients(shift, order)
+        assert abs(found - wanted) < miss  # without the correction 3e-5
+
+
+def test_a_contact_shorter_than_a_sample_counts():
+    """∮ max((1 + d) cos τ − 1, 0) dτ = 2 ((1 + d) sin τ₀ − τ₀) with cos τ₀ = 1/(1 + d)."""
+    for depth, miss in ((2e-5, 1e-2), (1e-4, 1e-4), (1e-2, 1e-6)):
+        end = np.arccos(1 / (1 + depth))
+        wanted = 2 * ((1 + depth) * np.sin(end) - end)
+        for shift in (0.0, 0.003, 0.012, 0.02):
+            x = jnp.asarray((1 + depth) * np.cos(TAU + shift))
+            kinks = Kinks(jnp.array([1.0]), jnp.array([1.0]))
+            found = float(jnp.sum(with_kinks(contact(x, 1.0), x, kinks))) * 2 * np.pi / N
+            assert found == pytest.approx(wanted, rel=miss)
+
+
+def test_the_derivative_is_that_of_the_integral():
+    """d/dg ∮ max(x − g, 0) dτ is minus the time above g."""
+
+    def whole(place):
+        x = jnp.asarray(motion(TAU))
+        kinks = Kinks(place[None], jnp.ones(1))
+        return jnp.sum(with_kinks(contact(x, place), x, kinks)) * 2 * jnp.pi / N
+
+    fine = 2 * np.pi * np.arange(2**19) / 2**19
+    above = np.mean(motion(fine) > 0.4) * 2 * np.pi
+    assert float(jax.grad(whole)(jnp.array(0.4))) == pytest.approx(-above, abs=2e-5)
+
+
+def test_passings_are_found_with_their_rates():
+    found = crossings(jnp.asarray(motion(TAU)), jnp.array(0.4))
+    used = np.asarray(found.passes)
+    fine = 2 * np.pi * np.arange(2**19) / 2**19
+    signs = np.diff((motion(fine) > 0.4).astype(int))
+    wanted = np.flatnonzero(signs) * fine[1]
+    phases = np.asarray(found.interval + found.share)[used] * TAU[1]
+    np.testing.assert_allclose(phases, wanted, atol=2 * fine[1])
+    assert np.all(np.sign(found.rate[used]) == np.sign(signs[signs != 0]))
+
+
+def test_what_touches_nowhere_is_left_alone():
+    x = jnp.asarray(motion(TAU))
+    kinks = Kinks(jnp.array([5.0]), jnp.array([1.0]))
+    np.testing.assert_array_equal(with_kinks(x**3, x, kinks), x**3)
