@@ -333,8 +333,10 @@ def test_matrices_side_by_side_are_factorised_one_by_one():
     found = jax.vmap(solved_behind)(columns)
     exact = np.linalg.solve(matrices[:, :, :5], matrices[:, :, 5:])
     np.testing.assert_allclose(np.swapaxes(found, 1, 2), exact, rtol=1e-12, atol=1e-13)
-    program = str(jax.make_jaxpr(jax.vmap(solved_behind))(columns))
-    assert re.findall(r"f64\[([\d,]+)\] \w+:i32\[[\d,]+\] \w+:i32\[[\d,]+\] = lu", program) == [
-        "5,7"
-    ]
-    assert "scan" in program  # over the three
+    # Within another program's lanes too.
+    together = jax.vmap(solved_behind)
+    for solve, given in ((together, columns), (jax.vmap(together), columns[None])):
+        program = str(jax.make_jaxpr(solve)(given))
+        sizes = re.findall(r"f64\[([\d,]+)\] \w+:i32\[[\d,]+\] \w+:i32\[[\d,]+\] = lu", program)
+        assert sizes == ["5,7"]
+        assert "scan" in program  # over the three
