@@ -7,7 +7,7 @@ import ast
 from pathlib import Path
 from typing import NamedTuple
 
-NUMBERS = Path(__file__).resolve().parents[2] / "snrmjax" / "model" / "beams.py"
+NUMBERS = Path(__file__).resolve().parents[2] / "snrmjax" / "model" / "builders" / "beams.py"
 
 
 class Beam(NamedTuple):
