@@ -8,7 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from snrmjax.model.effect_base import AbstractHysteresis, AbstractKinked
+from snrmjax.model.effect_base import (
+    AbstractForce,
+    AbstractHysteresis,
+    AbstractKinked,
+    AbstractMemoryless,
+)
+from snrmjax.model.effect_metadata import Argument
 from snrmjax.model.elements import Elements, elements_of
 from snrmjax.model.kinks import crossings
 from snrmjax.model.library.friction import AbstractSliders
@@ -47,15 +53,22 @@ def monodromy(
     Behind them stand the positions of sliders at other places than the first one's, where there
     are any. NaN where more steps would be needed than any sensible motion needs.
     """
-    if model.forces or model.modes.damping_coupling is not None:
+    if not all(map(_is_spring, model.forces)) or model.modes.damping_coupling is not None:
         return _by_magnus(model, coefficients, frequency, steps_per_cycle)
     return _by_kicks(model, coefficients, frequency, steps_per_cycle)
+
+
+def _is_spring(force: AbstractForce) -> bool:
+    """Whether a force is a smooth function of the displacement, as a potential's is."""
+    smooth = isinstance(force, AbstractMemoryless) and not isinstance(force, AbstractKinked)
+    shape = type(force).shape
+    return smooth and shape is not None and shape.argument is Argument.DISPLACEMENT
 
 
 def _by_kicks(
     model: Structure, coefficients: Array, frequency: Array, steps_per_cycle: Array
 ) -> Float[Array, "point state state"]:
-    """The map of a potential: oscillators that a varying stiffness kicks at equal intervals.
+    """The map of springs and potential: oscillators that a varying stiffness kicks equally often.
 
     Between kicks every mode moves by itself with its own damping and mean tangent stiffness,
     which is exact; the kicks hold what varies and what couples, K(t). With K − h²K²/12 in place of
@@ -71,13 +84,19 @@ def _by_kicks(
     orders = np.arange(1, (coefficients.shape[1] - 1) // 2 + 1)
     rows = jnp.moveaxis(coefficients, 0, 2).reshape(coefficients.shape[1], n * n_points)
     per_mass = (terms.mass[:, None] * frequency**2)[:, None, :]
+    springs = elements_of(model.forces, model.modes)
 
     def stiffness(tau: Array) -> Float[Array, "time mode mode point"]:
         """The nonlinear part of the tangent stiffness over mΩ²."""
         angle = tau[:, None] * orders
         waves = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=2).reshape(len(tau), -1)
         q = (rows[0] + waves @ rows[1:]).reshape(len(tau), n, n_points)
-        tangent = model.potential.stiffness_of_rows(jnp.moveaxis(q, 1, 0).reshape(n, -1))
+        columns = jnp.moveaxis(q, 1, 0).reshape(n, -1)
+        tangent = model.potential.stiffness_of_rows(columns)
+        if model.forces:
+            x = springs.displacement(columns.T)
+            of_springs = springs.matrix(springs.slopes(x, jnp.zeros_like(x)).stiffness)
+            tangent = tangent + jnp.moveaxis(of_springs, 0, 2)
         return jnp.moveaxis(tangent.reshape(n, n, len(tau), n_points), 2, 0) / per_mass
 
     varying = stiffness(2 * jnp.pi * jnp.arange(48) / 48)
