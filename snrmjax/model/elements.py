@@ -75,7 +75,7 @@ class Elements(NamedTuple):
                 values = of(force, x[:, places[0]], v[:, places[0]])[:, None]
             else:
                 values = jax.vmap(of, (0, 1, 1), 1)(force, x[:, index], v[:, index])
-            one_each = self.n_places == 1 or np.array_equal(index, np.arange(self.n_places))
+            one_each = np.array_equal(index, np.arange(self.n_places))
             total = total + (values if one_each else values @ np.eye(self.n_places)[index])
         return total
 

@@ -8,6 +8,7 @@ import pytest
 import snrmjax as sj
 from snrmjax.model.effects import ELEMENTS
 from snrmjax.model.places import between, row_over_points, row_text
+from snrmjax.model.structures import simulated_structure
 
 MASS, STIFFNESS = np.diag([1.0, 2.0]), np.array([[3.0, -1.0], [-1.0, 2.0]])
 DAMPING = np.array([[0.05, -0.03], [-0.03, 0.04]])
@@ -38,6 +39,39 @@ def test_forces_act_on_points_and_between_them():
     energy = 0.5 * a**4 + 1.25 * (b - a) ** 4
     linear = 0.5 * np.einsum("ti,ij,tj->t", np.stack([a, b], 1), STIFFNESS, np.stack([a, b], 1))
     np.testing.assert_allclose(model.potential_energy(q), energy + linear, rtol=1e-12)
+
+
+@pytest.mark.parametrize("at", [None, "a", between("a", "b")])
+def test_forces_of_one_kind_at_one_place_add_up(at):
+    one = two_masses(spring(5.0, at), spring(2.0, "b"))
+    two = two_masses(spring(2.0, at), spring(3.0, at), spring(2.0, "b"))
+    alone, twice = two_masses(spring(5.0, at)), two_masses(spring(2.0, at), spring(3.0, at))
+    q = jnp.array([[0.3, -0.8], [1.1, 0.7], [-0.4, 0.1]])
+    for first, second in ((one, two), (alone, twice)):
+        np.testing.assert_allclose(
+            first.nonlinear_force(q, q), second.nonlinear_force(q, q), rtol=1e-13
+        )
+        np.testing.assert_allclose(first.slopes(q, q)[0], second.slopes(q, q)[0], rtol=1e-13)
+
+
+def test_a_further_mode_moves_no_point():
+    """An internal resonance adds a mode that forces at points and coupled damping do not touch."""
+    resonance = sj.model.make_effect(
+        "internal_resonance_1_3", {"coefficient": 2.0, "frequency_hz": 1.0, "damping_ratio": 0.01}
+    )
+    model = two_masses(spring(2.0, "b"), resonance, sensors=["a"])
+    wide = simulated_structure(model)
+    assert wide.n_modes == 3
+    q = jnp.array([[0.3, -0.8, 0.0], [1.1, 0.7, 0.0]])
+    without = two_masses(spring(2.0, "b"))
+    added = np.asarray(wide.nonlinear_force(q, q) - wide.potential.force(q))
+    np.testing.assert_allclose(
+        added[:, :2], without.nonlinear_force(q[:, :2], q[:, :2]), rtol=1e-13
+    )
+    assert not np.any(added[:, 2])
+    matrix = np.asarray(wide.linear_terms().damping_matrix())
+    np.testing.assert_allclose(matrix[:2, :2], without.linear_terms().damping_matrix(), rtol=1e-13)
+    assert not np.any(matrix[2, :2])
 
 
 def test_slopes_are_those_of_the_force():

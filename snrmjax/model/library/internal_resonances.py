@@ -88,9 +88,10 @@ class AbstractInternalResonance(AbstractAddedMode):
             participation=jnp.append(modes.participation, 0.0),
             natural_frequency_std=jnp.append(modes.natural_frequency_std, 0.0),
             damping_ratio_std=jnp.append(modes.damping_ratio_std, 0.0),
-            modal_mass_std=None
-            if modes.modal_mass_std is None
-            else jnp.append(modes.modal_mass_std, 0.0),
+            modal_mass_std=_padded(modes.modal_mass_std),
+            point_shape=_padded(modes.point_shape),
+            damping_coupling=_padded(modes.damping_coupling, axes=2),
+            participation_lag=_padded(modes.participation_lag),
         )
         monomial = (*(modes.mode_of_interest,) * self.order, n_modes)
         return expanded_modes, _with_monomial(potential, monomial, self.coefficient, n_modes + 1)
@@ -120,6 +121,13 @@ class InternalResonanceOneToTwo(AbstractInternalResonance):
     shape: ClassVar[Shape] = Shape(Part.HARMONICS, Symmetry.EVEN, strength_order=2)
     coefficient: Scalar = parameter("1/(kg^1/2 m s²)", "coupling of the two modes")
     order: ClassVar[int] = 2
+
+
+def _padded(values: Array | None, axes: int = 1) -> Array | None:
+    """Numbers of modes with a zero for the further one, along the last axes."""
+    if values is None:
+        return None
+    return jnp.pad(values, [(0, 0)] * (values.ndim - axes) + [(0, 1)] * axes)
 
 
 def _with_monomial(
