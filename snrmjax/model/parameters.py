@@ -41,23 +41,25 @@ def parameter_names(model: Structure) -> tuple[str, ...]:
     return tuple(_places(model))
 
 
-def checked_names(model: Structure, names: Sequence[str]) -> tuple[str, ...]:
-    """The names as a tuple, checked.
+def checked_names(
+    model: Structure, names: Sequence[str], subject: str = "parameters"
+) -> tuple[str, ...]:
+    """The names as a tuple, checked; `subject` is the argument that has them.
 
     Raises `ValueError` for an unknown name, with similar ones, and for one that is given twice.
     """
     known = parameter_names(model)
     if isinstance(names, str) or not names:
-        raise ValueError(f"`parameters` must be a sequence of names, but is {names!r}.")
+        raise ValueError(f"`{subject}` must be a sequence of names, but is {names!r}.")
     for name in names:
         if name not in known:
             near = difflib.get_close_matches(name, known, n=5, cutoff=0.5) or known[:5]
             raise ValueError(
-                f"`parameters` names {name!r}, which the model does not have; similar ones are "
+                f"`{subject}` names {name!r}, which the model does not have; similar ones are "
                 f"{', '.join(near)}."
             )
         if list(names).count(name) > 1:
-            raise ValueError(f"`parameters` names {name!r} twice.")
+            raise ValueError(f"`{subject}` names {name!r} twice.")
     return tuple(names)
 
 

@@ -68,7 +68,7 @@ def simulate_responses(
     if not follow and (to is not None or parameter != FORCE):
         raise ValueError("`parameter` and `to` must be given with `follow`, the kinds of events.")
     if follow and parameter != FORCE:
-        checked_names(model, [parameter])
+        checked_names(model, [parameter], "parameter")
     ends, settings = (from_hz * HERTZ, to_hz * HERTZ), ResponseSettings(harmonic_order=harmonics)
     curves: list[ResponseCurve] = []
     notes = list(_notes_on_equilibria(model))

@@ -257,7 +257,7 @@ def _problem(
     lower, upper = (float(end) for end in to)
     begin = load
     if parameter != FORCE:
-        checked_names(model, [parameter])
+        checked_names(model, [parameter], "parameter")
         begin = float(parameter_value(model, parameter))
     if not (np.isfinite([lower, upper]).all() and lower < upper):
         raise ValueError(f"`to` must be two numbers that rise, but is {lower:g} to {upper:g}.")
