@@ -25,6 +25,8 @@ _MOST_SEGMENTS = 256
 _SEGMENT = 32  # steps whose propagators, or kicks, are computed side by side
 _KICKS = 3  # for every step of Magnus' method
 _LEAST_KICKS = 240
+_FEW_SLIDERS = 16  # whose slip begins and ends with a step
+_MOST_SLIPS = 8  # of one slider in a period
 _CONTACT_SAMPLES = 512  # over a period, among which contacts are looked for
 _GAUSS = np.array([0.5 - np.sqrt(0.15), 0.5, 0.5 + np.sqrt(0.15)])
 
@@ -38,7 +40,30 @@ class _Friction(NamedTuple):
     places: Elements  # of the sliders, one force each
     owner: np.ndarray  # (slider,) the place of each
     stiffness: Float[Array, "point slider"]  # 1/s²
-    dragged: Bool[Array, "step point slider"]
+    slip: "_Slip"  # of the sliders
+
+
+class _Slip(NamedTuple):
+    """When sliders are dragged, by phases behind the beginning of the period."""
+
+    at_first: Bool[Array, "point slider"]  # dragged before phase zero
+    onsets: Float[Array, "event point slider"]  # infinite where there are fewer
+    ends: Float[Array, "event point slider"]
+
+    def dragged(self, phase: Float[Array, "step point"]) -> Bool[Array, "step point slider"]:
+        """Whether sliders are dragged at phases."""
+
+        def passed(events: Array) -> Array:
+            # An end may lie a little before phase zero, and so before the end of the period.
+            images = jnp.concatenate([events, events + 2 * jnp.pi])
+            return jnp.sum(images[:, None] <= phase[None, :, :, None], axis=0)
+
+        return self.at_first + passed(self.onsets) - passed(self.ends) > 0
+
+    @property
+    def slips(self) -> Bool[Array, "point slider"]:
+        """The sliders that are dragged at all."""
+        return self.at_first | jnp.isfinite(self.onsets[0])
 
 
 @partial(compiled, long_loops=True)
@@ -166,9 +191,12 @@ def _by_magnus(
     cycles = jnp.nan_to_num(jnp.maximum(rate, 0.5 * jnp.max(jnp.sum(jnp.abs(c), axis=-1))))
     n_segments, step = _segments(jnp.maximum(steps_per_cycle * cycles, 512), _MOST_SEGMENTS)
     contacts = _contacts(model, coefficients, frequency, friction.begin)
+    if 0 < friction.owner.size <= _FEW_SLIDERS:
+        few = [jnp.moveaxis(part, 2, 1) for part in (friction.slip.onsets, friction.slip.ends)]
+        contacts = jnp.concatenate([contacts, *(part.reshape(-1, n_points) for part in few)])
     unit = jnp.sqrt(jnp.max(terms.stiffness / terms.mass)) / frequency  # of δq̇, over Ω
     places, owner, n_places = friction.places, friction.owner, friction.places.n_places
-    size, n_dragged = 2 * n + n_places, len(friction.dragged)
+    size = 2 * n + n_places
     of_place = np.eye(n_places)[owner]  # (slider, place)
 
     def generators(start: Array, length: Array, held: Array) -> Array:
@@ -190,9 +218,8 @@ def _by_magnus(
         return a.reshape(_SEGMENT, 3, n_points, size, size)
 
     def segment(number: Array, state: tuple) -> tuple:
-        index = (number * _SEGMENT + jnp.arange(_SEGMENT)) * n_dragged
-        held = ~friction.dragged[index // (n_segments * _SEGMENT)]
         ends = _step_ends(number * _SEGMENT + jnp.arange(_SEGMENT + 1), step, contacts)
+        held = ~friction.slip.dragged(0.5 * (ends[1:] + ends[:-1]))
         length = ends[1:] - ends[:-1]
         per_step = generators(ends[:-1], length, held)
         propagators = _magnus(per_step, length[..., None, None])
@@ -218,7 +245,7 @@ def _by_magnus(
     free = np.flatnonzero(owner > 0)
     y = jnp.broadcast_to(jnp.eye(2 * n, 2 * n + free.size), (n_points, 2 * n, 2 * n + free.size))
     z = jnp.zeros((n_points, owner.size, 2 * n + free.size))
-    slips = jnp.any(friction.dragged, axis=0)[:, :, None]
+    slips = friction.slip.slips[:, :, None]
     if n_places:
         start = sliding(y).at[:, free].set(np.eye(2 * n + free.size)[2 * n :])
         z = jnp.where(slips, start, 0.0)
@@ -304,7 +331,8 @@ def _friction(model: Structure, coefficients: Array, frequency: Array) -> _Frict
     places = elements_of(distinct, model.modes)
     nothing = jnp.zeros((n_points, n, n))
     begin = jnp.zeros_like(frequency)
-    no_sliders = jnp.zeros((n_points, 0)), jnp.zeros((1, n_points, 0), bool)
+    none = jnp.zeros((1, n_points, 0))
+    no_sliders = none[0], _Slip(none[0] > 0, none, none)
     if not model.hysteretic:
         return _Friction(begin, nothing, (), places, np.zeros(0, int), *no_sliders)
     n_samples = 512
@@ -324,19 +352,48 @@ def _friction(model: Structure, coefficients: Array, frequency: Array) -> _Frict
     if not sliders:
         return _Friction(begin, nothing, viscous, places, np.zeros(0, int), *no_sliders)
     largest = jnp.argmax(scaled(sliders[0])[2], axis=0)
-    stiffness, dragged, owner, stuck = [], [], [], nothing
+    stiffness, slip, owner, stuck = [], [], [], nothing
     for effect in sliders:
         each, there, x = scaled(effect)
         turned = jax.vmap(lambda row, k: jnp.roll(row, -k), in_axes=(1, 0))(x, largest)
         position = jax.vmap(lambda e, x: e.settled_states(x, x))(each, turned)
-        dragged.append(jnp.moveaxis(position != jnp.roll(position, -1, axis=1), 1, 0))
+        sizes = jax.vmap(lambda e: e.sliders().slip_displacement)(each)
+        slip.append(jax.vmap(jax.vmap(_slip_of, (None, 1, 0)))(turned, position, sizes))
         stiffness.append(jax.vmap(lambda e: e.sliders().stiffness)(each))
         owner += [[e.at for e in distinct].index(effect.at)] * stiffness[-1].shape[1]
         stuck = stuck + there.matrix(jax.vmap(lambda e: e.added_stiffness())(each)[:, None])
+    at_first, onsets, ends = (jnp.concatenate(part, axis=1) for part in zip(*slip, strict=True))
     return _Friction(
         *(tau[largest], stuck, viscous, places, np.array(owner)),
-        *(jnp.concatenate(stiffness, axis=1), jnp.concatenate(dragged, axis=2)),
+        jnp.concatenate(stiffness, axis=1),
+        _Slip(at_first, jnp.moveaxis(onsets, 2, 0), jnp.moveaxis(ends, 2, 0)),
     )
+
+
+def _slip_of(x: Array, position: Array, size: Array) -> tuple[Array, Array, Array]:
+    """Of one slider over a period: dragged at first, phases of onsets and of ends.
+
+    It starts where its stretch reaches the slip displacement, and stops where x turns, which a
+    parabola through three samples says.
+    """
+    n = x.shape[0]
+    width = 2 * jnp.pi / n
+    ahead, behind = jnp.roll(x, -1), jnp.roll(x, 1)
+    moves = position != jnp.roll(position, -1)
+
+    def phases(starts: Array, share: Array) -> Array:
+        (index,) = jnp.nonzero(starts, size=_MOST_SLIPS, fill_value=n)
+        known = index < n
+        there = (index + share[jnp.minimum(index, n - 1)]) * width
+        return jnp.where(known, there, jnp.inf)
+
+    rise = ahead - x
+    reach = position + jnp.sign(rise) * size
+    onset = jnp.clip((reach - x) / jnp.where(rise != 0, rise, 1.0), 0.0, 1.0)
+    bend = 2 * x - ahead - behind
+    turn = jnp.clip(0.5 * (ahead - behind) / jnp.where(bend != 0, bend, 1.0), -0.5, 0.5)
+    before = jnp.roll(moves, 1)
+    return before[0], phases(moves & ~before, onset), phases(before & ~moves, turn)
 
 
 def _tangents(

@@ -87,5 +87,5 @@ def test_multipliers_with_friction_and_a_stop_at_several_points(motion):
     values = values[np.argsort(-np.abs(values))]
     assert np.all(np.abs(values[6:]) < 1e-9)  # sliders are set anew in every period
     wanted, ours = (np.sort(np.abs(row)) for row in (values[:6], found))
-    # Sliders start and stop at the nearest of 512 phases.
-    np.testing.assert_allclose(ours, wanted, rtol=0, atol=5e-3)
+    # Times of slip, from 512 samples, are late by up to 1e-4 of a period; ours of 4 000 steps too.
+    np.testing.assert_allclose(ours, wanted, rtol=0, atol=5e-4)
