@@ -1,7 +1,7 @@
 """A structure: linear modes, a polynomial potential and further effects."""
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -16,13 +16,12 @@ from snrmjax.model.effect_base import (
     AbstractForce,
     AbstractForceSpectrum,
     AbstractHysteresis,
-    AbstractKinked,
     AbstractLinearChange,
     AbstractMeasurementEffect,
     AbstractMemoryless,
     checked_effects,
 )
-from snrmjax.model.elements import elements_of
+from snrmjax.model.elements import Elements, elements_of
 from snrmjax.model.modes import LinearModes, have_values
 from snrmjax.model.places import row_text, unit_at
 from snrmjax.model.potential import PolynomialPotential, polynomial_potential
@@ -132,12 +131,6 @@ class Structure(eqx.Module):
         return tuple(e for e in self.effects if isinstance(e, AbstractHysteresis))
 
     @property
-    def by_cycle(self) -> tuple[AbstractForce, ...]:
-        """The effects whose force over a cycle needs the whole cycle: friction and kinks."""
-        kinds = (AbstractHysteresis, AbstractKinked)
-        return tuple(e for e in self.effects if isinstance(e, kinds))
-
-    @property
     def measurement_effects(self) -> tuple[AbstractMeasurementEffect, ...]:
         """The effects that change what is recorded, in the order in which they act."""
         effects = [e for e in self.effects if isinstance(e, AbstractMeasurementEffect)]
@@ -177,9 +170,8 @@ class Structure(eqx.Module):
         force = self.potential.force(displacement)
         if not self.forces:
             return force
-        elements = elements_of(self.forces, self.modes)
-        x, v = elements.displacement(displacement), elements.displacement(velocity)
-        return force + elements.on_modes(elements.cycle_force(x, v))
+        elements, *motion = self._at_places(self.forces, displacement, velocity)
+        return force + elements.on_modes(elements.cycle_force(*motion))
 
     def memoryless_force(
         self, displacement: Float[Array, "time mode"], velocity: Float[Array, "time mode"]
@@ -188,9 +180,15 @@ class Structure(eqx.Module):
         force = self.potential.force(displacement)
         if not self.memoryless:
             return force
-        elements = elements_of(self.memoryless, self.modes)
-        x, v = elements.displacement(displacement), elements.displacement(velocity)
-        return force + elements.on_modes(elements.force(x, v))
+        elements, *motion = self._at_places(self.memoryless, displacement, velocity)
+        return force + elements.on_modes(elements.force(*motion))
+
+    def _at_places(
+        self, forces: Sequence[AbstractForce], displacement: Array, velocity: Array
+    ) -> tuple[Elements, Array, Array]:
+        """Forces where they act, and the displacements and velocities there."""
+        elements = elements_of(forces, self.modes)
+        return elements, elements.displacement(displacement), elements.displacement(velocity)
 
     def potential_energy(self, displacement: Float[Array, "*batch mode"]) -> Float[Array, "*batch"]:
         """Energy in J of a structure held at rest: linear, polynomial and of memoryless effects.
@@ -218,8 +216,8 @@ class Structure(eqx.Module):
         stiffness = self.potential.stiffness(displacement)
         if not self.memoryless:
             return stiffness, jnp.zeros_like(stiffness)
-        elements = elements_of(self.memoryless, self.modes)
-        by = elements.slopes(elements.displacement(displacement), elements.displacement(velocity))
+        elements, *motion = self._at_places(self.memoryless, displacement, velocity)
+        by = elements.slopes(*motion)
         return stiffness + elements.matrix(by.stiffness), elements.matrix(by.damping)
 
 

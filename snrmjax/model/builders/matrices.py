@@ -1,6 +1,5 @@
 """Structures from their mass, damping and stiffness matrices."""
 
-import functools
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -204,13 +203,10 @@ def _with_residuals(
     kept = np.concatenate([rigid, shapes], axis=1)
     columns = np.stack(loads, axis=1)
     columns = columns - m @ (kept @ (kept.T @ columns))  # nothing that the kept modes carry
-    solve = (
-        scipy.sparse.linalg.splu(k.tocsc()).solve
-        if scipy.sparse.issparse(k)
-        else functools.partial(scipy.linalg.lstsq, k)
-    )
-    answer: Any = solve(columns)
-    ways = answer[0] if isinstance(answer, tuple) else answer
+    if scipy.sparse.issparse(k):
+        ways = scipy.sparse.linalg.splu(k).solve(columns)
+    else:
+        ways = scipy.linalg.lstsq(k, columns)[0]  # singular where rigid-body modes exist
     vectors = np.zeros((len(shapes), 0))
     for way in ways.T:
         left = way

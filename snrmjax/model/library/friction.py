@@ -45,8 +45,8 @@ from snrmjax.numerics.rules import BETWEEN_ONE_AND_THREE, NOT_NEGATIVE, POSITIVE
 _SLIP = Shape(Part.STIFFNESS_AND_DAMPING, Symmetry.ODD, Argument.HISTORY)
 SMOOTHING = 0.05  # width of the smoothed jump of Coulomb's force over the rms velocity
 # In w = u^(p−1) on (0, 1), where the thresholds of an Iwan element are evenly dense.
-_NODE, _WEIGHT = (0.5 * part for part in np.polynomial.legendre.leggauss(48))
-_NODE = _NODE + 0.5
+NODE, WEIGHT = (0.5 * part for part in np.polynomial.legendre.leggauss(48))
+NODE = NODE + 0.5
 
 
 class Sliders(NamedTuple):
@@ -261,8 +261,8 @@ class IwanMicroslip(AbstractSliders):
         # At rest the derivative of largest^(p−1) is infinite, but nothing slips.
         at_rest = largest <= 0
         total = self.coefficient * p * jnp.where(at_rest, 1.0, largest) ** (p - 1)
-        stiffness = jnp.where(at_rest, 0.0, total) * _WEIGHT
-        return Sliders(stiffness, largest * jnp.asarray(_NODE) ** (1 / (p - 1)))
+        stiffness = jnp.where(at_rest, 0.0, total) * WEIGHT
+        return Sliders(stiffness, largest * jnp.asarray(NODE) ** (1 / (p - 1)))
 
     def cycle_force(self, displacement: Samples, velocity: Samples) -> Samples:
         half_range = 0.5 * (jnp.max(displacement) - jnp.min(displacement))

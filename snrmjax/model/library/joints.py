@@ -4,15 +4,11 @@ import dataclasses
 from typing import ClassVar, Self
 
 import jax.numpy as jnp
-import numpy as np
 
 from snrmjax.model.effect_base import AbstractMemoryless, Samples, Scalar
 from snrmjax.model.effect_metadata import Argument, Part, Shape, Symmetry, parameter
-from snrmjax.model.library.friction import AbstractSliders, Sliders
+from snrmjax.model.library.friction import NODE, WEIGHT, AbstractSliders, Sliders
 from snrmjax.numerics.rules import ABOVE_MINUS_ONE, NOT_NEGATIVE, POSITIVE
-
-_NODE, _WEIGHT = (0.5 * part for part in np.polynomial.legendre.leggauss(48))
-_NODE = _NODE + 0.5  # on (0, 1)
 
 
 class RegularisedFriction(AbstractMemoryless):
@@ -89,10 +85,10 @@ class FourParameterIwan(AbstractSliders):
         spread = self.stiffness / (1 + self.ratio)  # of all below φ_max
         share = jnp.where(largest > 0, largest, 0.0) / end
         some = jnp.where(share > 0, share, 1.0) ** power * jnp.where(share > 0, spread, 0.0)
-        slip = largest * jnp.asarray(_NODE) ** (1 / power)
+        slip = largest * jnp.asarray(NODE) ** (1 / power)
         rest = jnp.stack([self.stiffness - spread, spread - some])
         return Sliders(
-            jnp.concatenate([some * _WEIGHT, rest]), jnp.concatenate([slip, jnp.stack([end, end])])
+            jnp.concatenate([some * WEIGHT, rest]), jnp.concatenate([slip, jnp.stack([end, end])])
         )
 
     def for_cycle(self, displacement: Samples) -> Self:

@@ -215,7 +215,7 @@ def samples_for(model: Structure, harmonic_order: int, n_samples: int | None) ->
         n_samples = alias_free_samples(harmonic_order, max(model.potential.degree - 1, 1))
         if model.forces:
             n_samples = max(n_samples, 128, 16 * harmonic_order)
-        if model.by_cycle:
+        if any(isinstance(force, _BY_CYCLE) for force in model.forces):
             n_samples = max(n_samples, 256)
     return n_samples
 

@@ -27,7 +27,7 @@ _KICKS = 3  # for every step of Magnus' method
 _LEAST_KICKS = 240
 _FEW_SLIDERS = 16  # whose slip begins and ends with a step
 _MOST_SLIPS = 8  # of one slider in a period
-_CONTACT_SAMPLES = 512  # over a period, among which contacts are looked for
+_SAMPLES = 512  # over a period, among which contacts and slip are looked for
 _GAUSS = np.array([0.5 - np.sqrt(0.15), 0.5, 0.5 + np.sqrt(0.15)])
 
 
@@ -258,7 +258,7 @@ def _contacts(
     model: Structure, coefficients: Array, frequency: Array, begin: Array
 ) -> Float[Array, "contact point"]:
     """Phases behind `begin` at which contacts open and close; infinite where there are fewer."""
-    tau = 2 * jnp.pi * jnp.arange(_CONTACT_SAMPLES) / _CONTACT_SAMPLES
+    tau = 2 * jnp.pi * jnp.arange(_SAMPLES) / _SAMPLES
     phases = begin + tau[:, None]
     q, _ = _states_at(coefficients, frequency, phases)
     found = [jnp.zeros((0, len(frequency)))]
@@ -335,9 +335,8 @@ def _friction(model: Structure, coefficients: Array, frequency: Array) -> _Frict
     no_sliders = none[0], _Slip(none[0] > 0, none, none)
     if not model.hysteretic:
         return _Friction(begin, nothing, (), places, np.zeros(0, int), *no_sliders)
-    n_samples = 512
-    tau = 2 * jnp.pi * jnp.arange(n_samples) / n_samples
-    phases = jnp.broadcast_to(tau[:, None], (n_samples, n_points))
+    tau = 2 * jnp.pi * jnp.arange(_SAMPLES) / _SAMPLES
+    phases = jnp.broadcast_to(tau[:, None], (_SAMPLES, n_points))
     motions = _states_at(coefficients, frequency, phases)
 
     def scaled(effect: AbstractHysteresis) -> tuple[AbstractHysteresis, Elements, Array]:

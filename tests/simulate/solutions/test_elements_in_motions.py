@@ -49,7 +49,6 @@ def test_a_stop_grazes_where_the_linear_amplitude_is_the_gap():
 
 
 def test_friction_and_springs_between_points_move_as_integrated_in_time():
-    pytest.importorskip("diffrax")
     effects = (
         element("cubic_stiffness", "x1", coefficient=1e9),
         element(
