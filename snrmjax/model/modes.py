@@ -1,5 +1,6 @@
 """Linear modes of a structure and their response to a harmonic force."""
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -14,6 +15,7 @@ from snrmjax.numerics.rules import BELOW_ONE, POSITIVE, require
 from snrmjax.numerics.units import HERTZ
 
 _SHOWN = 12  # modes, in a text
+_STILL = 1e-9  # of the largest shape at a point, below which a mode has a node there
 
 UNSTATED_MODAL_MASS_STD = 0.05
 """1σ, relative, of a modal mass of which nobody stated one.
@@ -81,6 +83,31 @@ class LinearModes(eqx.Module):
         known = (*self.sensors, *self.points)
         near = suggestion(point, known) or f"; known are {', '.join(known[:_SHOWN])}"
         raise ValueError(f"a force acts at {point!r}, where the modes have no shape{near}.")
+
+    def forced_at(self, point: str) -> "LinearModes":
+        """The same modes moved by a force of one newton at a point instead.
+
+        Raises `ValueError` for a point without a shape, for one that a rigid-body mode moves but
+        no sensor watches, and for one where the mode of interest stands still.
+        """
+        participation = self.shape_at(point)
+        if not np.abs(participation[self.mode_of_interest]) > _STILL * np.max(
+            np.abs(participation)
+        ):
+            raise ValueError(f"a force at {point!r} does not move the mode of interest.")
+        rigid = self.rigid_body_participation
+        if rigid.size and point not in self.sensors:
+            raise ValueError(
+                f"a force at {point!r} moves rigid-body modes, which no sensor there sees."
+            )
+        if rigid.size:
+            rigid = self.rigid_body_shape[self.sensors.index(point)]
+        return dataclasses.replace(
+            self,
+            participation=participation,
+            rigid_body_participation=rigid,
+            participation_lag=None,
+        )
 
     @property
     def own_modal_mass_std(self) -> Float[Array, ""] | None:

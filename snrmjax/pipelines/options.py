@@ -100,6 +100,16 @@ class IdentifyOptions:
         positive="V",
         panel=_PREDICTED,
     )
+    predict_at: str | None = option(
+        None,
+        "Sensor or point at which the forces of the predictions act. Default: as in the test.",
+        "POINT",
+        panel=_PREDICTED,
+        needs=("predict_force",),
+        why_needed="belongs to predictions under a force: add `--predict-force` (N)",
+        alone=("predict_drive",),
+        why_alone="a drive voltage is that of the test's shaker, where it was",
+    )
     extrapolate: float | None = option(
         None,
         "Predict up to this multiple of the largest measured amplitude; 1 ends where the data end. "

@@ -40,6 +40,7 @@ class Prediction(NamedTuple):
     responses: Sequence[PredictedResponse]  # the main curve first; those of a joint fit with 1σ
     further: ResonanceDistribution  # of the resonance of a level that was not measured
     drive: float | None = None  # V, where the force is known as a drive voltage
+    at: str | None = None  # where the force acts, if not where it did in the test
 
     @property
     def banded(self) -> list[FittedResponse]:
@@ -49,7 +50,7 @@ class Prediction(NamedTuple):
     @property
     def load(self) -> Fact:
         """The force, and its drive voltage where the force is known as one."""
-        return Fact("load", force=self.force, drive=self.drive)
+        return Fact("load", force=self.force, drive=self.drive, at=self.at)
 
 
 def reach_of(options: IdentifyOptions) -> float:
@@ -61,22 +62,25 @@ def predictions_of_points(
     identification: Identification, model: Structure, options: IdentifyOptions
 ) -> tuple[Prediction, ...]:
     """What curves through points predict."""
-    backbone, ratio = identification.backbone, reach_of(options)
-    return tuple(
-        Prediction(
-            force,
-            resonances(backbone, model.modes, force, largest_amplitude_ratio=ratio),
-            predict_response(backbone, model.modes, force, largest_amplitude_ratio=ratio),
-            predicted_resonance(
-                identification.fit,
+    fit = identification.fit
+    ratio: dict[str, Any] = {"largest_amplitude_ratio": reach_of(options)}
+    predictions = []
+    for force in dict.fromkeys(options.predict_force):
+        level = new_level(fit, force, day=_day_of(options), at=options.predict_at)
+        backbone = identification.backbone.moved_by(level.over_test(fit))
+        modes = model.modes if level.forced is None else level.forced
+        predictions.append(
+            Prediction(
                 force,
-                largest_amplitude_ratio=ratio,
-                of=new_level(identification.fit, force, day=_day_of(options)),
-                self_excited=options.self_excited,
-            ),
+                resonances(backbone, modes, force, **ratio),
+                predict_response(backbone, modes, force, **ratio),
+                predicted_resonance(
+                    fit, force, of=level, self_excited=options.self_excited, **ratio
+                ),
+                at=options.predict_at,
+            )
         )
-        for force in dict.fromkeys(options.predict_force)
-    )
+    return tuple(predictions)
 
 
 def predictions_of_fit(
@@ -85,7 +89,8 @@ def predictions_of_fit(
     """What a joint fit predicts, and notes on trends of its levels, by which bands are wider."""
     loads: list[tuple[float, float | None, bool]] = []
     for force in dict.fromkeys(options.predict_force):
-        record = float(fit.recorded_force(np.array(force))) if fit.drive_known_only else None
+        by_drive = fit.drive_known_only and options.predict_at is None
+        record = float(fit.recorded_force(np.array(force))) if by_drive else None
         loads.append((force, record, False))
     for drive in dict.fromkeys(options.predict_drive):
         loads.append((float(fit.force_of_drive(np.array(drive))), drive, True))
@@ -94,12 +99,17 @@ def predictions_of_fit(
     for force, record, as_recorded in loads:
         settings: dict[str, Any] = {
             "largest_amplitude_ratio": reach_of(options),
-            "of": new_level(fit, force, as_recorded=as_recorded, day=_day_of(options)),
+            "of": new_level(
+                *(fit, force),
+                as_recorded=as_recorded,
+                day=_day_of(options),
+                at=options.predict_at,
+            ),
         }
         banded = fitted_response(fit, force, **settings)
         further = predicted_resonance(fit, force, self_excited=options.self_excited, **settings)
         tips = sorted((tip for one in banded for tip in one.resonances), key=lambda t: t.amplitude)
-        predictions.append(Prediction(force, tips, banded, further, record))
+        predictions.append(Prediction(force, tips, banded, further, record, options.predict_at))
         notes += notes_on_trends(settings["of"].trends, predictions[-1].load)
     return tuple(predictions), tuple(notes)
 
@@ -124,7 +134,8 @@ def notes_on_predictions(
     notes: list[Note] = []
     for each in predictions:
         notes += notes_on_resonance(each.further, each.load)
-        near = None if each.resonances else level_in_resonance(data, backbone, each.force)
+        as_in_test = each.at is None and not each.resonances
+        near = level_in_resonance(data, backbone, each.force) if as_in_test else None
         if near is not None:
             notes.append(
                 Fact(

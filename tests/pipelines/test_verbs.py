@@ -34,6 +34,7 @@ def test_identification_obeys_or_refuses_every_option(files, tmp_path):
         ({"knots": 4, "fit": "auto"}, "`--knots` has no effect beside `--fit`"),
         ({"extrapolate": 2.0}, "`--extrapolate` belongs to predictions"),
         ({"predict_force": (-1.0,)}, "`--predict-force` must be above zero, but is -1 N"),
+        ({"predict_at": "tip"}, "`--predict-at` belongs to predictions under a force"),
         ({"predict_drive": (1.0,)}, "is for data with a drive voltage"),
     ):
         with pytest.raises(ValueError, match=said):

@@ -98,17 +98,18 @@ def fitted_response(
     Raises `ValueError` for a force or a ratio that is not positive.
     """
     ratio = {"largest_amplitude_ratio": largest_amplitude_ratio}
-    rough = as_backbone(fit, reach=largest_amplitude_ratio)
     level = new_level(fit, force) if of is None else of
+    modes = level.modes(fit)
+    rough = as_backbone(fit, reach=largest_amplitude_ratio).moved_by(level.over_test(fit))
     curves = predict_response(
-        *(rough, fit.modes, force),
+        *(rough, modes, force),
         from_frequency=from_frequency,
         to_frequency=to_frequency,
         largest_amplitude_ratio=largest_amplitude_ratio,
     )
     tips = [
         Place("resonance", r.amplitude, r.frequency)
-        for r in resonances(rough, fit.modes, force, **ratio)
+        for r in resonances(rough, modes, force, **ratio)
         if from_frequency <= r.frequency <= to_frequency
     ]
     answer = []
@@ -175,8 +176,8 @@ def predicted_resonance(
         by = {"force_gain": 1 - float(fit.unknowns.force_offset) * smallest / load}
         by["force_offset"] = smallest / load
         by_load = by_load + sum(by[n] * root[names.index(n)] for n in by if n in names)
-    constant = abs(float(fit.problem.constant_of(fit.unknowns)))
-    modes = with_deviations(fit.modes, fit.unknowns.linear, fit.prior.linear)
+    constant = abs(float(fit.problem.constant_of(fit.unknowns)) * new.over_test(fit))
+    modes = with_deviations(new.modes(fit), fit.unknowns.linear, fit.prior.linear)
     return resonance_distribution(
         *(force, amplitude),
         KnownCurves(values, slopes @ root, constant * load, by_load),

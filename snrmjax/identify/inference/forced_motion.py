@@ -47,9 +47,9 @@ class ForcedMotion(eqx.Module):
         """A fit under a force in N, or under the record that `new` gives."""
         return cls(
             unravel=fit.packed().unravel,
-            modes=fit.modes,
+            modes=new.modes(fit),
             linear_std=fit.prior.linear,
-            constant=fit.problem.modal_constant,
+            constant=fit.problem.modal_constant * new.over_test(fit),
             force=jnp.asarray(float(force) if new.drive is None else new.drive),
             recorded=jnp.asarray(float(new.drive is not None)),
             smallest=jnp.min(fit.data.force),

@@ -72,7 +72,8 @@ def located(
         std = np.sqrt(solved.variance(fit) + solved.by_level**2 @ new.std**2)
     omega, speed, x = map(float, values)
     if solved is not None and place.kind == "resonance":
-        load = abs(float(fit.problem.constant_of(fit.unknowns))) * force
+        constant = float(fit.problem.constant_of(fit.unknowns)) * new.over_test(fit)
+        load = abs(constant) * force
         ratio = load / (2 * omega**2 * x)
     return FittedPoint(
         force=force,

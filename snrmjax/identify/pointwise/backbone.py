@@ -1,5 +1,6 @@
 """A mode's natural frequency and damping as curves of its amplitude, with one band."""
 
+import dataclasses
 from typing import ClassVar
 
 import equinox as eqx
@@ -59,6 +60,10 @@ class Backbone(AbstractResult):
     def attributes(self) -> dict[str, str | float | int]:
         """The sensor, and the amplitude that the curves are functions of."""
         return {"sensor": self.sensor, "amplitude": self.argument}
+
+    def moved_by(self, ratio: float) -> "Backbone":
+        """The same mode where a newton moves it so many times as much: the force acts elsewhere."""
+        return dataclasses.replace(self, modal_constant=self.modal_constant * ratio)
 
     def sampled(self, n_points: int = _SAMPLES, *, reach: float = 1.0) -> BackboneValues:
         """Values from the smallest to `reach` times the largest measured amplitude."""

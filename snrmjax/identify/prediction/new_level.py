@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.test_model.states import LEVEL_ERRORS
+from snrmjax.model.modes import LinearModes
 
 _FEWEST = 3  # levels, of which a straight line leaves something
 _CHANCE = 0.05  # of a trend where levels differ at random
@@ -38,6 +39,21 @@ class NewLevel(NamedTuple):
     drive: float | None = None  # the record (N or V) of the force; None: the force itself is given
     trends: tuple[LevelTrend, ...] = ()
     another_day: bool = False  # whether `std` holds another day's errors too
+    forced: LinearModes | None = None  # the modes as the force moves them; None: as in the test
+
+    def modes(self, fit: JointFit) -> LinearModes:
+        """The linear modes, moved as the predicted force does."""
+        return fit.modes if self.forced is None else self.forced
+
+    def over_test(self, fit: JointFit) -> float:
+        """How many times as much a newton moves the mode of interest as it did in the test."""
+        return (
+            1.0 if self.forced is None else _participation(self.forced) / _participation(fit.modes)
+        )
+
+
+def _participation(modes: LinearModes) -> float:
+    return modes.participation.item(modes.mode_of_interest)
 
 
 ON_THE_CURVES = NewLevel(np.zeros(len(LEVEL_ERRORS)))
@@ -45,7 +61,12 @@ ON_THE_CURVES = NewLevel(np.zeros(len(LEVEL_ERRORS)))
 
 
 def new_level(
-    fit: JointFit, force: float, *, as_recorded: bool = False, day: DayToDay | None = None
+    fit: JointFit,
+    force: float,
+    *,
+    as_recorded: bool = False,
+    day: DayToDay | None = None,
+    at: str | None = None,
 ) -> NewLevel:
     """The errors of one further level under a force, as large as the fit's levels have them.
 
@@ -53,15 +74,20 @@ def new_level(
     it there.
 
     Arguments: `force` in N; `as_recorded` where not the force is given but what the test records of
-    it, whose gain then errs too; `day` what another day's test differs by.
+    it, whose gain then errs too; `day` what another day's test differs by; `at` the sensor or point
+    where the force acts, if not where it did in the test.
+    Raises what `LinearModes.forced_at` raises.
     """
     std = np.array(fit.prior.level, dtype=float)
-    trends = _trends(fit, force) if fit.data.n_levels >= _FEWEST else ()
+    forced = None if at is None else fit.modes.forced_at(at)
+    new = NewLevel(std, another_day=day is not None, forced=forced)
+    as_in_test = force * abs(new.over_test(fit))
+    trends = _trends(fit, as_in_test) if fit.data.n_levels >= _FEWEST else ()
     for trend in trends:
         place = LEVEL_ERRORS.index(trend.kind)
         std[place] = np.hypot(std[place], trend.there)
     record = float(fit.recorded_force(np.array(force))) if as_recorded else None
-    return NewLevel(further_std(std, day), record, trends, day is not None)
+    return new._replace(std=further_std(std, day), drive=record, trends=trends)
 
 
 def further_std(

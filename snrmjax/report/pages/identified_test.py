@@ -13,6 +13,7 @@ from snrmjax.io.files import write_summary
 from snrmjax.io.units import HERTZ
 from snrmjax.model.structures import Structure
 from snrmjax.pipelines.identify import FitDetails, IdentifiedTest
+from snrmjax.pipelines.predictions import Prediction
 from snrmjax.report.figures import identification as plot
 from snrmjax.report.figures.simulation import normal_mode_figure
 from snrmjax.report.html import Report, ReportFigure, Section, write_report
@@ -87,7 +88,7 @@ def identification_figures(
             found.responses,
             found.resonances,
             simulated=found.simulated,
-            measured=found.data,
+            measured=None if found.options.predict_at else found.data,
         )
     if found.joint is not None:
         figures |= joint_figures(found.joint, points, shown)
@@ -199,14 +200,12 @@ def write(
         summary["joint_fit"] = joint_results.summarise_fit(details.fit, banded, details.shares)
     summary |= results.summarise(found.identification, found.values)
     summary["resonances"] = [
-        results.summarise_resonance(each)
-        | ({} if prediction.drive is None else {"drive_v": prediction.drive})
+        results.summarise_resonance(each) | _further_load(prediction)
         for prediction in found.predictions
         for each in prediction.resonances
     ]
     summary["resonance_distributions"] = [
-        results.summarise_distribution(prediction.further)
-        | ({} if prediction.drive is None else {"drive_v": prediction.drive})
+        results.summarise_distribution(prediction.further) | _further_load(prediction)
         for prediction in found.predictions
     ]
     summary["notes"] = [str(note) for note in found.notes]
@@ -217,6 +216,12 @@ def write(
     report = findings_report(found, title, done, figures)
     write_report(folder / "report.html", report)
     return report
+
+
+def _further_load(prediction: Prediction) -> dict[str, float | str]:
+    """What a summary says of a predicted force beside its newtons."""
+    given = {"drive_v": prediction.drive, "force_at": prediction.at}
+    return {name: value for name, value in given.items() if value is not None}
 
 
 def _write_fit(folder: Path, details: FitDetails, added: tuple[str, int]) -> None:

@@ -7,11 +7,22 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from truths import joint_fits
-from truths.exact_states import CONSTANT, GAIN, TRUE, damping, driven, modes, squared
+from truths.exact_states import (
+    CONSTANT,
+    GAIN,
+    TRUE,
+    damping,
+    driven,
+    exact,
+    modes,
+    squared,
+    stated,
+)
 from truths.levels_with_errors import drawn_levels, measured
 
 import snrmjax as sj
 from snrmjax.identify.prediction.new_level import DayToDay, NewLevel, new_level
+from snrmjax.model.modes import Beside
 
 FORCE = 1.5  # N, below the folds
 
@@ -150,3 +161,39 @@ def test_left_out_levels_lie_inside_their_bands():
     share = np.mean(inside, axis=0)
     # Binomial: 2 % of 100. Student's factor for five levels widens beyond 95 %.
     assert np.all((share >= 0.90) & (share <= 0.99))
+
+
+def test_a_force_at_another_point_moves_the_same_mode_otherwise():
+    # A second linear mode at 900 rad/s; the test's force acts at `a`, where the modes' shapes are
+    # those of the sensor, the predicted one at `b`.
+    shape = {"a": [2.0, 1.1], "b": [-0.7, 3.0]}
+    second, tested, force = (900.0, 0.01), np.prod(np.array([shape["a"]] * 2), axis=0), 6.0
+
+    def beside(omega, constant):
+        return 1j * omega * constant / (second[0] ** 2 - omega**2 + 2j * np.prod(second) * omega)
+
+    level, omega, forces, own = exact()
+    forces = forces * CONSTANT / tested[0]
+    linear = sj.model.linear_modes(
+        *([500.0, 900.0], [0.012, 0.01], [shape["a"]], shape["a"]),
+        sensors=("a",),
+        beside=Beside({"b": shape["b"]}),
+    )
+    velocity = own + forces * beside(omega, tested[1])
+    data = stated(level, omega, forces, velocity, sensors=("a",))
+    fit = sj.fit_jointly(data, linear, **TRUE)
+    elsewhere = new_level(fit, force, at="b")
+    curve = sj.identify.fitted_response(fit, force, of=elsewhere)[0]
+    x, omega = np.asarray(curve.amplitude), np.asarray(curve.frequency)
+    of_mode = -1.4 / (squared(x) - omega**2 + 1j * omega * damping(x * omega))
+    np.testing.assert_allclose(force * np.abs(of_mode), x, rtol=1e-4)
+    expected = force * (1j * omega * of_mode + beside(omega, 3.3))
+    np.testing.assert_allclose(curve.velocity, expected, rtol=1e-3)
+    (tip,) = curve.resonances
+    np.testing.assert_allclose(
+        [tip.frequency, tip.frequency * tip.amplitude], bisected(force * 1.4 / CONSTANT), rtol=1e-6
+    )
+    further = sj.identify.predicted_resonance(fit, force, of=elsewhere)
+    np.testing.assert_allclose(further.frequency[2], tip.frequency, rtol=1e-4)
+    with pytest.raises(ValueError, match="'c', where the modes have no shape"):
+        new_level(fit, force, at="c")
