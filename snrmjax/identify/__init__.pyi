@@ -4,6 +4,7 @@ from .calibrate.backbone_calibration import (
 )
 from .calibrate.calibration import calibrate_model
 from .calibrate.inverse_force import inverse_force
+from .coupled.coupled_modes import coupled_modes
 from .curves.families import FAMILIES
 from .inference.contributions import contributions
 from .inference.fitted_curves import fitted_values
@@ -56,6 +57,7 @@ __all__ = [
     "closed_form",
     "contributions",
     "corrected_states",
+    "coupled_modes",
     "find_modes",
     "fit_free_decay",
     "fit_jointly",

@@ -7,7 +7,7 @@ folds. The residual is the difference of that force from the measured one.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -23,7 +23,15 @@ from snrmjax.identify.calibrate.calibration_states import (
     state_whitener,
     whitened_columns,
 )
-from snrmjax.identify.calibrate.inverse_force import StateWithErrors, residual_columns, state_motion
+from snrmjax.identify.calibrate.held_modes import (
+    HeldModes,
+    HeldMotion,
+    columns_of_held,
+    held_at_orders,
+    held_columns,
+    held_motion,
+)
+from snrmjax.identify.calibrate.inverse_force import StateWithErrors, residual_columns
 from snrmjax.measure.states import SteadyStates, check_phases
 from snrmjax.model.parameters import (
     checked_names,
@@ -43,6 +51,7 @@ from snrmjax.numerics.levenberg_marquardt import (
     StepRule,
     minimise,
 )
+from snrmjax.simulate.balance.prescribed_motion import PrescribedMotion
 
 
 class _Round(NamedTuple):
@@ -76,11 +85,19 @@ class _Settings(NamedTuple):
     harmonic_order: int
     shared: tuple[str, ...]  # errors that a level shares
     n_levels: int
+    held_modes: tuple[tuple[int, ...], ...] = ()  # whose motion is held as measured, an order each
 
-    @property
-    def held(self) -> tuple[int, int]:
-        """The sensor whose velocity is held, and the harmonic order."""
-        return self.sensors[0], self.harmonic_order
+    def motion(
+        self, model: Structure, erring: StateWithErrors
+    ) -> tuple[PrescribedMotion | HeldMotion, Callable[[Array], Array]]:
+        """The equations of a state, and its columns of a solution."""
+        if not self.held_modes:
+            given = erring.motion(model, self.sensors[0], self.harmonic_order)
+            seen = self.sensors, self.orders
+            return given, lambda point: residual_columns(erring, given, point, *seen)
+        held = HeldModes(self.held_modes, self.sensors, (1, *self.orders))
+        motion = held_motion(erring, model, held, self.harmonic_order)
+        return motion, lambda point: columns_of_held(motion, erring.state, point)
 
 
 class _Aim(NamedTuple):
@@ -124,6 +141,7 @@ def calibrate_model(
     level_gain_std: float = 0.0,
     level_phase_std: float = 0.0,
     priors: bool = False,
+    held_modes: Sequence[int] = (),
 ) -> CalibratedModel:
     """Fit parameters of a model to measured steady states of all levels at once.
 
@@ -142,11 +160,15 @@ def calibrate_model(
     state for which no balanced motion is found has no weight and is named there too. Where errors
     of velocity are not stated for all states, equal relative ones are taken for all and their size
     found from the residuals.
+    `held_modes` (counted from 0) are modes that may exchange energy: their motions at all recorded
+    orders are held as the sensors have them, of as many modes as there are sensors, and the forces
+    that are left on each are the residual. Inside an internal resonance no branch has then to be
+    chosen. Every state needs all sensors.
     Raises `ValueError` for unknown or repeated names, for sensors other than the model's, for an
     unknown force or phase, for levels' errors below zero and for too few data.
     Validity: motions with the period of the force. Errors of velocity enter to first order. Inside
-    an internal resonance several motions have one fundamental; the one that grows from small
-    amplitudes is taken.
+    an internal resonance several motions have one fundamental; without `held_modes` the one that
+    grows from small amplitudes is taken.
     Not differentiable: differentiate `inverse_force`.
     Reference: the formulation is this package's own.
     """
@@ -157,9 +179,16 @@ def calibrate_model(
             raise ValueError(f"`level_{name}_std` must be zero or positive, but is {value}.")
     check_phases(data, "a calibration")
     chosen = calibration_states(model, data, harmonic_order)
+    held: tuple[tuple[int, ...], ...] = ()
+    if held_modes:
+        _check_held(model, tuple(held_modes))
+        chosen = held_columns(chosen)
+        typical = float(np.median(np.asarray(chosen.states.frequency)))
+        orders = (1, *chosen.orders)
+        held = held_at_orders(model, held_modes, typical, orders, len(chosen.sensors))
     shared = tuple(name for name, value in level_std.items() if value > 0)
     picked = (chosen.sensors, chosen.orders, harmonic_order, shared, chosen.n_levels)
-    settings = _Settings(names, *picked)
+    settings = _Settings(names, *picked, held)
     prior_std = np.array([stated_std(model, name) if priors else 0.0 for name in names])
     weight = np.divide(1.0, prior_std, out=np.zeros(len(names)), where=prior_std > 0)
     n_rows = int(chosen.states.known.sum()) + int(np.sum(weight > 0))
@@ -176,6 +205,13 @@ def calibrate_model(
     return _result(model, data.n_states, chosen, settings, aim)
 
 
+def _check_held(model: Structure, modes: tuple[int, ...]) -> None:
+    if len(set(modes)) < len(modes) or not set(modes) <= set(range(model.n_modes)):
+        raise ValueError(
+            f"`held_modes` must be different modes from 0 to {model.n_modes - 1}, but is {modes}."
+        )
+
+
 @compiled
 def _grown(
     model: Structure,
@@ -187,7 +223,8 @@ def _grown(
     model = with_parameters(model, settings.names, parameters)
 
     def one(state: CalibrationStates) -> Array:
-        return state_motion(model, state, state.velocity[0], *settings.held).grown()
+        exact = StateWithErrors(state, 1.0, jnp.zeros_like(state.error))
+        return settings.motion(model, exact)[0].grown()
 
     return mapped(one, states)
 
@@ -211,9 +248,9 @@ def _columns(
     shared = dict(zip(settings.shared, level * aim.level_std, strict=True))
     factor = jnp.exp(-shared.get("gain", 0.0) - 1j * shared.get("phase", 0.0))
     erring = StateWithErrors(state, factor, error)
-    motion = erring.motion(model, settings.sensors[0], settings.harmonic_order)
+    motion, columns = settings.motion(model, erring)
     point = motion.solved(near)
-    return residual_columns(erring, motion, point, settings.sensors, settings.orders), point
+    return columns(point), point
 
 
 @compiled

@@ -102,13 +102,14 @@ class StateWithErrors(NamedTuple):
     def velocity(self) -> Complex[Array, " sensor"]:
         """Fundamentals freed of the errors, in m/s."""
         n = self.state.velocity.shape[0]
-        factors = jnp.exp(self.error[1 : n + 1] + 1j * self.error[n + 1 :])
+        factors = jnp.exp(self.error[1 : n + 1] + 1j * self.error[n + 1 : 2 * n + 1])
         return self.state.velocity * self.factor * factors
 
     def harmonics(self, orders: tuple[int, ...]) -> Complex[Array, "sensor harmonic"]:
         """Harmonics freed of the errors, in m/s: a phase is an error of time, h times as large."""
         n = self.state.velocity.shape[0]
-        factor = self.factor * jnp.exp(self.error[1 : n + 1] + 1j * self.error[n + 1 :])
+        phase = self.error[n + 1 : 2 * n + 1]
+        factor = self.factor * jnp.exp(self.error[1 : n + 1] + 1j * phase)
         size = jnp.abs(factor)
         turn = (factor / size)[:, None] ** np.array(orders, dtype=int)
         return self.state.harmonics * size[:, None] * turn

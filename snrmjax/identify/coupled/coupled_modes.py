@@ -1,0 +1,242 @@
+"""Modes that exchange energy, identified from steady states by harmonic balance."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import ClassVar, NamedTuple
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Complex, Float
+
+from snrmjax.identify.calibrate.calibrated_model import CalibratedModel
+from snrmjax.identify.calibrate.calibration import calibrate_model
+from snrmjax.identify.coupled.coupling_terms import (
+    RATIOS,
+    ChosenTerms,
+    CouplingTerm,
+    chosen_terms,
+    coupling_terms,
+)
+from snrmjax.measure.states import SteadyStates, check_phases
+from snrmjax.model.parameters import stated_stds
+from snrmjax.model.potential import monomial_key, polynomial_potential
+from snrmjax.model.structures import Structure
+from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
+
+_NEAR = 0.15  # relative detuning up to which a harmonic can excite a mode much
+_COUPLED = 0.5  # probability from which on modes are said to be coupled
+
+
+class Interaction(NamedTuple):
+    """How the mode of interest and another one may exchange energy."""
+
+    mode: int  # counted from zero, as `other` is
+    other: int
+    ratio: int  # harmonic of the motion at which the other mode is excited
+    detuning: float  # of the other mode from that harmonic, relative, the smallest measured
+    share: float  # of the energy that the other mode has at that harmonic, the largest measured
+    probability: float  # that a term which couples them at this ratio is there
+
+
+class CoupledModes(AbstractResult):
+    """A model of modes that exchange energy, fitted to steady states; see `coupled_modes`.
+
+    `interactions` has all that were looked at, the most probable one first.
+    """
+
+    coordinates: ClassVar[tuple[str, ...]] = ("interaction",)
+
+    calibration: CalibratedModel
+    interactions: tuple[Interaction, ...] = eqx.field(static=True)
+    probability: Float[np.ndarray, " interaction"] = quantity(
+        "interaction", "1", "probability that the modes are coupled"
+    )
+    share: Float[np.ndarray, " interaction"] = quantity(
+        "interaction", "1", "largest share of the energy in the other mode"
+    )
+    coupled: bool = setting()
+    notes: tuple[Fact, ...] = setting()
+
+    @property
+    def model(self) -> Structure:
+        """The model with the terms that the data ask for."""
+        return self.calibration.model
+
+    @property
+    def interaction(self) -> Interaction | None:
+        """The interaction that the data show; None for none."""
+        return self.interactions[0] if self.coupled else None
+
+    def summary(self) -> tuple[str, ...]:
+        """See `AbstractResult`."""
+        lines = [
+            f"mode {i.mode + 1} and mode {i.other + 1}, 1:{i.ratio}: probability "
+            f"{i.probability:.3g}, up to {100 * i.share:.2g} % of the energy in mode {i.other + 1}"
+            for i in self.interactions
+        ]
+        found = "coupled" if self.coupled else "not coupled"
+        return (
+            f"CoupledModes: {found}",
+            *lines,
+            *self.calibration.summary(),
+            *(f"note: {note}" for note in self.notes),
+        )
+
+    def variables(self) -> dict[str, Variable]:
+        """Those of the fields, with what an interaction is."""
+        names = [f"{i.mode + 1}-{i.other + 1} 1:{i.ratio}" for i in self.interactions]
+        where = Variable(("interaction",), np.array(names, dtype=str), "", "modes and ratio")
+        return {"interaction": where, **super().variables()}
+
+
+def coupled_modes(
+    data: SteadyStates,
+    model: Structure,
+    *,
+    harmonic_order: int = 7,
+    level_gain_std: float = 0.0,
+    level_phase_std: float = 0.0,
+) -> CoupledModes:
+    """Recognise which mode exchanges energy with the mode of interest, and fit how.
+
+    Looked at are modes near the first, second or third harmonic of the measured frequencies (1:1,
+    1:2, 1:3). For each the potential gets all cubic and quartic terms of both modes that matter
+    at that ratio, and their coefficients are fitted with the motions of both modes held as
+    measured (`calibrate_model` with `held_modes`): no branch has to be chosen. Which terms are
+    there follows from their evidence; these are fitted once more.
+
+    Arguments: `data` of sensors that see both modes, best two or more with harmonics and their
+    errors; `model` with both modes, its potential the terms that are known already (fitted too).
+    Frequencies and damping ratios whose 1σ the model states are fitted within it.
+    `level_gain_std` (relative) and `level_phase_std` (rad) as `calibrate_model` has them.
+    Returns `CoupledModes`; without a mode near a harmonic its `interactions` are empty and the
+    mode's own stiffness is fitted.
+    Raises what `calibrate_model` raises.
+    Validity: smooth stiffness; mode shapes and participations are taken as they are. A mode near
+    another harmonic than these, and one that no sensor tells apart, is not found.
+    Reference: evidence as in MacKay, Neural Comput. 4 (1992) 415, doi:10.1162/neco.1992.4.3.415;
+    the formulation with held modes is this package's own.
+    """
+    check_phases(data, "an identification of coupled modes")
+    settings = {
+        "harmonic_order": harmonic_order,
+        "level_gain_std": level_gain_std,
+        "level_phase_std": level_phase_std,
+    }
+    looked = []
+    for pair in _candidates(data, model):
+        terms = coupling_terms(pair.mode, pair.other, pair.ratio)
+        fit = _fitted(data, model, [term.key for term in terms], (pair.mode, pair.other), settings)
+        chosen = _chosen(data, model, terms, fit)
+        looked.append((pair._replace(probability=chosen.coupled), terms, chosen, fit))
+    looked.sort(key=lambda one: -one[0].probability)
+    interactions = tuple(one[0] for one in looked)
+    coupled = bool(interactions) and interactions[0].probability > _COUPLED
+    j = model.modes.mode_of_interest
+    keys, held = [monomial_key((j,) * 4)], (j,)
+    if looked:
+        pair, terms, chosen, _ = looked[0]
+        # What resonates is kept together: of terms that act alike the evidence drops the wrong one.
+        resonant = np.array([term.couples for term in terms])
+        own = np.array([term.powers[1] == 0 for term in terms])
+        best = chosen.best | resonant if coupled else chosen.best & own
+        keys = [term.key for term, there in zip(terms, best, strict=True) if there] or keys
+        held = (pair.mode, pair.other)
+    final = _fitted(data, model, keys, held, settings)
+    return CoupledModes(
+        calibration=final,
+        interactions=interactions,
+        probability=np.array([one.probability for one in interactions]),
+        share=np.array([one.share for one in interactions]),
+        coupled=coupled,
+        notes=(),
+    )
+
+
+def _candidates(data: SteadyStates, model: Structure) -> list[Interaction]:
+    """Other modes near a harmonic of the measured frequencies, each at its nearest ratio."""
+    modes, j = model.modes, model.modes.mode_of_interest
+    frequency = np.asarray(data.frequency)
+    found = []
+    for k in modes.residual_modes:
+        away = {
+            ratio: float(np.min(np.abs(modes.natural_frequency.item(k) / (ratio * frequency) - 1)))
+            for ratio in RATIOS
+        }
+        ratio = min(away, key=lambda r: away[r])
+        if away[ratio] > _NEAR:
+            continue
+        pair = Interaction(j, k, ratio, away[ratio], np.nan, np.nan)
+        found.append(pair._replace(share=_share(data, model, pair)))
+    return found
+
+
+def _share(data: SteadyStates, model: Structure, pair: Interaction) -> float:
+    """The largest share of both modes' energy that the other has at its harmonic; NaN unseen."""
+    motion = modal_motions(data, model, (pair.mode, pair.other))
+    energy = np.nansum(np.abs(motion) ** 2, axis=(1, 2))
+    order = (1, *data.harmonic_order)
+    if len(data.sensors) < 2 or pair.ratio not in order:
+        return float("nan")
+    return float(np.nanmax(np.abs(motion[:, 1, order.index(pair.ratio)]) ** 2 / energy))
+
+
+def modal_motions(
+    data: SteadyStates, model: Structure, modes: Sequence[int]
+) -> Complex[np.ndarray, "state mode order"]:
+    """Velocities of some modes (kg^1/2 m/s) as the sensors have them, at all recorded orders.
+
+    Least squares over the sensors of each state; NaN where one was not measured.
+    """
+    fundamental = np.where(data.measured, data.velocity, np.nan)[..., None]
+    seen = np.concatenate([fundamental, np.asarray(data.harmonics)], axis=2)
+    inverse = np.linalg.pinv(np.asarray(model.modes.mode_shape)[:, list(modes)])
+    return np.einsum("ms,kso->kmo", inverse, seen)
+
+
+def _with_terms(model: Structure, keys: Sequence[str]) -> Structure:
+    """The model with some terms in its potential, zero where it has them not."""
+    potential, n = model.potential, model.n_modes
+    known = {
+        monomial_key(m): float(value)
+        for m, value in zip(potential.monomials, np.asarray(potential.coefficient), strict=True)
+    }
+    whole = dict.fromkeys(keys, 0.0) | known
+    return dataclasses.replace(model, potential=polynomial_potential(whole, n))
+
+
+def _fitted(
+    data: SteadyStates,
+    model: Structure,
+    keys: Sequence[str],
+    held: tuple[int, ...],
+    settings: dict[str, float],
+) -> CalibratedModel:
+    wide = _with_terms(model, keys)
+    names = [f"potential.{key}" for key in keys]
+    fields = ("natural_frequency", "damping_ratio")
+    linear = [f"mode_{k + 1}.{field}" for k in held for field in fields]
+    names += [name for name in linear if name in stated_stds(model)]
+    return calibrate_model(wide, data, names, priors=True, held_modes=held, **settings)
+
+
+def _chosen(
+    data: SteadyStates, model: Structure, terms: Sequence[CouplingTerm], fit: CalibratedModel
+) -> ChosenTerms:
+    """Which terms of a fit with all of them are there."""
+    n = len(terms)
+    known = np.isfinite(np.diag(fit.covariance))[:n]
+    information = np.zeros((n, n))
+    seen = np.flatnonzero(known)
+    information[np.ix_(seen, seen)] = np.linalg.inv(fit.covariance[np.ix_(seen, seen)])
+    modes, j = model.modes, model.modes.mode_of_interest
+    omega = modes.natural_frequency.item(j)
+    motion = modal_motions(data, model, (j,))[:, 0, 0] if len(data.sensors) > 1 else None
+    if motion is None:
+        motion = np.asarray(data.velocity)[:, 0] / modes.mode_shape.item(0, j)
+    amplitude = np.nanmax(np.abs(motion)) / omega
+    # A term may hold as much energy as the linear stiffness at the largest amplitude.
+    prior = np.array([omega**2 * amplitude ** (2 - sum(term.powers)) for term in terms])
+    values = np.where(known, fit.values[:n], 0.0)
+    return chosen_terms(terms, values, information, prior)
