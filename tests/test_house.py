@@ -75,6 +75,7 @@ SUB_ROOMS = {
         "identify.test_model",
     },
     "identify.calibrate": {"identify.pointwise"},
+    "identify.coupled": {"identify.calibrate", "identify.inference"},
     "identify.modal": set(),
     "identify.scaling": {"identify.modal"},
     "methods.steady": {"methods.result", "methods.one_sensor"},

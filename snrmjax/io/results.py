@@ -211,6 +211,27 @@ def write_prediction(
     )
 
 
+def write_coupled_prediction(
+    path: FilePath, curves: Sequence[ResponseCurve], *, sensor: str
+) -> None:
+    """Write responses of coupled modes as `write_prediction` writes those of one mode.
+
+    Arguments: `sensor` is the one of the backbone.
+    Raises `ValueError` when the file cannot be written.
+    """
+    force = np.concatenate([np.full(len(c.frequency), c.force) for c in curves])
+    velocity = np.concatenate([c.velocity[:, 1, _place(c.sensors, sensor)] for c in curves])
+    columns = {
+        "force_n": force,
+        "point": _numbered(force),
+        "frequency_hz": np.concatenate([c.frequency for c in curves]) / HERTZ,
+        "velocity_re_m_s": velocity.real,
+        "velocity_im_m_s": velocity.imag,
+        "stable": np.concatenate([c.is_stable for c in curves]),
+    }
+    write_table(path, columns)
+
+
 def summarise(identification: "Identification", values: "BackboneValues") -> dict:
     """The headline numbers of an identification, by name, in the units of the files.
 

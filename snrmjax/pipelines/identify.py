@@ -6,6 +6,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from snrmjax.doctor.column_misreadings import doubt, linear_damping_note, with_doubt
+from snrmjax.identify.coupled.coupled_modes import other_mode_moves
+from snrmjax.identify.coupled.coupled_test import CoupledDetails, coupled_details
 from snrmjax.identify.inference.contributions import Contribution, contributions
 from snrmjax.identify.inference.fitted_curves import fitted_values
 from snrmjax.identify.inference.fitted_response import FittedResponse, fitted_response
@@ -26,7 +28,7 @@ from snrmjax.identify.prediction.notes import notes_on_negative_damping
 from snrmjax.measure.states import SteadyStates, check_force, check_phases
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.facts import Fact
-from snrmjax.pipelines.options import IdentifyOptions, checked
+from snrmjax.pipelines.options import COUPLED_MODES, IdentifyOptions, checked
 from snrmjax.pipelines.predictions import (
     Note,
     Prediction,
@@ -67,6 +69,7 @@ class IdentifiedTest(NamedTuple):
     joint: FitDetails | None = None  # None: curves through points
     truth: NormalModeBranch | None = None
     simulated: tuple[ResponseCurve, ...] = ()
+    coupled: CoupledDetails | None = None  # None: not asked for, and nothing hints at it
 
     @property
     def responses(self) -> list[PredictedResponse]:
@@ -104,11 +107,20 @@ def identify_test(
     options = checked(dataclasses.replace(options or IdentifyOptions(), **settings))
     if options.predict_drive:
         require_drive(data)
-    return (
-        _by_joint_fit(data, model, options)
-        if options.is_joint
-        else _by_points(data, model, options)
+    if (options.modes or 1) > COUPLED_MODES:
+        raise ValueError(f"`--modes` must be 1 or 2, but is {options.modes}.")
+    coupled, alone = options.modes == COUPLED_MODES, options
+    if coupled:  # responses are then those of the coupled modes
+        alone = dataclasses.replace(options, predict_force=())
+    found = (
+        _by_joint_fit(data, model, alone) if options.is_joint else _by_points(data, model, alone)
     )
+    if not coupled and (options.modes is not None or not other_mode_moves(data, model)):
+        return found
+    forces = options.predict_force if coupled else ()
+    details = coupled_details(data, model, found.identification, forces)
+    notes = _each_once((*found.notes, *details.notes()))
+    return found._replace(options=options, coupled=details, notes=notes)
 
 
 def _by_points(data: SteadyStates, model: Structure, options: IdentifyOptions) -> IdentifiedTest:

@@ -82,9 +82,26 @@ _FOR_PREDICTIONS: dict[str, Any] = {
 }
 
 
+COUPLED_MODES = 2
+"""Of `IdentifyOptions.modes`: a mode and the one that it exchanges energy with."""
+
+
 @dataclasses.dataclass(frozen=True)
 class IdentifyOptions:
     """What `identify` may be asked for."""
+
+    modes: int | None = option(
+        None,
+        "2: also identify which mode exchanges energy with the mode of interest (1:1, 1:2, 1:3): "
+        "writes the completed model.toml, and predictions are then its responses by harmonic "
+        "balance. 1: look at one mode only. Default: look at two where the sensors show a second "
+        "one.",
+        "COUNT",
+        least=1,
+        panel="Coupled modes",
+        alone=("predict_drive", "predict_at"),
+        why_alone="responses of coupled modes are those to forces in N where the test had them",
+    )
 
     predict_force: tuple[float, ...] = option(
         (),

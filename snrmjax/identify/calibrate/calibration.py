@@ -6,32 +6,27 @@ the harmonic balance is solved for the rest of the motion and for the force: sin
 folds. The residual is the difference of that force from the measured one.
 """
 
-import dataclasses
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Sequence
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
 
 from snrmjax.identify.calibrate.calibrated_model import CalibratedModel
 from snrmjax.identify.calibrate.calibration_states import (
-    CalibrationStates,
     ComparedColumns,
     calibration_states,
-    state_whitener,
-    whitened_columns,
 )
 from snrmjax.identify.calibrate.held_modes import (
-    HeldModes,
-    HeldMotion,
-    columns_of_held,
     held_at_orders,
     held_columns,
-    held_motion,
 )
-from snrmjax.identify.calibrate.inverse_force import StateWithErrors, residual_columns
+from snrmjax.identify.calibrate.state_fit import (
+    FitAim,
+    FitSettings,
+    FittedStates,
+    FittedSubject,
+    fitted_states,
+)
 from snrmjax.measure.states import SteadyStates, check_phases
 from snrmjax.model.parameters import (
     checked_names,
@@ -41,95 +36,11 @@ from snrmjax.model.parameters import (
     with_stated_std,
 )
 from snrmjax.model.structures import Structure
-from snrmjax.numerics.blocks import mapped
-from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.least_squares import inverse_of
 from snrmjax.numerics.levenberg_marquardt import (
     MinimisationStatus,
-    Minimum,
-    StepRule,
-    minimise,
 )
-from snrmjax.simulate.balance.prescribed_motion import PrescribedMotion
-
-
-class _Round(NamedTuple):
-    """One round of fitting and whitening anew.
-
-    In the first rounds, far from the truth, what the data say little about stays within a relative
-    step of about `step`, and harmonics, which mislead there, have a relative error of
-    `harmonic_error`. A round ends with a step that lowers χ² by less than `settled`.
-    """
-
-    step: float
-    harmonic_error: float
-    settled: float
-
-
-_ROUNDS = (
-    _Round(0.1, 1.0, 1e-3),
-    _Round(0.3, 0.1, 1e-3),
-    _Round(np.inf, 0.0, 1e-3),
-    _Round(np.inf, 0.0, 1e-12),
-)
-_RULE = StepRule(steps=60)
-
-
-class _Settings(NamedTuple):
-    """What is compiled into a program."""
-
-    names: tuple[str, ...]
-    sensors: tuple[int, ...]  # rows of the mode shapes, the reference sensor first
-    orders: tuple[int, ...]  # harmonics that are compared
-    harmonic_order: int
-    shared: tuple[str, ...]  # errors that a level shares
-    n_levels: int
-    held_modes: tuple[tuple[int, ...], ...] = ()  # whose motion is held as measured, an order each
-
-    def motion(
-        self, model: Structure, erring: StateWithErrors
-    ) -> tuple[PrescribedMotion | HeldMotion, Callable[[Array], Array]]:
-        """The equations of a state, and its columns of a solution."""
-        if not self.held_modes:
-            given = erring.motion(model, self.sensors[0], self.harmonic_order)
-            seen = self.sensors, self.orders
-            return given, lambda point: residual_columns(erring, given, point, *seen)
-        held = HeldModes(self.held_modes, self.sensors, (1, *self.orders))
-        motion = held_motion(erring, model, held, self.harmonic_order)
-        return motion, lambda point: columns_of_held(motion, erring.state, point)
-
-
-class _Aim(NamedTuple):
-    """What unknowns mean, and what holds them near zero, where they all begin.
-
-    An unknown is a parameter's change relative to its start, or its value where that is zero, or
-    what a level shares in units of 1σ.
-    """
-
-    values: Float[Array, " parameter"]
-    weight: Float[Array, " parameter"]  # 1/σ, 0 where there is none
-    level_std: Float[Array, " error"]
-
-    def parameters(self, unknowns: Float[Array, " unknown"]) -> Float[Array, " parameter"]:
-        """The parameters themselves."""
-        changes = unknowns[: self.values.shape[0]]
-        return jnp.where(self.values != 0, self.values * (1 + changes), changes)
-
-    def misses(self, unknowns: Float[Array, " unknown"]) -> Float[Array, " unknown"]:
-        """Residuals of the unknowns themselves."""
-        off = (self.parameters(unknowns) - self.values) * self.weight
-        return jnp.append(off, unknowns[off.shape[0] :])
-
-
-class _Slopes(NamedTuple):
-    """All states at some unknowns, and their derivatives."""
-
-    points: Float[Array, "state entry"]
-    columns: Float[Array, "state column"]
-    by_unknown: Float[Array, "state column unknown"]
-    by_error: Float[Array, "state column input"]
-    points_by_unknown: Float[Array, "state entry unknown"]
 
 
 def calibrate_model(
@@ -188,7 +99,7 @@ def calibrate_model(
         held = held_at_orders(model, held_modes, typical, orders, len(chosen.sensors))
     shared = tuple(name for name, value in level_std.items() if value > 0)
     picked = (chosen.sensors, chosen.orders, harmonic_order, shared, chosen.n_levels)
-    settings = _Settings(names, *picked, held)
+    settings = FitSettings(names, *picked, held)
     prior_std = np.array([stated_std(model, name) if priors else 0.0 for name in names])
     weight = np.divide(1.0, prior_std, out=np.zeros(len(names)), where=prior_std > 0)
     n_rows = int(chosen.states.known.sum()) + int(np.sum(weight > 0))
@@ -197,7 +108,7 @@ def calibrate_model(
             f"{len(names)} parameters need more than {len(names)} data, but {len(chosen.rows)} "
             f"usable states give {n_rows}."
         )
-    aim = _Aim(
+    aim = FitAim(
         values=jnp.stack([parameter_value(model, name) for name in names]),
         weight=jnp.asarray(weight),
         level_std=jnp.array([level_std[name] for name in shared]),
@@ -212,154 +123,10 @@ def _check_held(model: Structure, modes: tuple[int, ...]) -> None:
         )
 
 
-@compiled
-def _grown(
-    model: Structure,
-    states: CalibrationStates,
-    settings: _Settings,
-    parameters: Float[Array, " parameter"],
-) -> Float[Array, "state entry"]:
-    """Solutions for the measured velocities, grown from small amplitudes."""
-    model = with_parameters(model, settings.names, parameters)
-
-    def one(state: CalibrationStates) -> Array:
-        exact = StateWithErrors(state, 1.0, jnp.zeros_like(state.error))
-        return settings.motion(model, exact)[0].grown()
-
-    return mapped(one, states)
-
-
-def _columns(
-    model: Structure,
-    state: CalibrationStates,
-    settings: _Settings,
-    aim: _Aim,
-    unknowns: Float[Array, " unknown"],
-    error: Float[Array, " input"],
-    near: Float[Array, " entry"],
-) -> tuple[Float[Array, " column"], Float[Array, " entry"]]:
-    """Columns of one state, and the solution behind them.
-
-    `error` adds to the logarithms of force and velocities and to the phases: for derivatives.
-    """
-    p = len(settings.names)
-    model = with_parameters(model, settings.names, aim.parameters(unknowns))
-    level = unknowns[p:].reshape(settings.n_levels, len(settings.shared))[state.level]
-    shared = dict(zip(settings.shared, level * aim.level_std, strict=True))
-    factor = jnp.exp(-shared.get("gain", 0.0) - 1j * shared.get("phase", 0.0))
-    erring = StateWithErrors(state, factor, error)
-    motion, columns = settings.motion(model, erring)
-    point = motion.solved(near)
-    return columns(point), point
-
-
-@compiled
-def _slopes(
-    model: Structure,
-    states: CalibrationStates,
-    settings: _Settings,
-    aim: _Aim,
-    unknowns: Float[Array, " unknown"],
-    near: Float[Array, "state entry"],
-) -> _Slopes:
-    def one(state: CalibrationStates, start: Array) -> _Slopes:
-        def both(unknowns: Array, error: Array) -> tuple:
-            columns_and_point = _columns(model, state, settings, aim, unknowns, error, start)
-            return columns_and_point, columns_and_point
-
-        slopes = jax.jacfwd(both, argnums=(0, 1), has_aux=True)
-        (columns, points), (value, point) = slopes(unknowns, jnp.zeros_like(state.error))
-        return _Slopes(point, value, columns[0], columns[1], points[0])
-
-    return mapped(one, states, near)
-
-
-class _Linear(NamedTuple):
-    """The whitened problem at some unknowns."""
-
-    residuals: Float[np.ndarray, " row"]
-    jacobian: Float[np.ndarray, "row unknown"]
-    slopes: _Slopes
-
-
-class _Fitted(NamedTuple):
-    unknowns: np.ndarray
-    residuals: Float[np.ndarray, "state column"]
-    jacobian: Float[np.ndarray, "row unknown"]
-    usable: Bool[np.ndarray, " state"]
-    status: MinimisationStatus
-
-
-def _fitted(model: Structure, states: CalibrationStates, settings: _Settings, aim: _Aim) -> _Fitted:
-    """Fit, whiten anew where the fit ended, and fit again."""
-    subject = (model, states, settings)
-    unknowns = np.zeros(len(settings.names) + settings.n_levels * len(settings.shared))
-    status, relative = MinimisationStatus.NOT_FITTED, np.asarray(aim.values) != 0
-    slopes = _slopes(*subject, aim, jnp.asarray(unknowns), _grown(*subject, aim.values))
-    for turn, (step, harmonic_error, settled) in enumerate(_ROUNDS):
-        lost = ~np.isfinite(np.asarray(slopes.points[:, -1]))
-        if turn and lost.any():
-            grown = _grown(*subject, aim.parameters(jnp.asarray(unknowns)))
-            again = jnp.where(lost[:, None], grown, slopes.points)
-            slopes = _slopes(*subject, aim, jnp.asarray(unknowns), again)
-        whiten = np.asarray(state_whitener(states, slopes.by_error, jnp.asarray(harmonic_error)))
-        hold = np.append(relative / step, np.zeros(len(unknowns) - len(relative)))
-        end = _settled(subject, aim, unknowns, slopes, whiten, hold, settled)
-        unknowns, slopes, status = end.point, end.linearised.slopes, end.status
-    if not np.any(whiten):
-        status = MinimisationStatus.NOT_FINITE
-    return _Fitted(
-        unknowns=unknowns,
-        residuals=whitened_columns(whiten, np.asarray(slopes.columns)),
-        jacobian=_jacobian(whiten, slopes, aim),
-        usable=np.any(whiten != 0, axis=(1, 2)),
-        status=status,
-    )
-
-
-def _settled(
-    subject: tuple[Structure, CalibrationStates, _Settings],
-    aim: _Aim,
-    begin: Float[np.ndarray, " unknown"],
-    slopes: _Slopes,
-    whiten: Float[np.ndarray, "state column column"],
-    hold: Float[np.ndarray, " unknown"],
-    settled: float,
-) -> Minimum[_Linear]:
-    """The best unknowns with states whitened like this, held near where they begin."""
-
-    def linear(unknowns: np.ndarray, at: _Slopes) -> _Linear:
-        columns = whitened_columns(whiten, np.asarray(at.columns)).reshape(-1)
-        misses = np.asarray(aim.misses(jnp.asarray(unknowns)))
-        jacobian = np.concatenate([_jacobian(whiten, at, aim), np.diag(hold)])
-        return _Linear(np.concatenate([columns, misses, hold * (unknowns - begin)]), jacobian, at)
-
-    def evaluate(trials: np.ndarray) -> list[_Linear]:
-        # A state that is lost on the way is NaN: a smaller step is then taken.
-        near = [slopes.points + slopes.points_by_unknown @ (trial - begin) for trial in trials]
-        return [
-            linear(trial, _slopes(*subject, aim, jnp.asarray(trial), start))
-            for trial, start in zip(trials, near, strict=True)
-        ]
-
-    anywhere = np.full(len(begin), -np.inf), np.full(len(begin), np.inf)
-    rule = dataclasses.replace(_RULE, settled=settled)
-    return minimise(evaluate, begin[None], [linear(begin, slopes)], anywhere, rule)[0]
-
-
-def _jacobian(whitener: np.ndarray, slopes: _Slopes, aim: _Aim) -> np.ndarray:
-    by_unknown = np.asarray(slopes.by_unknown)
-    of_states = whitened_columns(whitener, by_unknown).reshape(-1, by_unknown.shape[-1])
-    values, weight = np.asarray(aim.values), np.asarray(aim.weight)
-    of_parameters = np.where(values != 0, values, 1.0) * weight
-    shared = np.ones(by_unknown.shape[-1] - len(values))
-    return np.concatenate([of_states, np.diag(np.append(of_parameters, shared))])
-
-
 def _result(
-    model: Structure, n_states: int, chosen: ComparedColumns, settings: _Settings, aim: _Aim
+    model: Structure, n_states: int, chosen: ComparedColumns, settings: FitSettings, aim: FitAim
 ) -> CalibratedModel:
-    fit = _fitted(model, chosen.states, settings, aim)
+    fit = fitted_states(FittedSubject(model, chosen.states, settings, aim))
     names, p, usable = settings.names, len(settings.names), fit.usable
     known = np.asarray(chosen.states.known) & usable[:, None]
     freedom = int(known.sum()) + int(np.sum(np.asarray(aim.weight) > 0)) - p
@@ -399,7 +166,11 @@ def _result(
 
 
 def _notes(
-    chosen: ComparedColumns, names: tuple[str, ...], fit: _Fitted, reduced: float, margin: float
+    chosen: ComparedColumns,
+    names: tuple[str, ...],
+    fit: FittedStates,
+    reduced: float,
+    margin: float,
 ) -> list[Fact]:
     notes = []
     if fit.status == MinimisationStatus.NOT_FINITE:

@@ -52,7 +52,7 @@ def held_at_orders(
     )
 
 
-class HeldMotion(eqx.Module):
+class HeldState(eqx.Module):
     """The equations of one state: the balance, and held modes in place of their equations.
 
     A point holds the balance's scaled displacements.
@@ -174,21 +174,19 @@ def held_columns(chosen: ComparedColumns) -> ComparedColumns:
     states, n = chosen.states, len(chosen.sensors)
     known, own = np.asarray(states.known), np.asarray(states.own_std)
     by_order = known[:, 2 * n :].reshape(len(known), n, len(chosen.orders), 2).all(axis=(1, 3))
-    whole = known[:, : 2 * n].all(axis=1)
-    there = np.repeat(
-        np.concatenate([np.ones((len(known), n), bool), np.tile(by_order, n)], 1), 2, 1
-    )
+    whole = np.all(known[:, : 2 * n], axis=1, keepdims=True)
+    there = np.concatenate([np.tile(whole, n), np.tile(by_order, n) & whole], axis=1)
     parts: dict[str, Any] = {
         "error": np.concatenate([np.asarray(states.error), own[:, 2 * n :]], axis=1),
         "own_std": np.full(known.shape, _FLOOR),
-        "known": there & whole[:, None],
+        "known": np.repeat(there, 2, axis=1),
     }
     return chosen._replace(states=states._replace(**jax.device_put(parts)))
 
 
 def held_motion(
     erring: StateWithErrors, model: Structure, held: HeldModes, harmonic_order: int
-) -> HeldMotion:
+) -> HeldState:
     """The equations of a state whose records have some errors.
 
     Modes that are not held move under the measured force.
@@ -215,11 +213,11 @@ def held_motion(
     load = jnp.abs(modes.participation[j]) * state.force
     known = state.known.reshape(-1, 2)[:, 0]
     there = jnp.concatenate([known[:1], known[n:].reshape(n, len(orders))[0]])
-    return HeldMotion(balance, state.frequency, seen, there, load, held)
+    return HeldState(balance, state.frequency, seen, there, load, held)
 
 
 def columns_of_held(
-    motion: HeldMotion, state: CalibrationStates, point: Float[Array, " unknown"]
+    motion: HeldState, state: CalibrationStates, point: Float[Array, " unknown"]
 ) -> Float[Array, " column"]:
     """Real and imaginary parts of what is left, in the order of `held_columns`."""
     by_order = motion.columns(point)

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -26,6 +26,8 @@ from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
 
 _NEAR = 0.15  # relative detuning up to which a harmonic can excite a mode much
 _COUPLED = 0.5  # probability from which on modes are said to be coupled
+_SEEN = 5.0  # standard errors of another mode's motion, and
+_STRONG = 5e-3  # its share of the mode of interest's, from which on it is looked at unasked
 
 
 class Interaction(NamedTuple):
@@ -119,7 +121,7 @@ def coupled_modes(
     the formulation with held modes is this package's own.
     """
     check_phases(data, "an identification of coupled modes")
-    settings = {
+    settings: dict[str, Any] = {
         "harmonic_order": harmonic_order,
         "level_gain_std": level_gain_std,
         "level_phase_std": level_phase_std,
@@ -134,13 +136,13 @@ def coupled_modes(
     interactions = tuple(one[0] for one in looked)
     coupled = bool(interactions) and interactions[0].probability > _COUPLED
     j = model.modes.mode_of_interest
-    keys, held = [monomial_key((j,) * 4)], (j,)
+    keys: Sequence[str] = [monomial_key((j,) * 4)]
+    held: tuple[int, ...] = (j,)
     if looked:
         pair, terms, chosen, _ = looked[0]
-        # What resonates is kept together: of terms that act alike the evidence drops the wrong one.
-        resonant = np.array([term.couples for term in terms])
+        kept = np.array([term.kept for term in terms])
         own = np.array([term.powers[1] == 0 for term in terms])
-        best = chosen.best | resonant if coupled else chosen.best & own
+        best = chosen.best | kept if coupled else chosen.best & own
         keys = [term.key for term, there in zip(terms, best, strict=True) if there] or keys
         held = (pair.mode, pair.other)
     final = _fitted(data, model, keys, held, settings)
@@ -170,6 +172,38 @@ def _candidates(data: SteadyStates, model: Structure) -> list[Interaction]:
         pair = Interaction(j, k, ratio, away[ratio], np.nan, np.nan)
         found.append(pair._replace(share=_share(data, model, pair)))
     return found
+
+
+def other_mode_moves(data: SteadyStates, model: Structure) -> bool:
+    """Whether sensors show a mode near a harmonic that moves more than the force alone moves it.
+
+    Beyond the errors of the states, and by a share that matters; False where fewer than two sensors
+    can tell.
+    """
+    if len(data.sensors) < 2:
+        return False
+    shapes = np.asarray(model.modes.mode_shape)
+    order = (1, *data.harmonic_order)
+    for pair in _candidates(data, model):
+        if pair.ratio not in order:
+            continue
+        inverse = np.linalg.pinv(shapes[:, [pair.mode, pair.other]])
+        motion = modal_motions(data, model, (pair.mode, pair.other))[..., order.index(pair.ratio)]
+        moved = motion[:, 1] - (_forced(data, model, pair.other) if pair.ratio == 1 else 0.0)
+        std = data.velocity_std if pair.ratio == 1 else data.harmonic_std
+        error = np.sqrt(np.asarray(std) ** 2 @ inverse[1] ** 2)
+        whole = np.abs(modal_motions(data, model, (pair.mode, pair.other))[:, 0, 0])
+        if np.any((np.abs(moved) > _SEEN * error) & (np.abs(moved) > _STRONG * whole)):
+            return True
+    return False
+
+
+def _forced(data: SteadyStates, model: Structure, k: int) -> Complex[np.ndarray, " state"]:
+    """Velocity of a linear mode under the measured force, kg^1/2 m/s."""
+    modes, omega = model.modes, np.asarray(data.frequency)
+    natural, ratio = modes.natural_frequency.item(k), modes.damping_ratio.item(k)
+    stiffness = natural**2 - omega**2 + 2j * ratio * natural * omega
+    return 1j * omega * modes.participation.item(k) * np.asarray(data.force) / stiffness
 
 
 def _share(data: SteadyStates, model: Structure, pair: Interaction) -> float:
@@ -211,7 +245,7 @@ def _fitted(
     model: Structure,
     keys: Sequence[str],
     held: tuple[int, ...],
-    settings: dict[str, float],
+    settings: dict[str, Any],
 ) -> CalibratedModel:
     wide = _with_terms(model, keys)
     names = [f"potential.{key}" for key in keys]

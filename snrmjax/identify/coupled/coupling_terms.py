@@ -30,6 +30,14 @@ class CouplingTerm(NamedTuple):
     powers: tuple[int, int]  # a and b
     couples: bool  # whether it carries energy between the modes at the ratio
 
+    @property
+    def kept(self) -> bool:
+        """Whether it stays where modes are coupled: of terms that act alike none can be left out.
+
+        q_j²q_k² moves both frequencies at every ratio, and with them what a resonant term does.
+        """
+        return self.couples or self.powers == (2, 2)
+
 
 def coupling_terms(mode: int, other: int, ratio: int) -> tuple[CouplingTerm, ...]:
     """The terms of two modes at a ratio: those that resonate, others of both, the mode's own."""

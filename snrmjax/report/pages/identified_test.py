@@ -17,6 +17,7 @@ from snrmjax.pipelines.predictions import Prediction
 from snrmjax.report.figures import identification as plot
 from snrmjax.report.figures.simulation import normal_mode_figure
 from snrmjax.report.html import Report, ReportFigure, Section, write_report
+from snrmjax.report.pages import coupled_modes as coupled_page
 from snrmjax.report.pages.identification import ComparedResponses, identification_report
 from snrmjax.report.pages.joint_fit import (
     curves_in_words,
@@ -55,6 +56,8 @@ def headline(found: IdentifiedTest) -> list[str]:
             damped = f"{100 * each.damping_ratio:.3g} % of critical damping"
             lines.append(f"resonance at {prediction.load}: {place}, {damped}")
         lines.append(f"resonance at {prediction.load} {where_in_words(prediction.further)}")
+    if found.coupled is not None:
+        lines += coupled_page.headline(found.coupled)
     for advised in found.advice or ():
         force, drive = advised.force, advised.drive
         load = f"force {force:.4g} N" if drive is None else f"drive {drive:.4g} V"
@@ -92,6 +95,8 @@ def identification_figures(
         )
     if found.joint is not None:
         figures |= joint_figures(found.joint, points, shown)
+    if found.coupled is not None:
+        figures |= coupled_page.figures(found.coupled, found.identification.backbone)
     if found.truth is not None:
         figures["nnm"] = normal_mode_figure(found.truth, sensor=points.sensor)
     return figures
@@ -146,6 +151,8 @@ def findings_report(
             ],
         )
     )
+    if found.coupled is not None:
+        further.append(coupled_page.section(found.coupled, figures))
     if "nnm" in figures:
         shown = [ReportFigure(figures["nnm"], MODE_CAPTION)]
         further.append(Section("The nonlinear normal mode", (), shown))
@@ -191,6 +198,8 @@ def write(
         given = (folder / "prediction.csv", found.responses)
         results.write_prediction(*given, drives=drives, velocity_stds=stds)
     summary: dict[str, object] = {"program": "snrmjax", "version": version("snrmjax"), **done}
+    if found.coupled is not None:
+        summary["coupled_modes"] = coupled_page.write(folder, found.coupled)
     if found.joint is None:
         results.write_backbone(folder / "backbone.csv", found.identification, added=added)
     else:

@@ -233,7 +233,39 @@ def _not_located(points: Sequence[tuple[str, float]], force: float) -> str:
     )
 
 
+def _coupled(mode: int, other: int, ratio: int, probability: float, share: float) -> str:
+    moved = "" if np.isnan(share) else f", which has up to {100 * share:.2g} % of the energy"
+    return (
+        f"mode {mode} exchanges energy with mode {other} (1:{ratio}, probability "
+        f"{_probable(probability)}){moved}: a backbone of one mode holds where this is little."
+    )
+
+
+def _probable(probability: float) -> str:
+    return "above 0.999" if probability > 0.999 else f"{probability:.3g}"
+
+
+def _not_coupled(looked: Sequence[tuple[int, int]]) -> str:
+    if not looked:
+        return "no other mode lies near the first three harmonics of the measured frequencies."
+    pairs = enumerated([f"mode {other} (1:{ratio})" for other, ratio in looked])
+    return f"the states show no exchange of energy with {pairs}."
+
+
+def _biased(velocity: float, frequency: float, damping: float, clear: bool) -> str:
+    said = (
+        f"at {velocity:.3g} m/s the backbone of one mode has a natural frequency "
+        f"{100 * frequency:+.2g} % and a damping ratio {100 * damping:+.2g} % from the coupled "
+        "modes'"
+    )
+    return f"{said}." if clear else f"{said}: within its error."
+
+
 SENTENCES: dict[str, Wording] = {
+    # Coupled modes.
+    "modes_coupled": _coupled,
+    "modes_not_coupled": _not_coupled,
+    "single_mode_biased": _biased,
     # Joint fits.
     "as_in_file": "{text}",
     "fit_not_converged": "the fit has {reason}; try a simpler family.",
