@@ -5,6 +5,7 @@ Run: python benchmarks/coupled_sets/score.py --folder DIR [--one-sensor] [--writ
 Of every set: whether the interaction is the true one (or none), whether the 95 % band of the
 resonant coefficients holds the true ones, and how far the responses of the fitted model to the
 force that was left out lie from the integrated ones, at all sensors, over the largest of them.
+And the bias of a backbone of one mode: stated, true and 1σ of the backbone.
 One JSON line a set, one at the end.
 """
 
@@ -16,8 +17,11 @@ import time
 from pathlib import Path
 
 import numpy as np
+from generate import gradient
+from scipy.optimize import fsolve
 
 import snrmjax as sj
+from snrmjax.identify.coupled.single_mode_bias import single_mode_bias
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 from harness import options, teller
@@ -53,6 +57,57 @@ def off_left_out(model, key, n_sensors):
     return off
 
 
+def true_mode(key, sensor, speeds):
+    """Natural frequency and damping ratio of the true nonlinear mode at velocities of a sensor.
+
+    By a harmonic balance of its own, of five harmonics without damping; the damping ratio is what
+    both modes dissipate in that motion.
+    """
+    omega, zeta, shape = (np.array(key[name]) for name in ("omega", "zeta", "shape"))
+    order, tau = np.arange(6), 2 * np.pi * np.arange(64) / 64
+    cosines = np.cos(np.outer(tau, order))
+
+    def left(unknown, speed, size):
+        q, frequency = unknown[:-1].reshape(2, -1) * size, unknown[-1] * omega[0]
+        inside = np.stack(gradient(q @ cosines.T, key["terms"])) @ cosines / 32
+        inside[:, 0] /= 2
+        balance = (omega[:, None] ** 2 - (order * frequency) ** 2) * q + inside
+        seen = frequency * (shape[sensor] @ q[:, 1]) * np.sign(shape[sensor, 0])
+        return np.append(balance.reshape(-1) / (omega[0] ** 2 * size), seen / speed - 1)
+
+    found, unknown = [], np.zeros(13)
+    unknown[[1, -1]] = 1.0
+    for speed in speeds:
+        size = speed / (omega[0] * abs(shape[sensor, 0]))
+        new, _, good, _ = fsolve(left, unknown, (speed, size), full_output=True, xtol=1e-11)
+        if good != 1:
+            found.append((np.nan, np.nan))
+            continue
+        unknown, frequency = new, new[-1] * omega[0]
+        energy = np.sum((order * frequency * new[:-1].reshape(2, -1)) ** 2, axis=1)
+        found.append((frequency, np.sum(zeta * omega * energy) / np.sum(energy) / frequency))
+    return np.array(found).T
+
+
+def biases(identified, coupled, key):
+    """Stated and true bias of one mode at the largest amplitude, and 1σ of its curve."""
+    bias = single_mode_bias(identified, coupled)
+    speed, frequency, damping, std = bias.at_largest
+    if not np.isfinite(speed):
+        return None
+    place = np.flatnonzero(bias.velocity == speed)[0]
+    sensor = "ab".index(identified.backbone.sensor)
+    curve = identified.backbone.sampled(len(bias.velocity))
+    true = true_mode(key, sensor, np.linspace(speed / 100, speed, 100))[:, -1]
+    return {
+        "frequency": [frequency, float(curve.natural_frequency[place]) / true[0] - 1, std],
+        "damping": [
+            *(damping, float(curve.damping_ratio[place]) / true[1] - 1),
+            float(curve.damping_ratio_std[place]) / true[1],
+        ],
+    }
+
+
 def of_one_sensor(path, folder):
     """The set as the first sensor alone has it."""
     lines = path.read_text().splitlines()
@@ -68,7 +123,8 @@ def scored(path, key):
     """One set."""
     begin = time.perf_counter()
     model = sj.read_model(path.with_suffix(".toml"))
-    found = sj.identify.coupled_modes(sj.read_steady_states(path, model), model)
+    data = sj.read_steady_states(path, model)
+    found = sj.identify.coupled_modes(data, model)
     seconds = time.perf_counter() - begin
     answer = "none" if found.interaction is None else f"1:{found.interaction.ratio}"
     fit = found.calibration
@@ -84,7 +140,20 @@ def scored(path, key):
         "share": found.interactions[0].share if found.interactions else None,
         **{"scale": fit.noise_scale, "errors_std": held},
         **{"left_out": np.max(off) if off else None, "seconds": seconds},
+        "bias": biases(sj.identify_backbone(data, model), found, key),
         "terms": [name.removeprefix("potential.") for name in fit.names if name.startswith("p")],
+    }
+
+
+def bias_counts(lines, part):
+    """Of biases that matter, and of those above three 1σ, how many are stated within 30 %."""
+    least = {"frequency": 1e-4, "damping": 1e-3}[part]
+    rows = [line["bias"][part] for line in lines if line["bias"] is not None]
+    right = [(abs(true), std, abs(stated - true) < 0.3 * abs(true)) for stated, true, std in rows]
+    large, clear = ([r for t, s, r in right if t > max(least, k * s)] for k in (0, 3))
+    return {
+        **{"all": len(rows), "large": len(large), "large_within_30_percent": sum(large)},
+        **{"above_3_std": len(clear), "above_3_std_within_30_percent": sum(clear)},
     }
 
 
@@ -110,6 +179,7 @@ def main() -> None:
         within_1_percent=sum(o < 0.01 for o in off),
         responses=len(off),
         median_off=float(np.median(off)),
+        **{part: bias_counts(lines, part) for part in ("frequency", "damping")},
         median_seconds=float(np.median([line["seconds"] for line in lines])),
     )
 
