@@ -1,0 +1,1 @@
+"""Where in a structure a nonlinear force acts."""
