@@ -86,6 +86,7 @@ SUB_ROOMS = {
     "diagnose.checks": {
         *("diagnose.misfit", "diagnose.search", "diagnose.priors", "diagnose.evidence"),
     },
+    "diagnose.location": {"diagnose.misfit"},
     "diagnose.laws": {
         *("diagnose.misfit", "diagnose.search", "diagnose.checks", "diagnose.priors"),
     },

@@ -69,7 +69,10 @@ def diagnose(
                 structure, measured = read_test(path, given, asked.add)
                 for note in measured.notes:
                     warn(note)
-                found = diagnose_test(measured, structure, simulate=simulate, former=former)
+                places = [one.strip() for one in asked.where.split(",") if one.strip()]
+                found = diagnose_test(
+                    measured, structure, simulate=simulate, former=former, where=places
+                )
                 title = path.stem.replace("_", " ")
                 page.write(folder, found, title=title, data=path.name)
                 if asked.plan is not None:

@@ -1,6 +1,15 @@
 from .decide import Verdict
 from .diagnosis import diagnose_model
 from .diagnosis_result import Diagnosis
+from .location.where import EVERYWHERE, Whereabouts, locate_force
 from .response_prediction import predict_levels
 
-__all__ = ["Diagnosis", "Verdict", "diagnose_model", "predict_levels"]
+__all__ = [
+    "EVERYWHERE",
+    "Diagnosis",
+    "Verdict",
+    "Whereabouts",
+    "diagnose_model",
+    "locate_force",
+    "predict_levels",
+]

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from snrmjax.diagnose.design.discriminating_test import DiscriminatingTest
 from snrmjax.diagnose.diagnosis_result import Diagnosis
 from snrmjax.diagnose.laws.law_search import DrawnLaw
+from snrmjax.diagnose.location.where import Whereabouts
 from snrmjax.diagnose.response_prediction import LevelResponse
 from snrmjax.diagnose.search.locating import Located
 from snrmjax.model.effect_metadata import Argument
@@ -143,3 +144,14 @@ def _part(part: Located) -> dict:
     if part.exponent is not None:
         entry |= {"exponent": part.exponent, "exponent_std": part.exponent_std}
     return entry
+
+
+def summarise_whereabouts(found: Whereabouts) -> dict:
+    """Where a force acts: places with their probabilities, and the law at the first."""
+    law = found.places[0].law
+    return {
+        "where": found.by_place,
+        "where_misfit": found.misfit,
+        "where_law": None if law is None else {"kind": law.kind, "parameters": law.parameters},
+        "where_settled_by_sensor": None if found.told else found.settled_by,
+    }

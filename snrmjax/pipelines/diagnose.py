@@ -4,8 +4,12 @@ import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
+
+from snrmjax.diagnose.decide import Verdict
 from snrmjax.diagnose.diagnosis import diagnose_model
 from snrmjax.diagnose.diagnosis_result import Diagnosis, FormerAnswer
+from snrmjax.diagnose.location.where import Whereabouts, few_places, locate_force
 from snrmjax.diagnose.response_prediction import (
     HeldCurve,
     LevelPredictions,
@@ -39,6 +43,7 @@ class DiagnosedTest(NamedTuple):
     diagnosis: Diagnosis
     model: Structure  # as given
     simulated: SimulatedLevels | None = None  # None: not asked for, or nothing to simulate
+    where: Whereabouts | None = None  # None: nothing is missing, or there is but one place
 
     @property
     def predicted(self) -> tuple[LevelResponse, ...]:
@@ -52,21 +57,35 @@ def diagnose_test(
     *,
     simulate: bool = True,
     former: FormerAnswer | None = None,
+    where: Sequence[str] = (),
 ) -> DiagnosedTest:
-    """Find what the model lacks and, if asked for, simulate all levels with and without it.
+    """Find what the model lacks and where; if asked for, simulate all levels with and without it.
 
-    Arguments: `former` answer of fewer states. Where no structure can have the parameters found,
-    nothing is simulated. Raises `ValueError` as `diagnose_model` does.
+    Arguments: `former` answer of fewer states; `where` it may be, points and pairs ("x3-x2"), by
+    default all points and neighbouring pairs if there are several sensors and few points. Where no
+    structure can have the parameters found, nothing is simulated.
+    Raises `ValueError` as `diagnose_model` and `locate_force` do.
     """
     found = diagnose_model(model, data, former=former)
+    place = _whereabouts(found, data, model, where)
     if not (simulate and found.effects and found.completed is not None):
-        return DiagnosedTest(found, model)
+        return DiagnosedTest(found, model, where=place)
     simulated = simulated_levels(found, model)
     levels = tuple(each.level for each in simulated.predicted.levels if not each.complete)
     if levels:
         note = Fact("responses_not_complete", levels=levels)
         found = dataclasses.replace(found, notes=(*found.notes, note))
-    return DiagnosedTest(found, model, simulated)
+    return DiagnosedTest(found, model, simulated, place)
+
+
+def _whereabouts(
+    found: Diagnosis, data: SteadyStates, model: Structure, where: Sequence[str]
+) -> Whereabouts | None:
+    """Where the force acts that a model lacks, if it lacks one and there is a choice."""
+    missing = found.verdict not in (Verdict.NOTHING_MISSING, Verdict.NOISE_REJECTED)
+    told = np.isfinite(np.asarray(data.force)).any() and not np.asarray(data.phase_unknown).any()
+    asked = bool(where) or (len(data.sensors) > 1 and few_places(model))
+    return locate_force(data, model, where) if missing and told and asked else None
 
 
 def simulated_levels(diagnosis: Diagnosis, model: Structure) -> SimulatedLevels:

@@ -220,6 +220,12 @@ class DiagnoseOptions:
         "Simulate the responses of the model as given and as completed, for comparison with the "
         "data. Default: for a single file.",
     )
+    where: str = option(
+        "",
+        "Points and pairs at which the missing force may act, as tip,mid,tip-mid. Default: all "
+        "points and neighbouring pairs, if there are several sensors and few points.",
+        "PLACE[,PLACE]",
+    )
     plan: Path | None = option(
         None,
         "Write the measurement that would decide an open answer: a CSV of steady states to be "

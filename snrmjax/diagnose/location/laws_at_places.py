@@ -11,20 +11,22 @@ from scipy.optimize import least_squares
 
 from snrmjax.diagnose.location.source_patterns import SensorRecords, SourceFit, SourcePattern
 from snrmjax.diagnose.misfit.candidates import candidate
-from snrmjax.model.effect_base import AbstractForce
+from snrmjax.model.effect_base import AbstractForce, AbstractHysteresis
 from snrmjax.model.effect_metadata import MotionScales
 from snrmjax.model.effects import EFFECTS, make_effect
+from snrmjax.model.library.friction import AbstractSliders
 from snrmjax.numerics.compiled import compiled
 
-_SAMPLES = 96  # of a cycle
-_HALVINGS = 24  # of the range in which the mean displacement lies
+_FINE = 1024  # samples of a cycle with jumps of the force
+_SAMPLES = 256  # of a cycle
+_SECANTS = 8  # towards the mean displacement, by the Illinois method
 _STEP = 1e-3  # of the motion, of differences of the force by it
 _SMALL = 1e-3  # of 1σ, of differences by the records' errors
 _ROUNDING = 1e-9
 _ROUNDS = 3  # of fits, the first with all errors independent
 
 
-class LawFit(NamedTuple):
+class PlacedLaw(NamedTuple):
     """A law along one row."""
 
     kind: str
@@ -103,11 +105,19 @@ class LawAtPlace(NamedTuple):
         return np.append(values[0] * (share if share > 0 else 1.0), values[1:])
 
 
-def law_fit(kind: str, records: SensorRecords, place: SourcePattern, free: SourceFit) -> LawFit:
+def law_fit(
+    kind: str,
+    records: SensorRecords,
+    place: SourcePattern,
+    free: SourceFit,
+    *,
+    rough: bool = False,
+) -> PlacedLaw:
     """The parameters with which a law along a row explains the sensors best.
 
     The motion along the row is what sensors and linear structure make of it; the law's force along
-    that motion, at the recorded orders, must move the sensors as they did.
+    that motion, at the recorded orders, must move the sensors as they did. A `rough` fit takes the
+    errors of all numbers as independent.
     """
     scales = _scales(records, place, free)
     start = candidate(kind, scales)
@@ -124,7 +134,7 @@ def law_fit(kind: str, records: SensorRecords, place: SourcePattern, free: Sourc
         )
 
     values = min(starts, key=misfit)
-    for turn in range(_ROUNDS):
+    for turn in range(1 if rough else _ROUNDS):
         roots = None if turn == 0 else law.roots(values)
 
         size = np.where(np.abs(values) > 0, np.abs(values), unit)
@@ -140,7 +150,7 @@ def law_fit(kind: str, records: SensorRecords, place: SourcePattern, free: Sourc
         found = least_squares(whitened, values / size, bounds=bounds, max_nfev=30, xtol=1e-6)
         values = found.x * size
     spread = np.sqrt(np.diag(np.linalg.pinv(found.jac.T @ found.jac))) * size
-    return LawFit(
+    return PlacedLaw(
         kind,
         2 * float(found.cost),
         int(law.used.sum()) - len(names),
@@ -190,7 +200,9 @@ def _force(
 ) -> Complex[Array, "state order"]:
     """Some harmonics of a law's force along motions whose mean is what that force itself makes."""
     law = dataclasses.replace(effect, **dict(zip(names, values, strict=True)))
-    tau, order = 2 * np.pi * np.arange(_SAMPLES) / _SAMPLES, np.array(orders)
+    jumps = isinstance(effect, AbstractHysteresis) and not isinstance(effect, AbstractSliders)
+    n_samples = _FINE if jumps else _SAMPLES
+    tau, order = 2 * np.pi * np.arange(n_samples) / n_samples, np.array(orders)
     turn = jnp.exp(1j * order[:, None] * tau)
 
     def one(x: Array, omega: Array) -> Array:
@@ -198,14 +210,26 @@ def _force(
         far = jnp.max(jnp.abs(wave))
 
         def along(mean: Array) -> Array:
-            return law.cycle_force(wave + mean, rate)
+            return law.cycle_force(wave + mean, jnp.asarray(rate))
 
-        def halved(_: int, ends: tuple[Array, Array]) -> tuple[Array, Array]:
-            middle = 0.5 * (ends[0] + ends[1])
-            above = middle + static * jnp.mean(along(middle)) > 0
-            return jnp.where(above, ends[0], middle), jnp.where(above, middle, ends[1])
+        def missed(mean: Array) -> Array:
+            return mean + static * jnp.mean(along(mean))
 
-        low, high = jax.lax.fori_loop(0, _HALVINGS, halved, (-far, far))
-        return jnp.fft.rfft(along(0.5 * (low + high)))[order] * 2 / _SAMPLES
+        def nearer(_: int, ends: tuple[Array, ...]) -> tuple[Array, ...]:
+            low, high, at_low, at_high = ends
+            share = at_low / jnp.where(at_low == at_high, 1.0, at_low - at_high)
+            middle = low + share * (high - low)
+            at = missed(middle)
+            same = at * at_high > 0  # of the end that stays the weight is halved
+            return (
+                jnp.where(same, low, high),
+                middle,
+                jnp.where(same, 0.5 * at_low, at_high),
+                at,
+            )
+
+        ends = -far, far, missed(-far), missed(far)
+        _, mean, *_ = jax.lax.fori_loop(0, _SECANTS, nearer, ends)
+        return jnp.fft.rfft(along(mean))[order] * 2 / n_samples
 
     return jax.vmap(one)(motion, frequency)

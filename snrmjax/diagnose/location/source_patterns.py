@@ -53,7 +53,9 @@ class SensorRecords(NamedTuple):
 def sensor_records(chosen: ComparedColumns) -> SensorRecords:
     """The records of states that are compared with a model."""
     states, n = chosen.states, len(chosen.sensors)
-    known = np.asarray(states.known).reshape(len(chosen.rows), -1, 2).all(axis=2)
+    known: np.ndarray = np.all(
+        np.asarray(states.known).reshape(len(chosen.rows), -1, 2), axis=2, keepdims=False
+    )
     velocity = np.asarray(states.velocity)
     higher = np.moveaxis(np.asarray(states.harmonics), 1, 2)
     own = np.asarray(states.own_std)[:, 2 * n :: 2].reshape(len(velocity), n, -1)

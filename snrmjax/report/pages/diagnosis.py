@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from snrmjax.diagnose.decide import Verdict
 from snrmjax.diagnose.diagnosis_result import Diagnosis
 from snrmjax.diagnose.evidence import NOISE_REJECTED, NONE, UNKNOWN
+from snrmjax.diagnose.location.where import Whereabouts
 from snrmjax.diagnose.misfit.candidates import scales_of_motions
 from snrmjax.diagnose.priors import AS_NOISE
 from snrmjax.diagnose.response_prediction import (
@@ -19,12 +20,13 @@ from snrmjax.diagnose.response_prediction import (
 )
 from snrmjax.diagnose.search.locating import Located
 from snrmjax.diagnose.search.model_search import TriedEffect, beyond_data
-from snrmjax.io.diagnosis_results import summarise_diagnosis
+from snrmjax.io.diagnosis_results import summarise_diagnosis, summarise_whereabouts
 from snrmjax.io.files import write_summary
 from snrmjax.io.models import write_model
 from snrmjax.measure.states import relative_errors
 from snrmjax.model.effect_shape import shape_of
 from snrmjax.model.effects import EFFECTS, effect_class
+from snrmjax.numerics.facts import Fact
 from snrmjax.pipelines.diagnose import DiagnosedTest, SimulatedLevels
 from snrmjax.report.figures.diagnosis import (
     HELD_CAPTION,
@@ -99,7 +101,12 @@ def write(folder: Path, found: DiagnosedTest, *, title: str = "", data: str = ""
     figures = diagnosis_figures(diagnosis)
     if found.simulated is not None:
         figures["responses"] = responses_figure(diagnosis, found.simulated)
-    write_summary(folder / "diagnosis.json", summarise_diagnosis(diagnosis, predicted))
+    summary = summarise_diagnosis(diagnosis, predicted)
+    if found.where is not None:
+        summary |= summarise_whereabouts(found.where)
+        if found.where.told and found.where.places[0].row is not None:
+            write_model(folder / "placed_model.toml", found.where.model)
+    write_summary(folder / "diagnosis.json", summary)
     if diagnosis.completed is not None:
         write_model(folder / "model.toml", diagnosis.completed)
     report = diagnosis_report(
@@ -109,8 +116,20 @@ def write(folder: Path, found: DiagnosedTest, *, title: str = "", data: str = ""
         predicted,
         done={"data": data, "model": found.model.name},
     )
+    if found.where is not None:
+        report = report._replace(sections=[_place_section(found.where), *report.sections])
     write_report(folder / "report.html", report)
     return report
+
+
+def _place_section(where: Whereabouts) -> Section:
+    """The places with their probabilities, and the law that explains the sensors best at each."""
+    rows = []
+    for place in where.places:
+        law = "" if place.law is None else effect_name(place.law.kind)
+        rows.append((place.name, in_words(place.probability), law))
+    table = ReportTable(("place", "probability", "law there"), rows, "Where the force acts")
+    return Section("Where it is", (str(_place(where)),), (), [table])
 
 
 def answer_in_words(diagnosis: Diagnosis) -> str:
@@ -130,7 +149,23 @@ def headline(found: DiagnosedTest) -> list[str]:
     ]
     if diagnosis.decide_by:
         lines.append(f"what would decide: {diagnosis.decide_by}")
+    if found.where is not None:
+        lines.append(str(_place(found.where)))
     return lines
+
+
+def _place(where: Whereabouts) -> Fact:
+    """Where the force acts, as far as it can be told."""
+    first, second = where.places[:2]
+    kind = "force_placed" if where.told else "force_not_placed"
+    return Fact(
+        kind,
+        place=first.name,
+        probability=first.probability,
+        other=second.name,
+        misfit=where.misfit,
+        sensor=where.settled_by,
+    )
 
 
 def responses_figure(diagnosis: Diagnosis, simulated: SimulatedLevels) -> Figure:

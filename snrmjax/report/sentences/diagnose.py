@@ -28,6 +28,7 @@ _COMPLETED = {
     "not_physical": ", but no structure can have these parameters: there is no completed model",
 }
 _UNITS = {"velocity": "m/s", "displacement": "m"}
+_NOT_THERE = 1.5  # times the noise, that the best place leaves
 
 
 def effect_name(kind: str) -> str:
@@ -175,7 +176,27 @@ def _level_force(*, level: int, gain: float, std: float) -> str:
     )
 
 
+def _placed(place: str, probability: float, other: str, misfit: float, sensor: str | None) -> str:
+    where = "on the mode as a whole" if place == "everywhere" else f"at {place}"
+    said = f"the missing force acts {where} ({probability_in_words(probability)})"
+    if misfit > _NOT_THERE:
+        said += f", although what it leaves there is {misfit:.2g} times the noise"
+    return f"{said}."
+
+
+def _not_placed(
+    place: str, probability: float, other: str, misfit: float, sensor: str | None
+) -> str:
+    said = (
+        f"the sensors cannot tell where the missing force acts: {place} "
+        f"({probability_in_words(probability)}) and {other} come first"
+    )
+    return f"{said}." if sensor is None else f"{said}; a sensor at {sensor} would tell them apart."
+
+
 SENTENCES: dict[str, Wording] = {
+    "force_placed": _placed,
+    "force_not_placed": _not_placed,
     # The verdict and what a result says first.
     "verdict": _verdict,
     "level_force": _level_force,
