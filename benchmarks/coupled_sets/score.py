@@ -16,6 +16,7 @@ import tempfile
 import time
 from pathlib import Path
 
+import jax
 import numpy as np
 from generate import gradient
 from scipy.optimize import fsolve
@@ -167,6 +168,7 @@ def main() -> None:
             asked = of_one_sensor(path, Path(folder)) if chosen.one_sensor else path
             lines.append(scored(asked, key))
         tell(**lines[-1])
+        jax.clear_caches()  # every set compiles its own programs
     errors = [e for line in lines for e in line["errors_std"] if e is not None]
     missing = sum(e is None for line in lines for e in line["errors_std"])
     off = [line["left_out"] for line in lines if line["left_out"] is not None]

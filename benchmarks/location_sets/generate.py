@@ -84,7 +84,7 @@ def element(kind, x, v, law):
         6 * k * jnp.maximum(x - gap, 0.0),
         3 * k * (jnp.maximum(x - gap, 0.0) - jnp.maximum(-x - gap, 0.0)),
         d * 3 * np.pi / 8 / law["v"] * jnp.abs(v) * v,
-        d * law["v"] * np.pi / 4 * jnp.tanh(v / (SMOOTH * law["v"])),
+        0.3 * d * law["v"] * np.pi / 4 * jnp.tanh(v / (SMOOTH * law["v"])),
         cubic,
     ]
     return jnp.select([kind == n for n in range(len(forces))], forces)

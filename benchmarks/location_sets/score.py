@@ -12,6 +12,7 @@ import sys
 import time
 from pathlib import Path
 
+import jax
 import numpy as np
 
 import snrmjax as sj
@@ -76,6 +77,8 @@ def main() -> None:
             }
         )
         print(json.dumps(lines[-1]), flush=True)
+        if len(lines) % 10 == 0:
+            jax.clear_caches()
     stated = np.array([line["probability"] for line in lines])
     right = np.array([line["found"] == line["true"] for line in lines])
     bins = []

@@ -19,7 +19,8 @@ from snrmjax.diagnose.location.source_patterns import (
 )
 from snrmjax.identify.calibrate.calibration_states import ComparedColumns, calibration_states
 from snrmjax.measure.states import SteadyStates, check_phases
-from snrmjax.model.effects import make_effect
+from snrmjax.model.effect_base import AbstractForce
+from snrmjax.model.effects import EFFECTS, make_effect
 from snrmjax.model.modes import LinearModes
 from snrmjax.model.places import Row, row_over_points
 from snrmjax.model.structures import Structure
@@ -27,12 +28,6 @@ from snrmjax.numerics.result import AbstractResult, quantity, setting
 
 EVERYWHERE = "everywhere"
 """The place of a force on the modal coordinate of interest: distributed as its inertia is."""
-
-LAWS = (
-    *("cubic_stiffness", "one_sided_stop", "gap_stiffness", "quadratic_damping"),
-    *("cubic_damping", "coulomb_friction", "jenkins_slider"),
-)
-"""Laws that are held against the sensors where their pattern alone does not decide."""
 
 _ORDERS = 9  # harmonics that are looked at, at most
 _FAR = 40.0  # of χ² over its scale, beyond the best: places that no law can bring back
@@ -95,7 +90,7 @@ def locate_force(
     model: Structure,
     candidates: Mapping[str, object] | Sequence[str] = (),
     *,
-    laws: Sequence[str] = LAWS,
+    laws: Sequence[str] = (),
 ) -> Whereabouts:
     """Say at which of some places a force acts that the model lacks.
 
@@ -109,7 +104,7 @@ def locate_force(
     `model` with shapes at the candidates, best from matrices; `candidates` are names of points or
     pairs ("a-b": between a and b), or rows by name; by default all points and neighbouring pairs in
     their order. `EVERYWHERE`, a force on the mode of interest, is always among them. `laws` are
-    kinds of effects.
+    kinds of effects, by default all forces of the library.
     Returns `Whereabouts`. Raises `ValueError` for unknown points, no candidate, unknown phases.
     Validity: one force at one place beside a linear structure that is right.
     """
@@ -125,7 +120,8 @@ def locate_force(
     weight = -0.5 * (square - square.min()) / scale
     near = [name for name, w in zip(rows, weight, strict=True) if w > -_FAR]
     misfit = float(square.min()) / freedom if freedom > 1 else np.nan
-    best, by_law, of_laws = _by_laws(near, records, patterns, fits, laws)
+    kinds = laws or [k for k, effect in EFFECTS.items() if issubclass(effect, AbstractForce)]
+    best, by_law, of_laws = _by_laws(near, records, patterns, fits, kinds)
     if len(near) > 1:
         misfit = of_laws
         weight = np.array([by_law.get(name, -np.inf) for name in rows])
