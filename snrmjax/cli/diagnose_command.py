@@ -86,7 +86,7 @@ def diagnose(
         if not several:
             for said in found.diagnosis.notes:
                 warn(said)
-        say(f"{path.name}: {page.answer_in_words(found.diagnosis)}")
+        say(f"{path.name}: {page.answer_in_words(found)}")
         for line in page.headline(found):
             say(f"  {line}")
     if not several:

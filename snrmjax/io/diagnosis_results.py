@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 
+from snrmjax.diagnose.decide import Verdict
 from snrmjax.diagnose.design.discriminating_test import DiscriminatingTest
 from snrmjax.diagnose.diagnosis_result import Diagnosis
 from snrmjax.diagnose.laws.law_search import DrawnLaw
@@ -10,6 +11,8 @@ from snrmjax.diagnose.location.where import Whereabouts
 from snrmjax.diagnose.response_prediction import LevelResponse
 from snrmjax.diagnose.search.locating import Located
 from snrmjax.model.effect_metadata import Argument
+
+_ALIKE = 0.05  # of the best law's probability: those that the sensors cannot tell from it
 
 
 def summarise_diagnosis(diagnosis: Diagnosis, predicted: Sequence[LevelResponse] = ()) -> dict:
@@ -154,4 +157,29 @@ def summarise_whereabouts(found: Whereabouts) -> dict:
         "where_misfit": found.misfit,
         "where_law": None if law is None else {"kind": law.kind, "parameters": law.parameters},
         "where_settled_by_sensor": None if found.told else found.settled_by,
+    }
+
+
+def placed_answer(found: Whereabouts) -> dict:
+    """The answer of a diagnosis whose effects act on one mode only, where a placed law explains it.
+
+    Parameters are physical (N, m, kg), as those of an effect with `at`.
+    """
+    first = found.places[0]
+    law = first.law
+    if law is None:
+        return {}
+    shares = {kind: first.probability * share for kind, share in first.laws.items()}
+    alike = [kind for kind, share in shares.items() if share > _ALIKE * shares[law.kind]]
+    return {
+        "verdict": Verdict.NAMED.value if len(alike) == 1 else Verdict.AMBIGUOUS.value,
+        "effects": [law.kind],
+        "candidates": [sorted(alike, key=lambda kind: -shares[kind])],
+        "probabilities": {**shares, "elsewhere": 1 - first.probability},
+        "probability": sum(shares[kind] for kind in alike),
+        "decide_by": None,
+        "parameters": {
+            f"{law.kind}.{name}": {"value": value, "std": law.std[name]}
+            for name, value in law.parameters.items()
+        },
     }

@@ -46,6 +46,12 @@ class DiagnosedTest(NamedTuple):
     where: Whereabouts | None = None  # None: nothing is missing, or there is but one place
 
     @property
+    def is_placed(self) -> bool:
+        """Whether a law at one place explains what no effect on the mode alone does."""
+        unknown = self.diagnosis.verdict is Verdict.UNKNOWN
+        return unknown and self.where is not None and self.where.explains
+
+    @property
     def predicted(self) -> tuple[LevelResponse, ...]:
         """The simulated resonances of all levels."""
         return () if self.simulated is None else tuple(self.simulated.predicted.levels)

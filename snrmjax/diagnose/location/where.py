@@ -35,6 +35,7 @@ _SURE = 0.5  # probability from which on a place is named
 _MOST = 16  # candidates that are made unasked
 _HOPELESS = 30.0  # times the best misfit of rough fits, beyond which a law is not fitted
 _FEWEST = 3.0  # numbers that count where no law fits
+_AS_NOISE = 1.2  # times the noise, up to which a law leaves no more than that
 _STILL = 0.02  # of the largest motion, below which a row says nothing
 
 
@@ -45,6 +46,7 @@ class PlacedForce(NamedTuple):
     row: Row | None  # None: everywhere
     probability: float
     law: PlacedLaw | None  # the best one; None where the sensors' pattern rules the place out
+    laws: dict[str, float]  # probabilities of laws there, if the force is of one of them
 
 
 class Whereabouts(AbstractResult):
@@ -62,6 +64,13 @@ class Whereabouts(AbstractResult):
     name: tuple[str, ...] = quantity("place", "", "place", name="place", static=True)
     probability: Float[np.ndarray, " place"] = quantity("place", "1", "probability")
     misfit: float = setting()
+
+    @property
+    def explains(self) -> bool:
+        """Whether a law at one place, and no distributed one, leaves no more than noise."""
+        first = self.places[0]
+        law = first.law is not None and first.law.chi_square < _AS_NOISE**2 * first.law.freedom
+        return self.told and first.row is not None and law
 
     @property
     def told(self) -> bool:
@@ -130,7 +139,7 @@ def locate_force(
     order = np.argsort(-probability, kind="stable")
     names = tuple(list(rows)[k] for k in order)
     places = tuple(
-        PlacedForce(name, rows[name][0], float(p), best.get(name))
+        PlacedForce(name, rows[name][0], float(p), *best.get(name, (None, {})))
         for name, p in zip(names, probability[order], strict=True)
     )
     return Whereabouts(
@@ -188,7 +197,7 @@ def _by_laws(
     patterns: Mapping[str, SourcePattern],
     fits: Mapping[str, SourceFit],
     laws: Sequence[str],
-) -> tuple[dict[str, PlacedLaw], dict[str, float], float]:
+) -> tuple[dict[str, tuple[PlacedLaw, dict[str, float]]], dict[str, float], float]:
     """The best law of every place, the logarithms of their evidence, and what the best leaves."""
     pairs = [(name, kind) for name in near for kind in laws]
     rough = [
@@ -205,11 +214,15 @@ def _by_laws(
     scale = max(1.0, least.chi_square / least.freedom)
     # Where no law fits, what is left is no noise: then few numbers count, as of Student's t.
     counts = max(least.freedom / scale, _FEWEST)
-    evidence = {}
+    evidence, best = {}, {}
     for name, there in found.items():
         worse = np.array([fit.chi_square / least.chi_square for fit in there])
-        evidence[name] = float(np.logaddexp.reduce(-0.5 * counts * np.log(worse)))
-    best = {name: min(there, key=lambda fit: fit.chi_square) for name, there in found.items()}
+        # A parameter more costs what it explains of noise alone.
+        terms = -0.5 * counts * np.log(worse) - np.array([len(fit.std) for fit in there])
+        evidence[name] = float(np.logaddexp.reduce(terms))
+        shares = np.exp(terms - evidence[name])
+        kinds = {fit.kind: float(share) for fit, share in zip(there, shares, strict=True)}
+        best[name] = there[int(np.argmax(shares))], kinds
     return best, evidence, least.chi_square / least.freedom
 
 

@@ -20,7 +20,7 @@ from snrmjax.diagnose.response_prediction import (
 )
 from snrmjax.diagnose.search.locating import Located
 from snrmjax.diagnose.search.model_search import TriedEffect, beyond_data
-from snrmjax.io.diagnosis_results import summarise_diagnosis, summarise_whereabouts
+from snrmjax.io.diagnosis_results import placed_answer, summarise_diagnosis, summarise_whereabouts
 from snrmjax.io.files import write_summary
 from snrmjax.io.models import write_model
 from snrmjax.measure.states import relative_errors
@@ -104,10 +104,12 @@ def write(folder: Path, found: DiagnosedTest, *, title: str = "", data: str = ""
     summary = summarise_diagnosis(diagnosis, predicted)
     if found.where is not None:
         summary |= summarise_whereabouts(found.where)
-        if found.where.told and found.where.places[0].row is not None:
-            write_model(folder / "placed_model.toml", found.where.model)
+        if found.is_placed:
+            summary |= placed_answer(found.where)
     write_summary(folder / "diagnosis.json", summary)
-    if diagnosis.completed is not None:
+    if found.where is not None and found.where.explains:
+        write_model(folder / "model.toml", found.where.model)
+    elif diagnosis.completed is not None:
         write_model(folder / "model.toml", diagnosis.completed)
     report = diagnosis_report(
         diagnosis,
@@ -132,8 +134,11 @@ def _place_section(where: Whereabouts) -> Section:
     return Section("Where it is", (str(_place(where)),), (), [table])
 
 
-def answer_in_words(diagnosis: Diagnosis) -> str:
+def answer_in_words(found: DiagnosedTest) -> str:
     """The verdict with the effects of the answer, or of the best attempt."""
+    diagnosis, where = found.diagnosis, found.where
+    if found.is_placed and where is not None and where.places[0].law is not None:
+        return f"{Verdict.NAMED} ({where.places[0].law.kind} at {where.places[0].name})"
     effects = ", ".join(diagnosis.effects)
     if effects:
         effects = f" ({effects})" if diagnosis.verdict.is_answer else f"; best attempt: {effects}"
@@ -147,11 +152,19 @@ def headline(found: DiagnosedTest) -> list[str]:
         diagnosis.verdict_sentence,
         f"probability: {diagnosis.most_probable()}",
     ]
-    if diagnosis.decide_by:
+    if found.is_placed and found.where is not None:
+        lines = [str(Fact("placed_law_explains", kind=_kind_at(found.where)))]
+    elif diagnosis.decide_by:
         lines.append(f"what would decide: {diagnosis.decide_by}")
     if found.where is not None:
         lines.append(str(_place(found.where)))
     return lines
+
+
+def _kind_at(where: Whereabouts) -> str:
+    """The kind of law at the first place."""
+    law = where.places[0].law
+    return "" if law is None else law.kind
 
 
 def _place(where: Whereabouts) -> Fact:

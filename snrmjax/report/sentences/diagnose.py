@@ -196,6 +196,10 @@ def _not_placed(
 
 SENTENCES: dict[str, Wording] = {
     "force_placed": _placed,
+    "placed_law_explains": lambda kind: (
+        f"effects on the mode alone do not explain the states, {effect_name(kind)} at one "
+        "place does, to the noise."
+    ),
     "force_not_placed": _not_placed,
     # The verdict and what a result says first.
     "verdict": _verdict,

@@ -1,0 +1,83 @@
+"""The place of a force; truth from a harmonic balance of a chain of its own."""
+
+import numpy as np
+import pytest
+from truths import two_modes
+from truths.chain_states import steady_states, structure
+
+import snrmjax as sj
+from snrmjax.io.diagnosis_results import placed_answer, summarise_whereabouts
+
+ROW = (0.0, -1.0, 1.0, 0.0)  # x3 less x2
+CUBIC = 2e7  # N/m³
+LAWS = ("cubic_stiffness", "quadratic_damping", "cubic_damping")  # all would take half a minute
+
+
+def hardening(x, v):
+    return CUBIC * x**3
+
+
+def drag(x, v):
+    return 3.0 * np.abs(v) * v
+
+
+@pytest.mark.parametrize("law", [hardening, drag])
+def test_sensors_tell_the_place_without_a_law(law):
+    sensors = ("x1", "x2", "x4")
+    data, model = steady_states(ROW, law, sensors), structure(sensors)
+    candidates = ("x1", "x2", "x3", "x4", "x2-x1", "x3-x2", "x4-x3")
+    found = sj.diagnose.locate_force(data, model, candidates, laws=LAWS)
+    assert found.told
+    assert found.places[0].name == "x3-x2"
+    assert found.probability.sum() == pytest.approx(1.0, abs=1e-12)
+    # What is left is noise: 18 states of 5 orders and 3 sensors, 1σ of the root about 0.04.
+    assert 0.8 < found.misfit < 1.2
+
+
+def test_one_sensor_tells_it_by_the_law():
+    data, model = steady_states(ROW, hardening, ("x4",)), structure(("x4",))
+    candidates = ("x1", "x3-x2", "x2", "x4", "x4-x3")
+    found = sj.diagnose.locate_force(data, model, candidates, laws=LAWS)
+    assert found.places[0].name == "x3-x2"
+    law = found.places[0].law
+    assert law.kind == "cubic_stiffness"
+    (value,), (std,) = law.parameters.values(), law.std.values()
+    assert abs(value - CUBIC) < 3.3 * std
+    assert std < 0.05 * CUBIC
+    assert found.explains
+    assert found.model.effects[0].at == (("x3", 1.0), ("x2", -1.0))
+    told = summarise_whereabouts(found)
+    assert sum(told["where"].values()) == pytest.approx(1.0)
+    answer = placed_answer(found)
+    assert answer["effects"] == ["cubic_stiffness"]
+    assert sum(answer["probabilities"].values()) == pytest.approx(1.0)
+
+
+def test_a_force_on_the_mode_is_everywhere():
+    data = two_modes.steady_states({(4, 0): 2e4}, noise=3e-3, seed=2)
+    found = sj.diagnose.locate_force(data, two_modes.structure(), laws=LAWS)
+    assert found.places[0].name == sj.diagnose.EVERYWHERE
+    assert found.told
+    assert not found.explains
+
+
+def test_places_behind_one_sensor_want_another():
+    # Both sensors are on one side: a drag at x3 and at x4 moves them alike.
+    sensors = ("x1", "x2")
+    data, model = steady_states((0, 0, 0, 1.0), drag, sensors), structure(sensors)
+    found = sj.diagnose.locate_force(data, model, ("x3", "x4", "x1"), laws=LAWS)
+    assert set(found.name[:2]) == {"x3", "x4"}
+    assert found.settled_by in ("x3", "x4")
+
+
+def test_what_cannot_be_placed_is_told():
+    data, model = steady_states(ROW, hardening, ("x1", "x2")), structure(("x1", "x2"))
+    with pytest.raises(ValueError, match="'x9', where the modes have no shape"):
+        sj.diagnose.locate_force(data, model, ("x9",))
+    unknown = sj.measure.steady_states(
+        *(data.level, data.frequency, data.force, data.velocity),
+        phase_std=np.full((data.n_states, 2), np.pi),
+        sensors=data.sensors,
+    )
+    with pytest.raises(ValueError, match="needs the phases"):
+        sj.diagnose.locate_force(unknown, model)
