@@ -15,7 +15,8 @@ Asked = TypeVar("Asked")
 Model = Annotated[
     Path,
     typer.Argument(
-        help="Structure to simulate (TOML): modes, potential, effects.",
+        help="Structure to simulate (TOML): modes, potential, effects; or matrices, "
+        "with elements at points.",
         metavar="MODEL",
         show_default=False,
     ),

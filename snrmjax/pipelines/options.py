@@ -224,7 +224,7 @@ class DiagnoseOptions:
         "",
         "Points and pairs at which the missing force may act, as tip,mid,tip-mid. Default: all "
         "points and neighbouring pairs, if there are several sensors and few points.",
-        "PLACE[,PLACE]",
+        "PLACES",
     )
     plan: Path | None = option(
         None,

@@ -24,6 +24,7 @@ from snrmjax.model.effects import EFFECTS, make_effect
 from snrmjax.model.modes import LinearModes
 from snrmjax.model.places import Row, row_over_points
 from snrmjax.model.structures import Structure
+from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, quantity, setting
 
 EVERYWHERE = "everywhere"
@@ -64,6 +65,25 @@ class Whereabouts(AbstractResult):
     name: tuple[str, ...] = quantity("place", "", "place", name="place", static=True)
     probability: Float[np.ndarray, " place"] = quantity("place", "1", "probability")
     misfit: float = setting()
+
+    @property
+    def words(self) -> Fact:
+        """Where the force acts, as far as it can be told."""
+        first, second = self.places[:2]
+        return Fact(
+            "force_placed" if self.told else "force_not_placed",
+            place=first.name,
+            probability=first.probability,
+            other=second.name,
+            misfit=self.misfit,
+            sensor=self.settled_by,
+        )
+
+    @property
+    def answer(self) -> Fact:
+        """What explains the states where no effect on the mode alone does."""
+        law = self.places[0].law
+        return Fact("placed_law_explains", kind="" if law is None else law.kind)
 
     @property
     def explains(self) -> bool:

@@ -26,7 +26,6 @@ from snrmjax.io.models import write_model
 from snrmjax.measure.states import relative_errors
 from snrmjax.model.effect_shape import shape_of
 from snrmjax.model.effects import EFFECTS, effect_class
-from snrmjax.numerics.facts import Fact
 from snrmjax.pipelines.diagnose import DiagnosedTest, SimulatedLevels
 from snrmjax.report.figures.diagnosis import (
     HELD_CAPTION,
@@ -131,7 +130,7 @@ def _place_section(where: Whereabouts) -> Section:
         law = "" if place.law is None else effect_name(place.law.kind)
         rows.append((place.name, in_words(place.probability), law))
     table = ReportTable(("place", "probability", "law there"), rows, "Where the force acts")
-    return Section("Where it is", (str(_place(where)),), (), [table])
+    return Section("Where it is", (str(where.words),), (), [table])
 
 
 def answer_in_words(found: DiagnosedTest) -> str:
@@ -153,32 +152,12 @@ def headline(found: DiagnosedTest) -> list[str]:
         f"probability: {diagnosis.most_probable()}",
     ]
     if found.is_placed and found.where is not None:
-        lines = [str(Fact("placed_law_explains", kind=_kind_at(found.where)))]
+        lines = [str(found.where.answer)]
     elif diagnosis.decide_by:
         lines.append(f"what would decide: {diagnosis.decide_by}")
     if found.where is not None:
-        lines.append(str(_place(found.where)))
+        lines.append(str(found.where.words))
     return lines
-
-
-def _kind_at(where: Whereabouts) -> str:
-    """The kind of law at the first place."""
-    law = where.places[0].law
-    return "" if law is None else law.kind
-
-
-def _place(where: Whereabouts) -> Fact:
-    """Where the force acts, as far as it can be told."""
-    first, second = where.places[:2]
-    kind = "force_placed" if where.told else "force_not_placed"
-    return Fact(
-        kind,
-        place=first.name,
-        probability=first.probability,
-        other=second.name,
-        misfit=where.misfit,
-        sensor=where.settled_by,
-    )
 
 
 def responses_figure(diagnosis: Diagnosis, simulated: SimulatedLevels) -> Figure:
