@@ -17,6 +17,7 @@ LONG = (
     "07_models_from_finite_elements",
     "08_from_laboratory_files",
     "09_the_fields_other_methods",
+    "10_joints_and_coupled_modes",
 )  # a minute and more
 PATHS = [
     pytest.param(path, marks=[pytest.mark.long] if path.stem in LONG else [], id=path.stem)

@@ -70,14 +70,16 @@ class Whereabouts(AbstractResult):
     def words(self) -> Fact:
         """Where the force acts, as far as it can be told."""
         first, second = self.places[:2]
-        return Fact(
-            "force_placed" if self.told else "force_not_placed",
-            place=first.name,
-            probability=first.probability,
-            other=second.name,
-            misfit=self.misfit,
-            sensor=self.settled_by,
-        )
+        values = {
+            "place": first.name,
+            "probability": first.probability,
+            "other": second.name,
+            "misfit": self.misfit,
+            "sensor": self.settled_by,
+        }
+        if self.told:
+            return Fact("force_placed", **values)
+        return Fact("force_not_placed", **values)
 
     @property
     def answer(self) -> Fact:

@@ -26,6 +26,7 @@ from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
 
 _NEAR = 0.15  # relative detuning up to which a harmonic can excite a mode much
 _COUPLED = 0.5  # probability from which on modes are said to be coupled
+_EVEN = 2  # the harmonic that cubic terms of a potential make
 _SEEN = 5.0  # standard errors of another mode's motion, and
 _STRONG = 5e-3  # its share of the mode of interest's, from which on it is looked at unasked
 
@@ -109,8 +110,9 @@ def coupled_modes(
     there follows from their evidence; these are fitted once more.
 
     Arguments: `data` of sensors that see both modes, best two or more with harmonics and their
-    errors; `model` with both modes, its potential the terms that are known already (fitted too).
-    Frequencies and damping ratios whose 1σ the model states are fitted within it.
+    errors; without the second harmonic neither 1:2 nor cubic terms are looked for. `model` with
+    both modes, its potential the terms that are known already (fitted too). Frequencies and damping
+    ratios whose 1σ the model states are fitted within it.
     `level_gain_std` (relative) and `level_phase_std` (rad) as `calibrate_model` has them.
     Returns `CoupledModes`; without a mode near a harmonic its `interactions` are empty and the
     mode's own stiffness is fitted.
@@ -129,6 +131,9 @@ def coupled_modes(
     looked = []
     for pair in _candidates(data, model):
         terms = coupling_terms(pair.mode, pair.other, pair.ratio)
+        if not _even_recorded(data):
+            # From zero a cubic term moves the fundamental to second order only.
+            terms = tuple(term for term in terms if sum(term.powers) % 2 == 0)
         fit = _fitted(data, model, [term.key for term in terms], (pair.mode, pair.other), settings)
         chosen = _chosen(data, model, terms, fit)
         looked.append((pair._replace(probability=chosen.coupled), terms, chosen, fit))
@@ -167,7 +172,7 @@ def _candidates(data: SteadyStates, model: Structure) -> list[Interaction]:
             for ratio in RATIOS
         }
         ratio = min(away, key=lambda r: away[r])
-        if away[ratio] > _NEAR:
+        if away[ratio] > _NEAR or (ratio == _EVEN and not _even_recorded(data)):
             continue
         pair = Interaction(j, k, ratio, away[ratio], np.nan, np.nan)
         found.append(pair._replace(share=_share(data, model, pair)))
@@ -204,6 +209,11 @@ def _forced(data: SteadyStates, model: Structure, k: int) -> Complex[np.ndarray,
     natural, ratio = modes.natural_frequency.item(k), modes.damping_ratio.item(k)
     stiffness = natural**2 - omega**2 + 2j * ratio * natural * omega
     return 1j * omega * modes.participation.item(k) * np.asarray(data.force) / stiffness
+
+
+def _even_recorded(data: SteadyStates) -> bool:
+    """Whether the second harmonic was recorded, with its error."""
+    return _EVEN in data.harmonic_order and bool(np.any(np.asarray(data.harmonic_std) > 0))
 
 
 def _share(data: SteadyStates, model: Structure, pair: Interaction) -> float:

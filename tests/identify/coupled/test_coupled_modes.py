@@ -36,6 +36,21 @@ def test_the_interaction_is_recognised(terms, modes, ratio):
         assert (found.interaction.other, found.interaction.ratio) == (1, ratio)
 
 
+def test_fundamentals_of_two_sensors_do():
+    data = steady_states(ONE, noise=3e-3, seed=1, modes=CLOSE)
+    alone = sj.measure.steady_states(
+        *(data.level, data.frequency, data.force, data.velocity),
+        velocity_std=data.velocity_std,
+        phase_std=data.phase_std,
+        sensors=data.sensors,
+    )
+    found = sj.identify.coupled_modes(alone, structure(modes=CLOSE), harmonic_order=5)
+    assert found.coupled
+    assert found.calibration.state_converged.all()
+    k = found.calibration.names.index("potential.1122")
+    assert abs(found.calibration.values[k] - ONE[2, 2]) < 3.3 * found.calibration.std[k]
+
+
 def test_evidence_of_terms_is_that_of_integrals():
     # Two terms, one measured to be 3 ± 1, the other unseen: by quadrature over both coefficients.
     terms = coupling_terms(0, 1, 3)[:2]
