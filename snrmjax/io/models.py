@@ -10,9 +10,9 @@ from snrmjax.io.files import FilePath, file_name, read_text, shown, write_atomic
 from snrmjax.io.structure_matrices import listed_sensors, structure_of_matrices
 from snrmjax.io.toml_table import TomlTable, parsed_toml
 from snrmjax.io.units import DEGREE, HERTZ, in_unit
-from snrmjax.model.effect_base import AbstractEffect
+from snrmjax.model.effect_base import AbstractEffect, AbstractForce
 from snrmjax.model.effect_metadata import Entries
-from snrmjax.model.effects import effect_class, known_effects, make_effect
+from snrmjax.model.effects import SURFACES, effect_class, known_effects, make_effect
 from snrmjax.model.modes import (
     UNSTATED_MODAL_MASS_STD,
     Beside,
@@ -71,8 +71,9 @@ def read_model(path: FilePath) -> Structure:
     counts from zero. The sensors are those of the modes' shapes, in the first mode's order; a
     model without a name takes the file's. A mode may state the 1σ of its linear test:
     `frequency_std_hz`, `damping_ratio_std` and, relative, `modal_mass_std`. Effects act on the mode
-    of interest, or at points by `at` or `between`, in N and m. In place of modes a file may have
-    matrices (see `from_matrices`; or `file`, an NPZ or MAT file with such arrays):
+    of interest, or at points by `at` or `between`, in N and m; `normal_at` or `normal_between` say
+    where a contact is pressed. In place of modes a file may have matrices (see `from_matrices`; or
+    `file`, an NPZ or MAT file with such arrays):
 
         [structure]
         points = ["a", "b"]
@@ -110,7 +111,8 @@ def _read(text: str, file: str, path: Path) -> Structure:
         modes = _modes(top, file)
         potential = _potential(top.table("potential", f"[potential] of {file}"), modes.n_modes)
         for k, effect in enumerate(effects, 1):
-            for point, _ in getattr(effect, "at", None) or ():
+            rows = effect.rows if isinstance(effect, AbstractForce) else ()
+            for point, _ in (pair for row in rows if row is not None for pair in row):
                 _check_point(modes, point, f"effect {k} of {file}")
     return structure(
         modes,
@@ -273,7 +275,8 @@ def _effect(table: TomlTable) -> AbstractEffect:
         raise ValueError(f"{table.place} has the unknown kind {shown(kind)}{near}.")
     wanted = effect_class(kind).parameters()
     table = TomlTable(table.entries, f"{table.place} ({kind})")
-    table.check_keys(("kind", *wanted), ("at", "between"))
+    across = ("normal_at", "normal_between") if kind in SURFACES else ()
+    table.check_keys(("kind", *wanted), ("at", "between", *across))
     values: dict[str, float | np.ndarray] = {
         name: table.number(name, *parameter.rules)
         if parameter.entries is Entries.ONE
@@ -281,24 +284,25 @@ def _effect(table: TomlTable) -> AbstractEffect:
         for name, parameter in wanted.items()
     }
     try:
-        return make_effect(kind, values, at=_row(table))
+        return make_effect(kind, values, at=_row(table), normal_at=_row(table, "normal_"))
     except ValueError as error:
         raise ValueError(f"{table.place} cannot be read: {error}") from error
 
 
-def _row(table: TomlTable) -> Row | None:
+def _row(table: TomlTable, side: str = "") -> Row | None:
     """Where an effect acts: `at` a point or points with weights, `between` two points."""
-    if "at" in table.entries and "between" in table.entries:
-        raise ValueError(f"{table.place} has both `at` and `between`.")
-    if "between" in table.entries:
-        two = table.entries["between"]
+    one, pair = f"{side}at", f"{side}between"
+    if one in table.entries and pair in table.entries:
+        raise ValueError(f"{table.place} has both `{one}` and `{pair}`.")
+    if pair in table.entries:
+        two = table.entries[pair]
         if not isinstance(two, list) or len(two) != 2 or not all(isinstance(p, str) for p in two):
-            raise table.refusal("between", "two points", two)
+            raise table.refusal(pair, "two points", two)
         return between(*two)
-    at = table.entries.get("at")
+    at = table.entries.get(one)
     if at is None or isinstance(at, str):
         return None if at is None else row_over_points(at)
-    weights = table.table("at", f"`at` of {table.place}")
+    weights = table.table(one, f"`{one}` of {table.place}")
     return row_over_points({point: weights.number(point) for point in weights.entries})
 
 
@@ -385,9 +389,10 @@ def _effect_entry(effect: AbstractEffect) -> dict[str, object]:
     if effect.kind not in known_effects():
         raise ValueError(f"an effect to be written must be of a known kind, not {effect.kind!r}.")
     entry: dict[str, object] = {"kind": effect.kind}
-    at = getattr(effect, "at", None)
-    if at is not None:
-        entry |= {"at": at[0][0] if len(at) == 1 and at[0][1] == 1 else dict(at)}
+    for side in ("at", "normal_at"):
+        row = getattr(effect, side, None)
+        if row is not None:
+            entry[side] = row[0][0] if len(row) == 1 and row[0][1] == 1 else dict(row)
     for name, parameter in effect_class(effect.kind).parameters().items():
         value = getattr(effect, name)
         entry[name] = (

@@ -35,6 +35,8 @@ from snrmjax.model.potential import PolynomialPotential
 Scalar = Float[Array, ""]
 Samples = Float[Array, " time"]
 States = Float[Array, " state"]
+StateAt = Float[Array, ""] | Float[Array, " row"]
+"""What a force acts on: one number, or one for every row of a force at several."""
 Starts = list[tuple[float, ...]]
 """Parameters, in the order of the constructor, from which a fit begins."""
 Bounds = list[tuple[float, float]]
@@ -150,6 +152,14 @@ class AbstractForce(AbstractEffect):
 
     at: Row | None = eqx.field(default=None, static=True, kw_only=True, converter=checked_row)
 
+    @property
+    def rows(self) -> tuple[Row | None, ...]:
+        """The rows on which it acts: one, but for contacts that move along and across a surface.
+
+        With several, displacements, velocities and forces have a last axis for them.
+        """
+        return (self.at,)
+
     @abstractmethod
     def cycle_force(self, displacement: Samples, velocity: Samples) -> Samples:
         """The force at equally spaced samples of one period of a steady motion.
@@ -208,6 +218,8 @@ class AbstractHysteresis(AbstractForce):
     and apply `state_force`.
     """
 
+    held_in_steps: ClassVar[bool] = False
+
     def scaled_for(self, displacement: Scalar, velocity: Scalar) -> Self:
         """The same effect, set for integration in time of motions up to these amplitudes.
 
@@ -219,13 +231,35 @@ class AbstractHysteresis(AbstractForce):
     def initial_states(self) -> States:
         """The internal states of a structure that has not moved yet."""
 
+    def states_at_rest(self, displacement: StateAt) -> States:
+        """The internal states of a structure that was brought to a displacement and held there."""
+        return self.initial_states()
+
     @abstractmethod
-    def state_force(self, displacement: Scalar, velocity: Scalar, states: States) -> Scalar:
+    def state_force(self, displacement: StateAt, velocity: StateAt, states: States) -> StateAt:
         """The force for given internal states, in kg^1/2 m/s²."""
 
     @abstractmethod
-    def state_rate(self, displacement: Scalar, velocity: Scalar, states: States) -> States:
-        """Rates of the internal states, per second."""
+    def state_rate(self, displacement: StateAt, velocity: StateAt, states: States) -> States:
+        """Rates of the internal states, per second; not asked for with `held_in_steps`."""
+
+    def after_step(
+        self,
+        states: States,
+        begin: tuple[StateAt, StateAt],
+        end: tuple[StateAt, StateAt],
+        time: Array,
+    ) -> States:
+        """The internal states after a step of an integrator, from what it makes of them.
+
+        Arguments: displacement and velocity at the `begin` and at the `end` of a step of `time` s.
+        Effects with `held_in_steps`, whose states jump from holding to following, set them here.
+        """
+        return states
+
+    def stuck_stiffness(self) -> Float[Array, " row"]:
+        """The largest stiffness along every row, in 1/s²: what a step of an integrator resolves."""
+        return jnp.zeros(len(self.rows))
 
     @abstractmethod
     def settled_states(

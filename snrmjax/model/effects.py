@@ -20,11 +20,17 @@ from snrmjax.model.library.free_laws import (
     UnevenStiffnessLaw,
 )
 from snrmjax.model.library.friction import CoulombFriction, IwanMicroslip, JenkinsSlider
+from snrmjax.model.library.hysteresis import BoucWen, FrictionContact
 from snrmjax.model.library.internal_resonances import (
     InternalResonanceOneToThree,
     InternalResonanceOneToTwo,
 )
-from snrmjax.model.library.joints import FourParameterIwan, RegularisedFriction, SpringLinkage
+from snrmjax.model.library.joints import (
+    FourParameterIwan,
+    RegularisedFriction,
+    SpringLinkage,
+    StaticLoad,
+)
 from snrmjax.model.library.linear_changes import (
     AddedMass,
     FrequencyDrift,
@@ -127,9 +133,20 @@ LAWS: dict[str, type[AbstractLaw]] = {
 """The laws given by a table of knots, by their kind: drawn where no effect of the library holds."""
 
 ELEMENTS: dict[str, type[AbstractEffect]] = EffectTable(
-    (element.kind, element) for element in (RegularisedFriction, SpringLinkage, FourParameterIwan)
+    (element.kind, element)
+    for element in (
+        RegularisedFriction,
+        SpringLinkage,
+        StaticLoad,
+        FourParameterIwan,
+        BoucWen,
+        FrictionContact,
+    )
 )
 """Further forces for points of a structure, by their kind; a diagnosis does not look for them."""
+
+SURFACES = (FrictionContact.kind,)
+"""Kinds of elements that act across a surface, `normal_at`, and along it, `at`."""
 
 # `help(EFFECTS)` shows the docstring of its class.
 EffectTable.__doc__ = f"{EffectTable.__doc__}\n\n{EFFECTS!r}"
@@ -187,11 +204,13 @@ def make_effect(
     parameters: Mapping[str, float | Array | np.ndarray],
     *,
     at: str | Mapping[str, float] | Row | None = None,
+    normal_at: str | Mapping[str, float] | Row | None = None,
 ) -> AbstractEffect:
     """Build an effect from its kind and its parameters by name.
 
     `at` is a point, a row such as `between("tip", "root")`, or points with weights: there a force
-    acts, with parameters in N and m; without it on the mode of interest.
+    acts, with parameters in N and m; without it on the mode of interest. `normal_at`, likewise, is
+    where a contact that moves across its surface too is pressed.
 
     Raises `ValueError` for an unknown kind, for an unknown, a missing and a non-finite parameter,
     for one out of its range (traced parameters are not looked at), and for a law whose tables
@@ -211,11 +230,13 @@ def make_effect(
         require(f"`{name}` of {kind}", value, *wanted[name].rules)
     arrays = {k: jnp.asarray(v, dtype=jnp.float64) for k, v in parameters.items()}
     _check_tables(kind, arrays)
-    if at is None:
-        return effect_class(kind)(**arrays)
-    if not issubclass(effect_class(kind), AbstractForce):
+    places = {"at": at, "normal_at": normal_at}
+    given = {name: row_over_points(row) for name, row in places.items() if row is not None}
+    if given and not issubclass(effect_class(kind), AbstractForce):
         raise ValueError(f"{kind} is no force: it cannot act at a point.")
-    return effect_class(kind)(**arrays, at=row_over_points(at))
+    if normal_at is not None and kind not in SURFACES:
+        raise ValueError(f"{kind} acts at one place: it takes no `normal_at`.")
+    return effect_class(kind)(**arrays, **given)
 
 
 def _check_tables(kind: str, arrays: Mapping[str, Array]) -> None:

@@ -83,12 +83,14 @@ class Structure(eqx.Module):
         lines = [f"Structure {self.name!r}", *repr(self.modes).splitlines()]
         lines.append(f"polynomial potential: {terms}")
         for effect in self.effects:
-            row = effect.at if isinstance(effect, AbstractForce) else None
+            rows = effect.rows if isinstance(effect, AbstractForce) else (None,)
             values = [
-                f"{name} {_text(getattr(effect, name))} {unit_at(row, of.unit)}".removesuffix(" 1")
+                f"{name} {_text(getattr(effect, name))} {unit}".removesuffix(" 1")
                 for name, of in effect.parameters().items()
+                for unit in [unit_at(rows[0], of.unit)]
             ]
-            where = "" if row is None else f" at {row_text(row)}"
+            texts = [row_text(row) for row in rows if row is not None]
+            where = f" at {', pressed at '.join(texts)}" if texts else ""
             lines.append(f"effect {effect.kind}{where}: {', '.join(values)}")
         names = ("relative gain", "phase (rad)", "natural frequency (rad/s)", "damping ratio")
         stated = [f"{n} {s:.3g}" for n, s in zip(names, self.level_stds, strict=True) if s > 0]

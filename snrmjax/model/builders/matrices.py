@@ -9,7 +9,7 @@ import scipy.sparse
 import scipy.sparse.linalg
 from jaxtyping import Float
 
-from snrmjax.model.effect_base import AbstractEffect, checked_effects
+from snrmjax.model.effect_base import AbstractEffect, AbstractForce, checked_effects
 from snrmjax.model.modes import Beside, RigidBodyModes, linear_modes
 from snrmjax.model.places import Row, row_over_points
 from snrmjax.model.structures import Structure, structure
@@ -82,7 +82,8 @@ def from_matrices(
     names = tuple(points) if points is not None else tuple(f"x{i + 1}" for i in range(size))
     _check_names(names, size)
     made = checked_effects(effects)
-    places = dict.fromkeys(at for e in made if (at := getattr(e, "at", None)) is not None)
+    forces = [effect for effect in made if isinstance(effect, AbstractForce)]
+    places = dict.fromkeys(row for e in forces for row in e.rows if row is not None)
     rows = [_column(names, row, "an effect") for row in places]
     load = _column(names, force, "`force`")
     squared, shapes, rigid = _modes(m, k, n_modes)

@@ -104,6 +104,8 @@ def slipped_position(
 class AbstractSliders(AbstractHysteresis):
     """Friction by sliders side by side; the states are their positions in kg^1/2 m."""
 
+    held_in_steps: ClassVar[bool] = True
+
     @abstractmethod
     def sliders(self) -> Sliders:
         """The sliders, for integration in time."""
@@ -112,8 +114,14 @@ class AbstractSliders(AbstractHysteresis):
         """What the stuck sliders add to the structure: of a force at points all their springs."""
         return jnp.zeros(()) if self.at is None else jnp.sum(self.sliders().stiffness)
 
+    def stuck_stiffness(self) -> Float[Array, " row"]:
+        return self.added_stiffness()[None]
+
     def initial_states(self) -> States:
         return jnp.zeros_like(self.sliders().slip_displacement)
+
+    def states_at_rest(self, displacement: Scalar) -> States:
+        return self.moved_states(displacement, self.initial_states())
 
     def state_force(self, displacement: Scalar, velocity: Scalar, states: States) -> Scalar:
         """Errors of an integrator's positions are removed."""
@@ -127,12 +135,19 @@ class AbstractSliders(AbstractHysteresis):
         return jnp.where(dragged, velocity, 0.0)
 
     def moved_states(self, displacement: Scalar, states: States) -> States:
-        """Positions after q went to `displacement` without turning: exact, unlike an integrator.
-
-        An integrator of fixed steps does best to call this after each of them.
-        """
+        """Positions after q went to `displacement` without turning: exact, unlike an integrator."""
         slip = self.sliders().slip_displacement
         return jnp.clip(states, displacement - slip, displacement + slip)
+
+    def after_step(
+        self, states: States, begin: tuple[Array, Array], end: tuple[Array, Array], time: Array
+    ) -> States:
+        """Positions after a step, a turning point within which is passed."""
+        (x0, v0), (x1, v1) = begin, end
+        turns = v0 * v1 < 0
+        until = time * v0 / jnp.where(turns, v0 - v1, 1.0)
+        turning = jnp.where(turns, x0 + 0.5 * v0 * until, x0)
+        return self.moved_states(x1, self.moved_states(turning, states))
 
     def settled_states(
         self, displacement: Samples, velocity: Samples

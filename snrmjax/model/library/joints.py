@@ -47,6 +47,18 @@ class SpringLinkage(AbstractMemoryless):
         return self.stiffness * displacement * (1 - self.free_length / now)
 
 
+class StaticLoad(AbstractMemoryless):
+    """A constant force that pulls a point, as a weight or a bolt does: `load` F, along +x."""
+
+    kind: ClassVar[str] = "static_load"
+    description: ClassVar[str] = "A constant load beside the driving force."
+    shape: ClassVar[Shape] = Shape(Part.STIFFNESS, Symmetry.EVEN, Argument.DISPLACEMENT)
+    load: Scalar = parameter("kg^1/2 m/s²", "constant load")
+
+    def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
+        return -self.load + 0.0 * displacement
+
+
 class FourParameterIwan(AbstractSliders):
     """Segalman's joint: sliders of density R φ^χ up to φ_max, and some that slip at φ_max together.
 

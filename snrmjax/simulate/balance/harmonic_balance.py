@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from snrmjax.model.averaging import AveragedForce
 from snrmjax.model.effect_base import AbstractHysteresis, AbstractKinked
-from snrmjax.model.elements import elements_of
+from snrmjax.model.elements import AlikeForces, elements_of
 from snrmjax.model.modes import phasor_of_load
 from snrmjax.model.structures import Structure, linear_terms_of
 from snrmjax.numerics.compiled import compiled
@@ -153,21 +153,54 @@ class HarmonicBalance(eqx.Module):
         viscous = tangent_blocks(basis, slopes.damping / fs)
         block = block + omega * jnp.einsum("cep,ed->cdp", viscous, basis.derivative)
         change = slopes.damping * v_omega / unit
-        by_cycle = elements.only(_BY_CYCLE)
+        shapes = jnp.asarray(basis.synthesis.T) * self.displacement_scale
+        rates = jnp.asarray((basis.synthesis @ basis.derivative).T)
+        rates = rates * (omega * fs * self.displacement_scale)
+        by_cycle, across = elements.only(_BY_CYCLE).apart()
         if by_cycle.groups:
 
             def along(direction: Array, direction_rate: Array) -> Array:
                 return jax.jvp(by_cycle.cycle_force, (x, v), (direction, direction_rate))[1] / unit
 
             # One direction moves all places: a force feels its own alone.
-            shapes = jnp.asarray(basis.synthesis.T) * self.displacement_scale
-            rates = jnp.asarray((basis.synthesis @ basis.derivative).T)
-            rates = rates * (omega * fs * self.displacement_scale)
             every = jnp.ones(elements.n_places)
             by_shape = jax.vmap(along)(shapes[..., None] * every, rates[..., None] * every)
             block = block + jnp.einsum("ct,dtp->cdp", basis.analysis, by_shape)
             change = change + along(jnp.zeros_like(x), v_omega)
-        return elements.matrix(block), elements.on_modes(jnp.asarray(basis.analysis) @ change)
+        blocks = elements.matrix(block)
+        for group in across.groups:
+            pair = group.taken(x), group.taken(v)
+            added, values = _across(group, pair, (shapes, rates), group.taken(v_omega))
+            local = jnp.einsum("ct,djtfi->cdfij", basis.analysis, added / unit)
+            rows = elements.rows[group.places]
+            blocks = blocks + jnp.einsum("cdfij,fim,fjn->cdmn", local, rows, rows)
+            change = change + elements.at_places(group, values / unit)
+        return blocks, elements.on_modes(jnp.asarray(basis.analysis) @ change)
+
+
+def _across(
+    group: AlikeForces,
+    pair: tuple[Array, Array],
+    directions: tuple[Array, Array],
+    v_omega: Float[Array, "time force row"],
+) -> tuple[Float[Array, "direction moved time force row"], Float[Array, "time force row"]]:
+    """Derivatives of forces at several rows each: by every direction of every row, and by Ω.
+
+    Arguments: displacement and velocity `pair` (time, force, row) of the forces, the `directions`
+    of displacements and of velocities (direction, time), and the derivative of the velocity by Ω.
+    """
+
+    def along(moved: Array, rate: Array) -> Float[Array, "time force row"]:
+        return jax.jvp(group.cycle_force, pair, (moved, rate))[1]
+
+    def of_row(direction: Array, rate: Array, row: Array) -> Array:
+        # One direction moves one row of every force of the group.
+        every = jnp.ones(group.places.shape) * row
+        return along(direction[:, None, None] * every, rate[:, None, None] * every)
+
+    of_rows = jax.vmap(jax.vmap(of_row, (None, None, 0)), (0, 0, None))
+    by_row = of_rows(*directions, jnp.eye(group.places.shape[1]))
+    return by_row, along(jnp.zeros_like(v_omega), v_omega)
 
 
 def harmonic_balance(

@@ -1,69 +1,36 @@
 """Monodromy matrices: what small disturbances of a periodic motion become over one period."""
 
 from functools import partial
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from snrmjax.model.effect_base import (
     AbstractForce,
-    AbstractHysteresis,
     AbstractKinked,
     AbstractMemoryless,
 )
 from snrmjax.model.effect_metadata import Argument
-from snrmjax.model.elements import Elements, elements_of
+from snrmjax.model.elements import elements_of
 from snrmjax.model.kinks import crossings
-from snrmjax.model.library.friction import AbstractSliders
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.compiled import compiled
+from snrmjax.simulate.continuation.friction_along import (
+    SAMPLES,
+    Friction,
+    friction_along,
+    states_at,
+    viscous_slope,
+)
 
 _MOST_SEGMENTS = 256
 _SEGMENT = 32  # steps whose propagators, or kicks, are computed side by side
 _KICKS = 3  # for every step of Magnus' method
 _LEAST_KICKS = 240
 _FEW_SLIDERS = 16  # whose slip begins and ends with a step
-_MOST_SLIPS = 8  # of one slider in a period
-_SAMPLES = 512  # over a period, among which contacts and slip are looked for
 _GAUSS = np.array([0.5 - np.sqrt(0.15), 0.5, 0.5 + np.sqrt(0.15)])
-
-
-class _Friction(NamedTuple):
-    """Friction's part in the linearised motion; sliders by the places at which they act."""
-
-    begin: Float[Array, " point"]  # phase at which the period begins
-    stuck: Float[Array, "point mode mode"]  # stiffness of springs that the modes do not hold, 1/s²
-    viscous: tuple[tuple[AbstractHysteresis, Elements], ...]  # without memory, one of every point
-    places: Elements  # of the sliders, one force each
-    owner: np.ndarray  # (slider,) the place of each
-    stiffness: Float[Array, "point slider"]  # 1/s²
-    slip: "_Slip"  # of the sliders
-
-
-class _Slip(NamedTuple):
-    """When sliders are dragged, by phases behind the beginning of the period."""
-
-    at_first: Bool[Array, "point slider"]  # dragged before phase zero
-    onsets: Float[Array, "event point slider"]  # infinite where there are fewer
-    ends: Float[Array, "event point slider"]
-
-    def dragged(self, phase: Float[Array, "step point"]) -> Bool[Array, "step point slider"]:
-        """Whether sliders are dragged at phases."""
-
-        def passed(events: Array) -> Array:
-            # An end may lie a little before phase zero, and so before the end of the period.
-            images = jnp.concatenate([events, events + 2 * jnp.pi])
-            return jnp.sum(images[:, None] <= phase[None, :, :, None], axis=0)
-
-        return self.at_first + passed(self.onsets) - passed(self.ends) > 0
-
-    @property
-    def slips(self) -> Bool[Array, "point slider"]:
-        """The sliders that are dragged at all."""
-        return self.at_first | jnp.isfinite(self.onsets[0])
 
 
 @partial(compiled, long_loops=True)
@@ -76,8 +43,13 @@ def monodromy(
     """The linearised map of (δq, δq̇ over the fastest natural frequency) over one period.
 
     Behind them stand the positions of sliders at other places than the first one's, where there
-    are any. NaN where more steps would be needed than any sensible motion needs.
+    are any, and states of laws with a memory. NaN where more steps would be needed than any
+    sensible motion needs, and for contacts whose normal force moves.
     """
+    if any(len(force.rows) > 1 for force in model.forces):
+        # Their slip cannot be followed between samples here.
+        unknown = (frequency.shape[0], 2 * model.n_modes, 2 * model.n_modes)
+        return jnp.full(unknown, jnp.nan)
     if not all(map(_is_spring, model.forces)) or model.modes.damping_coupling is not None:
         return _by_magnus(model, coefficients, frequency, steps_per_cycle)
     return _by_kicks(model, coefficients, frequency, steps_per_cycle)
@@ -184,19 +156,22 @@ def _by_magnus(
     """
     n, n_points = model.n_modes, frequency.shape[0]
     terms = model.linear_terms()
-    friction = _friction(model, coefficients, frequency)
+    friction = friction_along(model, coefficients, frequency)
     phases = 2 * jnp.pi * jnp.arange(48)[:, None] / 48
     k, c = _tangents(model, friction, coefficients, frequency, phases)
-    rate = jnp.sqrt(jnp.max(jnp.sum(jnp.abs(k), axis=-1)))
+    hidden = sum((memory.stiffness() for memory in friction.memories), jnp.zeros(()))
+    hidden = hidden / (terms.mass * frequency[:, None] ** 2)[..., None]
+    rate = jnp.sqrt(jnp.max(jnp.sum(jnp.abs(k) + jnp.abs(hidden), axis=-1)))
     cycles = jnp.nan_to_num(jnp.maximum(rate, 0.5 * jnp.max(jnp.sum(jnp.abs(c), axis=-1))))
     n_segments, step = _segments(jnp.maximum(steps_per_cycle * cycles, 512), _MOST_SEGMENTS)
-    contacts = _contacts(model, coefficients, frequency, friction.begin)
+    contacts = _contacts(model, coefficients, frequency, friction)
     if 0 < friction.owner.size <= _FEW_SLIDERS:
         few = [jnp.moveaxis(part, 2, 1) for part in (friction.slip.onsets, friction.slip.ends)]
         contacts = jnp.concatenate([contacts, *(part.reshape(-1, n_points) for part in few)])
     unit = jnp.sqrt(jnp.max(terms.stiffness / terms.mass)) / frequency  # of δq̇, over Ω
     places, owner, n_places = friction.places, friction.owner, friction.places.n_places
-    size = 2 * n + n_places
+    own = 2 * n + sum(memory.n_states for memory in friction.memories)
+    size = own + n_places
     of_place = np.eye(n_places)[owner]  # (slider, place)
 
     def generators(start: Array, length: Array, held: Array) -> Array:
@@ -210,7 +185,24 @@ def _by_magnus(
             moving = places.matrix(jnp.repeat(loose, 3, axis=0))
             k = k - moving / (terms.mass * frequency[:, None] ** 2)[..., None]
             pulls = jnp.broadcast_to(places.rows.T, (n, n_places)) / terms.mass[:, None]
-            a = a.at[:, :, n : 2 * n, 2 * n :].set(pulls / (unit * frequency**2)[:, None, None])
+            a = a.at[:, :, n : 2 * n, own:].set(pulls / (unit * frequency**2)[:, None, None])
+        first = 2 * n
+        for memory in friction.memories:
+            last = first + memory.n_states
+            by, row = memory.at(tau), memory.there.on_modes(jnp.ones(1))
+            per_force = row[:, None] / (terms.mass * frequency[:, None] ** 2)[..., None]
+            stiffer, damped = by[:, :, :1, :1] * row, by[:, :, :1, 1:2] * row
+            k, c = k + per_force * stiffer, c + per_force * (damped * frequency[:, None, None])
+            held = by[:, :, :1, 2:] * memory.unit[:, None]
+            a = a.at[:, :, n : 2 * n, first:last].set(-per_force * held / unit[:, None, None])
+            over = memory.unit[:, :, None]
+            per_phase = 1 / frequency[:, None, None]
+            a = a.at[:, :, first:last, :n].set(by[:, :, 1:, :1] / over * row * per_phase)
+            follows = by[:, :, 1:, 1:2] / over * row * unit[:, None, None]
+            a = a.at[:, :, first:last, n : 2 * n].set(follows)
+            fades = by[:, :, 1:, 2:] / over * memory.unit[:, None] * per_phase
+            a = a.at[:, :, first:last, first:last].set(fades)
+            first = last
         modes = np.arange(n)
         a = a.at[:, :, modes, n + modes].set(unit[:, None])
         a = a.at[:, :, n : 2 * n, :n].set(-k / unit[:, None, None])
@@ -231,7 +223,7 @@ def _by_magnus(
                 return (propagator @ y, z), None
             held_by = jnp.where(stuck, friction.stiffness, 0.0)[:, :, None] * z
             pull = of_place.T @ held_by
-            y = propagator[:, : 2 * n, : 2 * n] @ y + propagator[:, : 2 * n, 2 * n :] @ pull
+            y = propagator[:, :own, :own] @ y + propagator[:, :own, own:] @ pull
             return (y, jnp.where(stuck[:, :, None], z, sliding(y))), None
 
         return jax.lax.scan(advance, state, (propagators, held))[0]
@@ -243,11 +235,11 @@ def _by_magnus(
 
     # Sliders at the first place follow from its motion; others have positions of their own.
     free = np.flatnonzero(owner > 0)
-    y = jnp.broadcast_to(jnp.eye(2 * n, 2 * n + free.size), (n_points, 2 * n, 2 * n + free.size))
-    z = jnp.zeros((n_points, owner.size, 2 * n + free.size))
+    y = jnp.broadcast_to(jnp.eye(own, own + free.size), (n_points, own, own + free.size))
+    z = jnp.zeros((n_points, owner.size, own + free.size))
     slips = friction.slip.slips[:, :, None]
     if n_places:
-        start = sliding(y).at[:, free].set(np.eye(2 * n + free.size)[2 * n :])
+        start = sliding(y).at[:, free].set(np.eye(own + free.size)[own:])
         z = jnp.where(slips, start, 0.0)
     y, z = jax.lax.fori_loop(0, n_segments, segment, (y, z))
     whole = jnp.concatenate([y, jnp.where(slips, z, 0.0)[:, free]], axis=1)
@@ -255,20 +247,29 @@ def _by_magnus(
 
 
 def _contacts(
-    model: Structure, coefficients: Array, frequency: Array, begin: Array
+    model: Structure, coefficients: Array, frequency: Array, friction: Friction
 ) -> Float[Array, "contact point"]:
-    """Phases behind `begin` at which contacts open and close; infinite where there are fewer."""
-    tau = 2 * jnp.pi * jnp.arange(_SAMPLES) / _SAMPLES
-    phases = begin + tau[:, None]
-    q, _ = _states_at(coefficients, frequency, phases)
+    """Phases behind the beginning at which contacts open and close, and laws with a memory turn.
+
+    Infinite where there are fewer.
+    """
+    tau = 2 * jnp.pi * jnp.arange(SAMPLES) / SAMPLES
+    phases = friction.begin + tau[:, None]
+    q, _ = states_at(coefficients, frequency, phases)
     found = [jnp.zeros((0, len(frequency)))]
+
+    def add(x: Array, place: Array, start: Array | float = 0.0) -> None:
+        there = jax.vmap(crossings, (1, None), 1)(x, place)
+        phase = jnp.mod((there.interval + there.share) * tau[1] - start, 2 * jnp.pi)
+        found.append(jnp.where(there.passes, phase, jnp.inf))
+
     for effect in model.memoryless:
         if isinstance(effect, AbstractKinked):
             x = elements_of([effect], model.modes).displacement(q)[..., 0]
             for place in effect.kinks().displacement:
-                there = jax.vmap(crossings, (1, None), 1)(x, place)
-                phase = (there.interval + there.share) * tau[1]
-                found.append(jnp.where(there.passes, phase, jnp.inf))
+                add(x, place)
+    for memory in friction.memories:
+        add(memory.rate, jnp.zeros(()), friction.begin)
     return jnp.concatenate(found)
 
 
@@ -318,118 +319,18 @@ def _exponential(matrix: Float[Array, "*batch state state"]) -> Float[Array, "*b
     return result
 
 
-def _friction(model: Structure, coefficients: Array, frequency: Array) -> _Friction:
-    """Friction along the motions.
-
-    The period begins at the largest displacement of the first sliders' place: there every one of
-    them that slips at all is being dragged, so that its position is no state of its own.
-    """
-    n_points, n = len(frequency), model.n_modes
-    sliders = [e for e in model.hysteretic if isinstance(e, AbstractSliders)]
-    others = [e for e in model.hysteretic if not isinstance(e, AbstractSliders)]
-    distinct = list({effect.at: effect for effect in reversed(sliders)}.values())[::-1]
-    places = elements_of(distinct, model.modes)
-    nothing = jnp.zeros((n_points, n, n))
-    begin = jnp.zeros_like(frequency)
-    none = jnp.zeros((1, n_points, 0))
-    no_sliders = none[0], _Slip(none[0] > 0, none, none)
-    if not model.hysteretic:
-        return _Friction(begin, nothing, (), places, np.zeros(0, int), *no_sliders)
-    tau = 2 * jnp.pi * jnp.arange(_SAMPLES) / _SAMPLES
-    phases = jnp.broadcast_to(tau[:, None], (_SAMPLES, n_points))
-    motions = _states_at(coefficients, frequency, phases)
-
-    def scaled(effect: AbstractHysteresis) -> tuple[AbstractHysteresis, Elements, Array]:
-        """The effect as set for every point, where it is, and its displacement."""
-        there = elements_of([effect], model.modes)
-        x, v = (there.displacement(part)[..., 0] for part in motions)
-        half_range = 0.5 * (jnp.max(x, axis=0) - jnp.min(x, axis=0))
-        typical = jnp.sqrt(jnp.mean(v**2, axis=0))
-        return jax.vmap(effect.scaled_for)(half_range, typical), there, x
-
-    viscous = tuple(scaled(effect)[:2] for effect in others)
-    if not sliders:
-        return _Friction(begin, nothing, viscous, places, np.zeros(0, int), *no_sliders)
-    largest = jnp.argmax(scaled(sliders[0])[2], axis=0)
-    stiffness, slip, owner, stuck = [], [], [], nothing
-    for effect in sliders:
-        each, there, x = scaled(effect)
-        turned = jax.vmap(lambda row, k: jnp.roll(row, -k), in_axes=(1, 0))(x, largest)
-        position = jax.vmap(lambda e, x: e.settled_states(x, x))(each, turned)
-        sizes = jax.vmap(lambda e: e.sliders().slip_displacement)(each)
-        slip.append(jax.vmap(jax.vmap(_slip_of, (None, 1, 0)))(turned, position, sizes))
-        stiffness.append(jax.vmap(lambda e: e.sliders().stiffness)(each))
-        owner += [[e.at for e in distinct].index(effect.at)] * stiffness[-1].shape[1]
-        stuck = stuck + there.matrix(jax.vmap(lambda e: e.added_stiffness())(each)[:, None])
-    at_first, onsets, ends = (jnp.concatenate(part, axis=1) for part in zip(*slip, strict=True))
-    return _Friction(
-        *(tau[largest], stuck, viscous, places, np.array(owner)),
-        jnp.concatenate(stiffness, axis=1),
-        _Slip(at_first, jnp.moveaxis(onsets, 2, 0), jnp.moveaxis(ends, 2, 0)),
-    )
-
-
-def _slip_of(x: Array, position: Array, size: Array) -> tuple[Array, Array, Array]:
-    """Of one slider over a period: dragged at first, phases of onsets and of ends.
-
-    It starts where its stretch reaches the slip displacement, and stops where x turns, which a
-    parabola through three samples says.
-    """
-    n = x.shape[0]
-    width = 2 * jnp.pi / n
-    ahead, behind = jnp.roll(x, -1), jnp.roll(x, 1)
-    moves = position != jnp.roll(position, -1)
-
-    def phases(starts: Array, share: Array) -> Array:
-        (index,) = jnp.nonzero(starts, size=_MOST_SLIPS, fill_value=n)
-        known = index < n
-        there = (index + share[jnp.minimum(index, n - 1)]) * width
-        return jnp.where(known, there, jnp.inf)
-
-    rise = ahead - x
-    reach = position + jnp.sign(rise) * size
-    onset = jnp.clip((reach - x) / jnp.where(rise != 0, rise, 1.0), 0.0, 1.0)
-    bend = 2 * x - ahead - behind
-    turn = jnp.clip(0.5 * (ahead - behind) / jnp.where(bend != 0, bend, 1.0), -0.5, 0.5)
-    before = jnp.roll(moves, 1)
-    return before[0], phases(moves & ~before, onset), phases(before & ~moves, turn)
-
-
 def _tangents(
-    model: Structure, friction: _Friction, coefficients: Array, frequency: Array, tau: Array
+    model: Structure, friction: Friction, coefficients: Array, frequency: Array, tau: Array
 ) -> tuple[Float[Array, "time point mode mode"], Float[Array, "time point mode mode"]]:
     """K/mΩ² and C/mΩ of all points at phases τ (time,) or (time, point), stuck sliders included."""
     n_points, _, n = coefficients.shape
     terms = model.linear_terms()
-    q, v = _states_at(coefficients, frequency, jnp.broadcast_to(tau.T, (n_points, len(tau))).T)
+    q, v = states_at(coefficients, frequency, jnp.broadcast_to(tau.T, (n_points, len(tau))).T)
     k, c = model.slopes(q.reshape(-1, n), v.reshape(-1, n))
     k = k.reshape(*q.shape, n) + jnp.diag(terms.stiffness) + friction.stuck
     c = c.reshape(*q.shape, n) + terms.damping_matrix()
     for effect, there in friction.viscous:
         x, rate = there.displacement(q)[..., 0], there.displacement(v)[..., 0]
-        c = c + there.matrix(_viscous_slope(effect, x, rate)[..., None])
+        c = c + there.matrix(viscous_slope(effect, x, rate)[..., None])
     per_mass = (terms.mass * frequency[:, None])[:, :, None]
     return k / (per_mass * frequency[:, None, None]), c / per_mass
-
-
-def _viscous_slope(
-    effects: AbstractHysteresis, x: Float[Array, "time point"], v: Float[Array, "time point"]
-) -> Float[Array, "time point"]:
-    """∂f/∂ẋ of friction without memory, one effect for every point."""
-
-    def slope(effect: AbstractHysteresis, x: Array, v: Array) -> Array:
-        return jax.grad(effect.state_force, argnums=1)(x, v, effect.initial_states())
-
-    return jax.vmap(lambda x, v: jax.vmap(slope)(effects, x, v))(x, v)
-
-
-def _states_at(coefficients: Array, frequency: Array, tau: Array) -> tuple[Array, Array]:
-    """q and q̇ of all points at phases τ (time, point), as (time, point, mode)."""
-    orders = jnp.arange(1, (coefficients.shape[1] - 1) // 2 + 1)
-    angle = tau[..., None] * orders
-    cosine, sine = jnp.cos(angle), jnp.sin(angle)
-    mean, a, b = coefficients[:, 0], coefficients[:, 1::2], coefficients[:, 2::2]
-    q = mean + jnp.einsum("tph,phm->tpm", cosine, a) + jnp.einsum("tph,phm->tpm", sine, b)
-    rate = jnp.einsum("tph,phm->tpm", cosine, orders[:, None] * b)
-    rate = rate - jnp.einsum("tph,phm->tpm", sine, orders[:, None] * a)
-    return q, frequency[:, None] * rate

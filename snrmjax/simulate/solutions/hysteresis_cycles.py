@@ -8,7 +8,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from snrmjax.model.effect_base import AbstractHysteresis
+from snrmjax.model.effect_base import AbstractHysteresis, StateAt
 from snrmjax.model.elements import elements_of
 from snrmjax.model.library.friction import AbstractSliders
 from snrmjax.model.structures import Structure
@@ -99,8 +99,8 @@ def integrated_cycle(
             step = jnp.where(good, longer, taken * factor)
             if effects:
                 (q0, v0, _), (q1, v1, held) = whole(state), whole(new)
-                ends = (rows @ q0, rows @ v0), (rows @ q1, rows @ v1)
-                states = memory_after_step(effects, held, *ends, taken / frequency)
+                ends = (q0, v0), (q1, v1)
+                states = memory_after_step(model, effects, held, *ends, taken / frequency)
                 new = ravel_pytree((q1, v1, states))[0]
             return jnp.where(good, to, phase), jnp.where(good, new, state), step, count + 1
 
@@ -125,7 +125,7 @@ def integrated_cycle(
 
 
 def friction_rows(model: Structure) -> Float[Array, "friction mode"]:
-    """The rows over the modes of what the effects with a memory act on."""
+    """The rows over the modes of what the effects with a memory act on, the first of each."""
     rows = [elements_of([effect], model.modes).rows[0] for effect in model.hysteretic]
     return jnp.stack(rows) if rows else jnp.zeros((0, model.n_modes))
 
@@ -139,12 +139,17 @@ def scaled_friction(
     )
 
 
-def memory_at_rest(effect: AbstractHysteresis, displacement: Array) -> Array:
+def memory_at_rest(
+    model: Structure, effects: tuple[AbstractHysteresis, ...], q: Float[Array, " mode"]
+) -> Memory:
     """Memory of a structure that was brought to a displacement and held there."""
-    states = effect.initial_states()
-    if isinstance(effect, AbstractSliders):
-        return effect.moved_states(displacement, states)
-    return states
+    return tuple(effect.states_at_rest(_acts_on(model, effect, q)) for effect in effects)
+
+
+def _acts_on(model: Structure, effect: AbstractHysteresis, q: Float[Array, " mode"]) -> StateAt:
+    """The displacement, or of q̇ the rate, on which an effect acts; of several rows all of them."""
+    there = elements_of([effect], model.modes).displacement(q)
+    return there if len(effect.rows) > 1 else there[0]
 
 
 def _moved_memory(old: AbstractHysteresis, new: AbstractHysteresis, states: Array) -> Array:
@@ -169,38 +174,33 @@ def inner_force(
     inner = terms.stiffness * q + terms.damped(v) + model.memoryless_force(q[None], v[None])[0]
     rates = []
     for effect, states in zip(effects, memory, strict=True):
-        there = elements_of([effect], model.modes)
-        x, rate = there.displacement(q)[0], there.displacement(v)[0]
-        inner = inner + there.on_modes(effect.state_force(x, rate, states)[None])
-        held = isinstance(effect, AbstractSliders)
+        x, rate = _acts_on(model, effect, q), _acts_on(model, effect, v)
+        values = effect.state_force(x, rate, states)
+        inner = inner + elements_of([effect], model.modes).on_modes(jnp.atleast_1d(values))
+        held = effect.held_in_steps
         rates.append(jnp.zeros_like(states) if held else effect.state_rate(x, rate, states))
     return inner, tuple(rates)
 
 
 def memory_after_step(
+    model: Structure,
     effects: tuple[AbstractHysteresis, ...],
     memory: Memory,
-    begin: tuple[Float[Array, " friction"], Float[Array, " friction"]],
-    end: tuple[Float[Array, " friction"], Float[Array, " friction"]],
+    begin: tuple[Float[Array, " mode"], Float[Array, " mode"]],
+    end: tuple[Float[Array, " mode"], Float[Array, " mode"]],
     time: Array,
 ) -> Memory:
     """Memory after a step of an integrator through which sliders were held.
 
-    Arguments: `memory` as the integrator leaves it; what each friction acts on and its rate at the
-    `begin` and at the `end` of the step, of length `time` in s. A turning point within the step is
-    passed; other effects than sliders keep what the integrator found.
+    Arguments: `memory` as the integrator leaves it; q and q̇ at the `begin` and at the `end` of the
+    step, of length `time` in s.
     """
-    (x0, v0), (x1, v1) = begin, end
-    turns = v0 * v1 < 0
-    until = time * v0 / jnp.where(turns, v0 - v1, 1.0)
-    turning = jnp.where(turns, x0 + 0.5 * v0 * until, x0)
 
-    def after(effect: AbstractHysteresis, states: Array, turn: Array, end: Array) -> Array:
-        if not isinstance(effect, AbstractSliders):
-            return states
-        return effect.moved_states(end, effect.moved_states(turn, states))
+    def after(effect: AbstractHysteresis, states: Array) -> Array:
+        q0, v0, q1, v1 = (_acts_on(model, effect, part) for part in (*begin, *end))
+        return effect.after_step(states, (q0, v0), (q1, v1), time)
 
-    return tuple(map(after, effects, memory, turning, x1))
+    return tuple(map(after, effects, memory))
 
 
 def _diffrax() -> Any:

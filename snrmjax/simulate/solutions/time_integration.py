@@ -20,7 +20,6 @@ from snrmjax.simulate.balance.harmonics import harmonic_basis, velocity_phasors
 from snrmjax.simulate.balance.labelled import HERTZ, batch_variables
 from snrmjax.simulate.solutions.hysteresis_cycles import (
     CyclePoint,
-    friction_rows,
     integrated_cycle,
     memory_at_rest,
     scaled_friction,
@@ -233,9 +232,8 @@ def _stepped(
 ) -> IntegratedMotion:
     """The motions at all steps, of the structure as simulated."""
     q, v = start
-    rows = friction_rows(model)
-    unscaled = jnp.ones(len(rows))
-    memory = tuple(map(memory_at_rest, scaled_friction(model, unscaled, unscaled), rows @ q))
+    unscaled = jnp.ones(len(model.hysteretic))
+    memory = memory_at_rest(model, scaled_friction(model, unscaled, unscaled), q)
     begin = CyclePoint(q, v, memory, jnp.asarray(0.01), jnp.zeros(()), 0 * unscaled, 0 * unscaled)
 
     def dwell(point: CyclePoint, step: tuple[Array, Array]) -> tuple[CyclePoint, IntegratedMotion]:

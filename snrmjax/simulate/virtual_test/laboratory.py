@@ -30,7 +30,6 @@ from snrmjax.model.effect_base import (
     AbstractMeasurementEffect,
 )
 from snrmjax.model.elements import elements_of
-from snrmjax.model.library.friction import AbstractSliders
 from snrmjax.model.modes import reference_sensor
 from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.simulate.solutions.hysteresis_cycles import (
@@ -168,9 +167,9 @@ class Laboratory(eqx.Module):
 
     def at_rest(self, controller: AbstractController) -> LabState:
         """The state before anything moves."""
-        n = simulated_structure(self.structure).n_modes
-        friction = self.friction()
-        memory = tuple(map(memory_at_rest, friction, jnp.zeros(len(friction))))
+        model = simulated_structure(self.structure)
+        n = model.n_modes
+        memory = memory_at_rest(model, self.friction(), jnp.zeros(n))
         sections = len(filter_sections(self.instruments, self.sampling_rate * self.substeps))
         return LabState(
             LabMotion(jnp.zeros(n), jnp.zeros(n), memory),
@@ -241,7 +240,7 @@ def _run(
     period = jnp.asarray(1 / laboratory.sampling_rate)
     steps, limit = laboratory.substeps, laboratory.shaker.largest_voltage
     slope = _equations(laboratory.shaker, laboratory.attached, structure, friction)
-    step = _integrator(slope, friction, friction_rows(structure), period / steps)
+    step = _integrator(slope, structure, friction, period / steps)
     cubic = _between_samples(np.arange(2 * steps + 1) / (2 * steps))
 
     def channels(motion: LabMotion, voltage: Array) -> Array:
@@ -313,8 +312,8 @@ def _equations(
 
 def _integrator(
     slope: Callable[[LabMotion, Array], tuple[LabMotion, Array]],
+    structure: Structure,
     friction: tuple[AbstractHysteresis, ...],
-    rows: Float[Array, "friction mode"],
     h: Array,
 ) -> Callable[[LabMotion, Float[Array, "3"]], LabMotion]:
     """One step of length h by the classical method of Runge and Kutta, sliders moved after it."""
@@ -331,8 +330,8 @@ def _integrator(
         four = slope(after(h, three), last)[0]
         mean = jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, one, two, three, four)
         moved = after(h, mean)
-        way = [(rows @ at.displacement, rows @ at.velocity) for at in (motion, moved)]
-        memory = memory_after_step(friction, moved.memory, way[0], way[1], h)
+        begin, end = ((at.displacement, at.velocity) for at in (motion, moved))
+        memory = memory_after_step(structure, friction, moved.memory, begin, end, h)
         return moved._replace(memory=memory)
 
     return step
@@ -374,12 +373,13 @@ def _fastest(structure: Structure, shaker: Shaker) -> float:
     grid = np.logspace(-12, 3, 301)
     x = jnp.asarray(np.concatenate([-grid, grid]))
     for effect in model.forces:
-        row = np.asarray(elements_of([effect], model.modes).rows[0])
+        rows = np.asarray(elements_of([effect], model.modes).rows)
         if isinstance(effect, AbstractKinked):
             slope = jax.vmap(jax.grad(effect.force))(x, jnp.zeros_like(x))
-            stiffness = stiffness + float(jnp.max(slope)) * np.outer(row, row)
-        elif isinstance(effect, AbstractSliders):
-            stiffness = stiffness + float(effect.added_stiffness()) * np.outer(row, row)
+            stiffness = stiffness + float(jnp.max(slope)) * np.outer(rows[0], rows[0])
+        elif isinstance(effect, AbstractHysteresis):
+            most = np.asarray(effect.stuck_stiffness())
+            stiffness = stiffness + rows.T @ (most[:, None] * rows)
     drive = np.asarray(model.modes.participation)
     coil = shaker.damping + shaker.motor_constant**2 / shaker.resistance
     coupling = np.outer(drive, drive)

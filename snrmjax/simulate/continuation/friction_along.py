@@ -1,0 +1,202 @@
+"""Friction along periodic motions: what it adds to the linearised motion, and when."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from snrmjax.model.effect_base import AbstractHysteresis
+from snrmjax.model.elements import Elements, elements_of
+from snrmjax.model.library.friction import AbstractSliders
+from snrmjax.model.structures import Structure
+
+SAMPLES = 512  # over a period, among which contacts and slip are looked for
+_MOST_SLIPS = 8  # of one slider in a period
+
+
+class Friction(NamedTuple):
+    """Friction's part in the linearised motion; sliders by the places at which they act."""
+
+    begin: Float[Array, " point"]  # phase at which the period begins
+    stuck: Float[Array, "point mode mode"]  # stiffness of springs that the modes do not hold, 1/s²
+    viscous: tuple[tuple[AbstractHysteresis, Elements], ...]  # without memory, one of every point
+    memories: tuple["Memory", ...]  # laws with states that follow rates
+    places: Elements  # of the sliders, one force each
+    owner: np.ndarray  # (slider,) the place of each
+    stiffness: Float[Array, "point slider"]  # 1/s²
+    slip: "Slip"  # of the sliders
+
+
+class Slip(NamedTuple):
+    """When sliders are dragged, by phases behind the beginning of the period."""
+
+    at_first: Bool[Array, "point slider"]  # dragged before phase zero
+    onsets: Float[Array, "event point slider"]  # infinite where there are fewer
+    ends: Float[Array, "event point slider"]
+
+    def dragged(self, phase: Float[Array, "step point"]) -> Bool[Array, "step point slider"]:
+        """Whether sliders are dragged at phases."""
+
+        def passed(events: Array) -> Array:
+            # An end may lie a little before phase zero, and so before the end of the period.
+            images = jnp.concatenate([events, events + 2 * jnp.pi])
+            return jnp.sum(images[:, None] <= phase[None, :, :, None], axis=0)
+
+        return self.at_first + passed(self.onsets) - passed(self.ends) > 0
+
+    @property
+    def slips(self) -> Bool[Array, "point slider"]:
+        """The sliders that are dragged at all."""
+        return self.at_first | jnp.isfinite(self.onsets[0])
+
+
+class Memory(NamedTuple):
+    """A law with states of its own, linearised at equally spaced phases of motions."""
+
+    there: Elements  # its place
+    slopes: Float[Array, "sample point result argument"]  # of force and rates by x, ẋ and states
+    unit: Float[Array, "point state"]  # of disturbed states, so that they are of the size of x
+    rate: Float[Array, "sample point"]  # of what it acts on
+
+    @property
+    def n_states(self) -> int:
+        """Number of its states."""
+        return self.unit.shape[1]
+
+    def at(self, phase: Float[Array, "time point"]) -> Float[Array, "time point result argument"]:
+        """The derivatives at phases, between samples along straight lines."""
+        place = phase / (2 * jnp.pi) * SAMPLES
+        before = jnp.floor(place).astype(int)
+        share = (place - before)[..., None, None]
+        point = jnp.arange(phase.shape[1])
+        one, two = (self.slopes[(before + k) % SAMPLES, point] for k in (0, 1))
+        return (1 - share) * one + share * two
+
+    def stiffness(self) -> Float[Array, "point mode mode"]:
+        """What its states add to the stiffness where they follow the motion, at most."""
+        held = self.slopes[:, :, 0, 2:] * self.slopes[:, :, 1:, 1]
+        return self.there.matrix(jnp.max(jnp.abs(jnp.sum(held, axis=-1)), axis=0)[:, None])
+
+
+def _memory_of(effects: AbstractHysteresis, there: Elements, x: Array, v: Array) -> Memory:
+    """A law along motions (sample, point), one effect for every point."""
+
+    def of_point(effect: AbstractHysteresis, x: Array, v: Array) -> Array:
+        def results(argument: Array, states: Array) -> Array:
+            force = effect.state_force(argument[0], argument[1], states)
+            return jnp.append(force, effect.state_rate(argument[0], argument[1], states))
+
+        motion, states = jnp.stack([x, v], axis=1), effect.settled_states(x, v)
+        by = jax.vmap(jax.jacfwd(results, argnums=(0, 1)))(motion, states)
+        return jnp.concatenate(by, axis=-1)
+
+    slopes = jax.vmap(of_point, (0, 1, 1), 1)(effects, x, v)
+    unit = jnp.max(jnp.abs(slopes[:, :, 1:, 1]), axis=0)
+    return Memory(there, slopes, jnp.where(unit > 0, unit, 1.0), v)
+
+
+def friction_along(model: Structure, coefficients: Array, frequency: Array) -> Friction:
+    """Friction along the motions.
+
+    The period begins at the largest displacement of the first sliders' place: there every one of
+    them that slips at all is being dragged, so that its position is no state of its own.
+    """
+    n_points, n = len(frequency), model.n_modes
+    sliders = [e for e in model.hysteretic if isinstance(e, AbstractSliders)]
+    others = [e for e in model.hysteretic if not isinstance(e, AbstractSliders)]
+    distinct = list({effect.at: effect for effect in reversed(sliders)}.values())[::-1]
+    places = elements_of(distinct, model.modes)
+    nothing = jnp.zeros((n_points, n, n))
+    begin = jnp.zeros_like(frequency)
+    none = jnp.zeros((1, n_points, 0))
+    no_sliders = none[0], Slip(none[0] > 0, none, none)
+    if not model.hysteretic:
+        return Friction(begin, nothing, (), (), places, np.zeros(0, int), *no_sliders)
+    tau = 2 * jnp.pi * jnp.arange(SAMPLES) / SAMPLES
+    phases = jnp.broadcast_to(tau[:, None], (SAMPLES, n_points))
+    motions = states_at(coefficients, frequency, phases)
+
+    def scaled(effect: AbstractHysteresis) -> tuple[AbstractHysteresis, Elements, Array, Array]:
+        """The effect as set for every point, where it is, its displacement and velocity there."""
+        there = elements_of([effect], model.modes)
+        x, v = (there.displacement(part)[..., 0] for part in motions)
+        half_range = 0.5 * (jnp.max(x, axis=0) - jnp.min(x, axis=0))
+        typical = jnp.sqrt(jnp.mean(v**2, axis=0))
+        return jax.vmap(effect.scaled_for)(half_range, typical), there, x, v
+
+    with_states = [len(jax.eval_shape(effect.initial_states)) > 0 for effect in others]
+    viscous = tuple(scaled(e)[:2] for e, has in zip(others, with_states, strict=True) if not has)
+    memories = tuple(
+        _memory_of(*scaled(e)) for e, has in zip(others, with_states, strict=True) if has
+    )
+    if not sliders:
+        none_sliding = places, np.zeros(0, int), *no_sliders
+        return Friction(begin, nothing, viscous, memories, *none_sliding)
+    largest = jnp.argmax(scaled(sliders[0])[2], axis=0)
+    stiffness, slip, owner, stuck = [], [], [], nothing
+    for effect in sliders:
+        each, there, x, _ = scaled(effect)
+        turned = jax.vmap(lambda row, k: jnp.roll(row, -k), in_axes=(1, 0))(x, largest)
+        position = jax.vmap(lambda e, x: e.settled_states(x, x))(each, turned)
+        sizes = jax.vmap(lambda e: e.sliders().slip_displacement)(each)
+        slip.append(jax.vmap(jax.vmap(_slip_of, (None, 1, 0)))(turned, position, sizes))
+        stiffness.append(jax.vmap(lambda e: e.sliders().stiffness)(each))
+        owner += [[e.at for e in distinct].index(effect.at)] * stiffness[-1].shape[1]
+        stuck = stuck + there.matrix(jax.vmap(lambda e: e.added_stiffness())(each)[:, None])
+    at_first, onsets, ends = (jnp.concatenate(part, axis=1) for part in zip(*slip, strict=True))
+    return Friction(
+        *(tau[largest], stuck, viscous, memories, places, np.array(owner)),
+        jnp.concatenate(stiffness, axis=1),
+        Slip(at_first, jnp.moveaxis(onsets, 2, 0), jnp.moveaxis(ends, 2, 0)),
+    )
+
+
+def _slip_of(x: Array, position: Array, size: Array) -> tuple[Array, Array, Array]:
+    """Of one slider over a period: dragged at first, phases of onsets and of ends.
+
+    It starts where its stretch reaches the slip displacement, and stops where x turns, which a
+    parabola through three samples says.
+    """
+    n = x.shape[0]
+    width = 2 * jnp.pi / n
+    ahead, behind = jnp.roll(x, -1), jnp.roll(x, 1)
+    moves = position != jnp.roll(position, -1)
+
+    def phases(starts: Array, share: Array) -> Array:
+        (index,) = jnp.nonzero(starts, size=_MOST_SLIPS, fill_value=n)
+        known = index < n
+        there = (index + share[jnp.minimum(index, n - 1)]) * width
+        return jnp.where(known, there, jnp.inf)
+
+    rise = ahead - x
+    reach = position + jnp.sign(rise) * size
+    onset = jnp.clip((reach - x) / jnp.where(rise != 0, rise, 1.0), 0.0, 1.0)
+    bend = 2 * x - ahead - behind
+    turn = jnp.clip(0.5 * (ahead - behind) / jnp.where(bend != 0, bend, 1.0), -0.5, 0.5)
+    before = jnp.roll(moves, 1)
+    return before[0], phases(moves & ~before, onset), phases(before & ~moves, turn)
+
+
+def viscous_slope(
+    effects: AbstractHysteresis, x: Float[Array, "time point"], v: Float[Array, "time point"]
+) -> Float[Array, "time point"]:
+    """∂f/∂ẋ of friction without memory, one effect for every point."""
+
+    def slope(effect: AbstractHysteresis, x: Array, v: Array) -> Array:
+        return jax.grad(effect.state_force, argnums=1)(x, v, effect.initial_states())
+
+    return jax.vmap(lambda x, v: jax.vmap(slope)(effects, x, v))(x, v)
+
+
+def states_at(coefficients: Array, frequency: Array, tau: Array) -> tuple[Array, Array]:
+    """q and q̇ of all points at phases τ (time, point), as (time, point, mode)."""
+    orders = jnp.arange(1, (coefficients.shape[1] - 1) // 2 + 1)
+    angle = tau[..., None] * orders
+    cosine, sine = jnp.cos(angle), jnp.sin(angle)
+    mean, a, b = coefficients[:, 0], coefficients[:, 1::2], coefficients[:, 2::2]
+    q = mean + jnp.einsum("tph,phm->tpm", cosine, a) + jnp.einsum("tph,phm->tpm", sine, b)
+    rate = jnp.einsum("tph,phm->tpm", cosine, orders[:, None] * b)
+    rate = rate - jnp.einsum("tph,phm->tpm", sine, orders[:, None] * a)
+    return q, frequency[:, None] * rate

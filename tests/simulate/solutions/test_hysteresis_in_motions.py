@@ -1,0 +1,136 @@
+"""Bouc and Wen's law and contacts that slip and part, in motions: against steps of our own."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import snrmjax as sj
+from snrmjax.model.places import between
+from snrmjax.simulate.continuation.stability import floquet_multipliers
+
+DAMPING, STIFFNESS = np.array([[0.1, -0.05], [-0.05, 0.1]]), np.array([[2.0, -1.0], [-1.0, 2.0]])
+
+
+@pytest.fixture(scope="module")
+def hysteretic():
+    """Two masses with Bouc and Wen's spring between them, and a motion near their second mode."""
+    values = {"stiffness": 0.5, "slip_force": 0.3, "exponent": 2.0, "unloading": 0.6}
+    law = sj.model.make_effect("bouc_wen", values, at=between("x2", "x1"))
+    model = sj.model.from_matrices(np.eye(2), DAMPING, STIFFNESS, force="x1", effects=law)
+    curve = sj.forced_response(model, 0.3, 1.6, 1.8, harmonic_order=9, stability=False)[0]
+    return model, curve, int(np.argmax(np.abs(np.asarray(curve.velocity)[:, 1, 0])))
+
+
+def rates(t, y, omega):
+    x, v, f = y[:2], y[2:4], y[4]
+    way = v[1] - v[0]
+    pull = 0.5 * way * (1 - (f / 0.3) ** 2 * (0.6 * np.sign(way * f) + 0.4))
+    load = np.array([0.3 * np.cos(omega * t), 0.0]) - f * np.array([-1.0, 1.0])
+    return np.concatenate([v, load - DAMPING @ v - STIFFNESS @ x, [pull]])
+
+
+@pytest.fixture(scope="module")
+def in_time(hysteretic):
+    """The settled state and one period of it, by SciPy."""
+    _, curve, place = hysteretic
+    omega = float(curve.frequency[place])
+    period = 2 * np.pi / omega
+    options = {"args": (omega,), "rtol": 1e-8, "atol": 1e-10}
+    begin = solve_ivp(rates, (0, 150 * period), np.zeros(5), **options).y[:, -1]
+    times = period * np.arange(64) / 64
+    return omega, begin, solve_ivp(rates, (0, period), begin, t_eval=times, **options).y[:2]
+
+
+def test_the_balance_is_the_settled_motion(hysteretic, in_time):
+    model, curve, place = hysteretic
+    q = np.asarray(curve.coefficients[place]) @ np.asarray(model.modes.mode_shape).T
+    wanted = np.fft.rfft(in_time[2], axis=1)[:, [1, 3]] / 32
+    for order, of in ((1, 0), (3, 1)):
+        found = q[2 * order - 1] - 1j * q[2 * order]
+        np.testing.assert_allclose(found, wanted[:, of], atol=2e-4 * np.abs(wanted[:, 0]).max())
+
+
+def test_our_integration_is_the_same(hysteretic, in_time):
+    model, curve, place = hysteretic
+    motion = sj.simulate.settled_motion(model, 0.3, in_time[0], harmonic_order=9)
+    np.testing.assert_allclose(
+        motion.coefficients,
+        curve.coefficients[place],
+        atol=3e-4 * np.abs(motion.coefficients).max(),
+    )
+
+
+def test_multipliers_are_those_of_the_map_over_a_period(hysteretic, in_time):
+    model, curve, place = hysteretic
+    omega, begin, _ = in_time
+
+    def after(y):
+        return solve_ivp(rates, (0, 2 * np.pi / omega), y, args=(omega,), rtol=1e-10, atol=1e-12).y[
+            :, -1
+        ]
+
+    step = 1e-5
+    columns = [(after(begin + step * e) - after(begin - step * e)) / (2 * step) for e in np.eye(5)]
+    wanted = np.linalg.eigvals(np.stack(columns, axis=1))
+    wanted = wanted[np.argsort(-np.abs(wanted))][:4]
+    found = floquet_multipliers(model, curve.coefficients[[place]], curve.frequency[[place]])[0]
+    assert np.abs(np.sort(np.abs(found)) - np.sort(np.abs(wanted))).max() < 5e-4
+    assert np.abs(found[:, None] - wanted).min(axis=1).max() < 1e-3
+
+
+def surface(normal_force):
+    """A mass on a surface, along and across it; a static load presses it, a force lifts it."""
+    values = {"stiffness": 5.0, "normal_stiffness": 21.0, "friction": 0.85, "preload": 0.0}
+    contact = sj.model.make_effect("friction_contact", values, at="x", normal_at="y")
+    load = sj.model.make_effect("static_load", {"load": 100.0}, at="y")
+    return sj.model.from_matrices(
+        *(np.eye(2), np.diag([0.35, 2.0]), np.diag([12.0, 21.0]), ("x", "y")),
+        force={"x": 1.0, "y": normal_force},
+        effects=[contact, load],
+    )
+
+
+def stepped(force, omega, periods=40, steps=2000):
+    """One period of the settled motion by Runge and Kutta's steps, the slider pushed after each."""
+    h, y, z, kept = 2 * np.pi / omega / steps, np.zeros(4), 0.0, []
+
+    def pushed(z, x):
+        reach = 0.85 * max(21 * x[1], 0.0) / 5
+        return min(max(z, x[0] - reach), x[0] + reach)
+
+    def rate(t, y):
+        inner = np.array([5 * (y[0] - pushed(z, y[:2])), max(21 * y[1], 0.0) - 100])
+        pull = force * np.cos(omega * t) - np.array([0.35, 2.0]) * y[2:] - [12.0, 21.0] * y[:2]
+        return np.concatenate([y[2:], pull - inner])
+
+    for k in range(periods * steps):
+        t = k * h
+        a = rate(t, y)
+        b = rate(t + h / 2, y + h / 2 * a)
+        c = rate(t + h / 2, y + h / 2 * b)
+        y = y + h / 6 * (a + 2 * b + 2 * c + rate(t + h, y + h * c))
+        z = pushed(z, y[:2])
+        if k >= (periods - 1) * steps:
+            kept.append(y[:2])
+    return np.fft.rfft(np.roll(kept, 1, axis=0), axis=0) / steps
+
+
+@pytest.mark.parametrize("normal_force", [0.1, 1.5], ids=["pressed", "parting"])
+def test_a_contact_slips_with_its_normal_force_and_parts(normal_force):
+    model, omega = surface(normal_force), 3.5
+    force = 100.0
+    curve = sj.forced_response(model, force, 3.0, 4.0, harmonic_order=21, stability=False)[0]
+    near = int(np.argmin(np.abs(curve.frequency - omega)))
+    motion = sj.simulate.periodic_motion(model, force, curve.point(near), value=omega)
+    q = np.asarray(motion.coefficients) @ np.asarray(model.modes.mode_shape).T
+    wanted = stepped(force * np.array([1.0, normal_force]), omega)
+    size = np.abs(2 * wanted[1]).max()
+    np.testing.assert_allclose(q[0], wanted[0].real, atol=1e-3 * size)
+    for order in (1, 2, 3):
+        found = q[2 * order - 1] - 1j * q[2 * order]
+        np.testing.assert_allclose(found, 2 * wanted[order], atol=1e-3 * size)
+    parts = np.min(np.fft.irfft(wanted[:, 1] * 64, 64)) < 0
+    assert parts == (normal_force > 1)
+    if normal_force < 1:
+        settled = sj.simulate.settled_motion(model, force, omega, harmonic_order=21)
+        np.testing.assert_allclose(settled.coefficients, motion.coefficients, atol=1e-3 * size)
