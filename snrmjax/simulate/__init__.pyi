@@ -14,6 +14,7 @@ from .solutions.isolated_responses import IsolatedSearch, isolated_responses
 from .solutions.mode_at_velocities import normal_mode_at_velocities
 from .solutions.normal_modes import nonlinear_normal_mode
 from .solutions.periodic_motion import periodic_motion
+from .solutions.quasi_periodic import quasi_periodic_branch
 from .solutions.time_integration import (
     IntegrationAccuracy,
     MotionStatus,
@@ -70,6 +71,7 @@ __all__ = [
     "phase_controlled",
     "phase_resonance_test",
     "phase_sweep",
+    "quasi_periodic_branch",
     "response_controlled",
     "run_test",
     "s_curve",

@@ -1,0 +1,238 @@
+"""Quasi-periodic motions: the branch that leaves a response at a Neimark-Sacker bifurcation."""
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+
+from snrmjax.model.structures import Structure, simulated_structure
+from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.result import AbstractResult, quantity, setting
+from snrmjax.numerics.status import Status
+from snrmjax.simulate.balance.given_numbers import frequency_range
+from snrmjax.simulate.balance.harmonic_balance import (
+    HarmonicBalance,
+    harmonic_balance,
+    resonance_displacement,
+)
+from snrmjax.simulate.balance.torus_balance import TorusBalance
+from snrmjax.simulate.continuation.continuation import (
+    RUNNING,
+    CurveRange,
+    CurveTracer,
+    StepControl,
+    Tracing,
+)
+from snrmjax.simulate.continuation.response_curve import ResponseCurve
+
+DEFAULT_STEPS = StepControl(first=0.02, smallest=1e-6, largest=0.1, angle=0.2, max_points=300)
+_MOST_MODES = 20
+_FIRST_SIZE = 1e-3  # of the modulation, in scaled unknowns, at the first point
+_ON_CIRCLE = 0.02  # distance from the unit circle of the multipliers that cross it, at most
+
+
+class TorusEnd(Status):
+    """How a branch of quasi-periodic motions ended."""
+
+    UPPER_END = 0, "the upper end of the frequency range"
+    LOWER_END = 1, "the lower end of the frequency range"
+    POINT_LIMIT = 2, "the largest number of points; raise `max_points`"
+    STEP_TOO_SMALL = 3, "where Newton's method fails at the smallest step; raise `slow_order`"
+    NO_START = 4, "at its start: there is no quasi-periodic motion near it with these harmonics"
+    CLOSED = 6, "where it started: a closed branch"
+    PERIODIC = 9, "at another Neimark-Sacker bifurcation: the motion is periodic there"
+
+
+class QuasiPeriodicBranch(AbstractResult):
+    """Motions with two base frequencies in order along a branch, stable or not.
+
+    The first point is the Neimark-Sacker bifurcation itself.
+    """
+
+    coordinates: ClassVar[tuple[str, ...]] = ("sensor",)
+
+    frequency: Float[np.ndarray, " point"] = quantity("point", "Hz", "frequency of the force")
+    slow_frequency: Float[np.ndarray, " point"] = quantity(
+        "point", "Hz", "second base frequency, of the modulation"
+    )
+    velocity: Complex[np.ndarray, "point sensor"] = quantity(
+        "point sensor", "m/s", "velocity at the frequency of the force"
+    )
+    largest_velocity: Float[np.ndarray, "point sensor"] = quantity(
+        "point sensor", "m/s", "largest velocity over the whole motion"
+    )
+    modulation: Float[np.ndarray, " point"] = quantity(
+        "point", "1", "rms of the modulated part of the displacement, over the whole"
+    )
+    coefficients: Float[np.ndarray, "point coefficient mode"]  # kg^1/2 m, of `torus_basis`
+    force: float = setting()  # N
+    slow_order: int = setting()
+    status: TorusEnd = setting()
+    sensors: tuple[str, ...] = quantity("sensor", "", "sensor", name="sensor", static=True)
+
+
+def quasi_periodic_branch(
+    model: Structure,
+    response: ResponseCurve,
+    event: int | None = None,
+    *,
+    within: tuple[float, float] | None = None,
+    slow_order: int = 3,
+    steps: StepControl = DEFAULT_STEPS,
+) -> QuasiPeriodicBranch:
+    """Follow the quasi-periodic motions that begin at a Neimark-Sacker point of a response.
+
+    There a second frequency ω appears, and a motion with two phases, Ωt and ωt, branches off. It is
+    followed in the frequency of the force by a harmonic balance in both, with the response's
+    harmonics of Ω and `slow_order` of ω, until the modulation vanishes at another such point.
+    Motions that lock (ω a simple fraction of Ω) are passed as if they did not. Whether the motions
+    are stable is not computed; where the branch leaves towards frequencies at which the response
+    is unstable they are as a rule.
+
+    Arguments: the `model` of the response; the index of the `event` in it, by default its first
+    Neimark-Sacker point; `within`, frequencies in rad/s where the branch ends, by default those of
+    the response. At most 20 modes, no friction with memory.
+    Raises `ValueError` for a response without such a point and for models beyond these limits.
+    Reference: Guillot, Cochelin & Vergez, Nonlinear Dyn. 97 (2019) 1711 (two base frequencies);
+    Schilder, Osinga & Vogt, SIAM J. Appl. Dyn. Syst. 4 (2005) 459, doi:10.1137/040611240.
+    """
+    model = simulated_structure(model)
+    if model.n_modes > _MOST_MODES:
+        raise ValueError(
+            f"quasi-periodic motions are followed in at most {_MOST_MODES} modes, not "
+            f"{model.n_modes}: leave modes out (`n_modes` of `from_matrices`)."
+        )
+    if model.hysteretic:
+        kinds = ", ".join(effect.kind for effect in model.hysteretic)
+        raise ValueError(f"quasi-periodic motions with a memory ({kinds}) cannot be followed.")
+    if slow_order < 1:
+        raise ValueError(f"`slow_order` must be 1 or more, but is {slow_order}.")
+    ns_points = response.at_events("neimark_sacker")
+    place = event if event is not None else (int(ns_points[0]) if len(ns_points) else None)
+    if place is None or place not in ns_points or response.multipliers is None:
+        raise ValueError("`response` has no Neimark-Sacker point there: see `at_events`.")
+    ends = within or (float(response.frequency.min()), float(response.frequency.max()))
+    lower, upper = frequency_range(*ends)
+
+    order = (response.coefficients.shape[1] - 1) // 2
+    balance = harmonic_balance(
+        model,
+        response.force,
+        resonance_displacement(model, response.force),
+        harmonic_order=order,
+    )
+    start, direction, phase = _beginning(balance, response, place, slow_order)
+    torus = TorusBalance(balance, jnp.asarray(phase), slow_order)
+    scale = float(balance.frequency_scale)
+    points, status = _followed(torus, start, direction, (lower / scale, upper / scale), steps)
+    return _as_result(torus, points, status)
+
+
+def _beginning(
+    balance: HarmonicBalance, response: ResponseCurve, place: int, slow_order: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The point of the bifurcation, the way onto the branch, and what fixes the second phase.
+
+    With the second frequency of the multipliers, the equations of k₂ = 1 have two solutions there,
+    a quarter of its period apart: either is the way.
+    """
+    multipliers = np.asarray(response.multipliers)[place]
+    turning = multipliers[np.abs(multipliers.imag) > 1e-9]
+    if not len(turning) or np.min(np.abs(np.abs(turning) - 1)) > _ON_CIRCLE:
+        raise ValueError("the multipliers of this point do not cross the unit circle in a pair.")
+    crossing = turning[np.argmin(np.abs(np.abs(turning) - 1))]
+    unit = float(balance.frequency_scale)
+    fast = float(response.frequency[place]) / unit
+    slow = abs(np.angle(crossing)) / (2 * np.pi) * fast
+    blank = TorusBalance(balance, jnp.zeros(1), slow_order)
+    size, n = blank.size, balance.model.n_modes
+    x = np.zeros(size)
+    x[: balance.size] = response.coefficients[place].reshape(-1) / float(balance.displacement_scale)
+    start = np.concatenate([x, [slow, fast]])
+    torus = TorusBalance(balance, jnp.zeros(size), slow_order)
+    jacobian = np.asarray(_linearised(torus, jnp.asarray(start))[1])[:size, :size]
+    block = np.flatnonzero(np.repeat(blank.basis.slow, n) == 1)
+    way = np.zeros(size)
+    way[block] = np.linalg.svd(jacobian[np.ix_(block, block)])[2][-1]
+    phase = (np.asarray(blank.basis.by_slow) @ way.reshape(-1, n)).reshape(-1)
+    direction = np.concatenate([way, [0.0, 0.0]])
+    return start, direction, phase / np.linalg.norm(phase)
+
+
+@compiled
+def _linearised(torus: TorusBalance, point: Array) -> tuple[Array, Array]:
+    return torus.linearised(point)
+
+
+def _tracer(torus: TorusBalance, within: CurveRange, steps: StepControl) -> CurveTracer:
+    return CurveTracer(torus.linearised, within, steps)
+
+
+@compiled
+def _begun(
+    torus: TorusBalance, within: CurveRange, steps: StepControl, start: Array, direction: Array
+) -> Tracing:
+    return _tracer(torus, within, steps).begun(start, direction, direction)
+
+
+@compiled
+def _corrected(
+    torus: TorusBalance, within: CurveRange, steps: StepControl, walk: Tracing
+) -> tuple[Tracing, Array]:
+    return _tracer(torus, within, steps).corrected(walk)
+
+
+def _followed(
+    torus: TorusBalance,
+    start: np.ndarray,
+    direction: np.ndarray,
+    ends: tuple[float, float],
+    steps: StepControl,
+) -> tuple[np.ndarray, TorusEnd]:
+    """Points of the branch; one by one, because only the host sees that a modulation vanished."""
+    within = CurveRange(*ends)
+    slow = np.flatnonzero(np.repeat(torus.basis.slow, torus.balance.model.n_modes))
+    begin = jnp.asarray(start + _FIRST_SIZE * direction)
+    walk, points = _begun(torus, within, steps, begin, jnp.asarray(direction)), [start]
+    while int(walk.status) == RUNNING:
+        walk, kept = _corrected(torus, within, steps, walk)
+        if not bool(kept):
+            continue
+        new, last = np.asarray(walk.here), points[-1]
+        if len(points) > 2 and new[slow] @ last[slow] < 0:
+            # The other half of the branch is the same motions, half a slow period later.
+            sizes = [np.linalg.norm(part[slow]) for part in (last, new)]
+            share = sizes[0] / sum(sizes)
+            points.append(last + share * (new - last))
+            return np.stack(points), TorusEnd.PERIODIC
+        points.append(new)
+    return np.stack(points), TorusEnd(int(walk.status))
+
+
+def _as_result(torus: TorusBalance, points: np.ndarray, status: TorusEnd) -> QuasiPeriodicBranch:
+    balance, basis = torus.balance, torus.basis
+    modes, n = balance.model.modes, balance.model.n_modes
+    shape, unit = np.asarray(modes.mode_shape), float(balance.frequency_scale)
+    slow, fast = points[:, -2] * unit, points[:, -1] * unit
+    scale = float(balance.displacement_scale)
+    x = scale * points[:, :-2].reshape(len(points), -1, n)
+    fundamental = (x[:, 1] - 1j * x[:, 2]) @ shape.T
+    largest = []
+    for coefficients, one, two in zip(x, fast, slow, strict=True):
+        rate = one * basis.by_fast + two * basis.by_slow
+        largest.append(np.max(np.abs(basis.synthesis @ rate @ coefficients @ shape.T), axis=0))
+    moving = (x[:, 1:] ** 2).sum(axis=2)
+    share = moving[:, basis.slow[1:] > 0].sum(axis=1) / moving.sum(axis=1)
+    return QuasiPeriodicBranch(
+        frequency=fast,
+        slow_frequency=slow,
+        velocity=1j * fast[:, None] * fundamental,
+        largest_velocity=np.stack(largest),
+        modulation=np.sqrt(share),
+        coefficients=x,
+        force=float(balance.force),
+        slow_order=torus.slow_order,
+        status=status,
+        sensors=modes.sensors,
+    )
