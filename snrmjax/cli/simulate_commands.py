@@ -17,7 +17,8 @@ def simulate(
     force: Annotated[
         list[float],
         typer.Option(
-            help="Peak amplitude of the harmonic force in N; give it again for further forces.",
+            help="Peak amplitude of the harmonic force in N, or of the base's acceleration in m/s² "
+            "where the model has [base]; give it again for further ones.",
             metavar="N",
             show_default=False,
         ),
@@ -88,15 +89,16 @@ def simulate(
         raise ValueError("`--follow` needs `--to`, the value that the parameter goes to.")
     if follow is None and (to is not None or parameter != "force"):
         raise ValueError("`--parameter` and `--to` need `--follow`, the kind of event.")
+    structure = read_model(model)
     with staged(out) as folder:
         found = simulate_responses(
-            *(read_model(model), force, from_hz, to_hz),
+            *(structure, force, from_hz, to_hz),
             harmonics=harmonics,
             isolated=isolated,
             follow=[] if follow is None else [follow],
             parameter=parameter,
             to=to,
-            progress=lambda load: say(f"force {load:g} N"),
+            progress=lambda load: say(f"{load:g} {structure.modes.force_unit}"),
         )
         simulation.write(folder, found)
     tell(found)

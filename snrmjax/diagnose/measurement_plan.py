@@ -94,4 +94,5 @@ def _states(diagnosis: Diagnosis, parts: list[_Part]) -> SteadyStates:
         force_std=force_std * force,
         drive=np.median(volts) * force if np.isfinite(volts).all() else None,
         order=np.ones(n) if stated else None,
+        base=data.base,
     )

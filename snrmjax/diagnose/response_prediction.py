@@ -261,6 +261,7 @@ def held_curves(
         held[:, None] * seen + 0j,
         sensors=data.sensors,
         measured=np.tile(seen, (len(of), 1)),
+        base=data.base,
     )
     needed = np.abs(np.asarray(inverse_force(model, states, harmonic_order=5).force)) / force_gain
     return [

@@ -23,7 +23,13 @@ REQUIRED: dict[str, tuple[Rule, ...]] = {
 """Columns that every table has, beside `force_n` or `drive_v`, and the rules of their numbers."""
 
 FORCES: dict[str, tuple[Rule, ...]] = {"force_n": (POSITIVE,), "drive_v": (POSITIVE,)}
-"""Columns of which a table has exactly one."""
+"""Columns of which a table has exactly one, or both parts of a base's acceleration."""
+
+BASE = ("base_acceleration_re_m_s2", "base_acceleration_im_m_s2")
+"""The acceleration of a base that moves, as a phasor, in place of a force."""
+
+BASE_STD = "base_acceleration_std_m_s2"
+"""Its 1σ, in place of that of a force."""
 
 OPTIONAL: dict[str, tuple[Rule, ...]] = {
     "velocity_std_m_s": (NOT_NEGATIVE,),
@@ -34,9 +40,11 @@ OPTIONAL: dict[str, tuple[Rule, ...]] = {
 }
 """Columns of numbers that a table may have, and in which a field may be empty."""
 
-_KNOWN = frozenset((*REQUIRED, *FORCES, *OPTIONAL, "sensor"))  # all but those of the harmonics
+_KNOWN = frozenset(
+    (*REQUIRED, *FORCES, *BASE, BASE_STD, *OPTIONAL, "sensor")
+)  # all but those of the harmonics
 _STEMS = {
-    stem: name for name in _KNOWN if (stem := re.sub(r"_(hz|n|v|m_s|deg)$", "", name)) != name
+    stem: name for name in _KNOWN if (stem := re.sub(r"_(hz|n|v|m_s|m_s2|deg)$", "", name)) != name
 }
 # What stands behind a stem when someone meant the column, but in another unit or in none.
 _UNIT = re.compile(
@@ -120,6 +128,9 @@ def _require(used: set[str], further: list[str], file: str) -> None:
         if name not in used and not (name in PHASOR and AMPLITUDE in used):
             raise ValueError(f"{file} lacks the column `{name}`{instead(name)}.")
     forces = used.intersection(FORCES)
+    _require_base(used, forces, file)
+    if BASE[0] in used:
+        return
     if not forces:
         near = instead("force_n") or instead("drive_v")
         raise ValueError(f"{file} lacks the column `force_n` or `drive_v`{near}.")
@@ -127,6 +138,26 @@ def _require(used: set[str], further: list[str], file: str) -> None:
         raise ValueError(
             f"{file} must have either `force_n` or `drive_v`, but has both columns: "
             "`drive_v` is for a force that is only known in volts."
+        )
+
+
+def _require_base(used: set[str], forces: set[str], file: str) -> None:
+    """Refuse half a base's acceleration, one beside a force, and an error of the other kind."""
+    of_base = used.intersection(BASE)
+    if len(of_base) == 1:
+        missing = next(name for name in BASE if name not in used)
+        raise ValueError(f"{file} has the column `{of_base.pop()}`, but lacks `{missing}`.")
+    if of_base and forces:
+        raise ValueError(
+            f"{file} must have either a force or the acceleration of a base, but has the columns "
+            f"`{sorted(forces)[0]}` and `{BASE[0]}`."
+        )
+    wrong, right = (("force_std_n", BASE_STD), (BASE_STD, "force_std_n"))[not of_base]
+    if wrong in used:
+        raise ValueError(
+            f"{file} has the column `{wrong}`, but "
+            + ("a base moves it" if of_base else "no base's acceleration")
+            + f": expected `{right}`."
         )
 
 

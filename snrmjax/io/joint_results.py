@@ -18,7 +18,7 @@ from snrmjax.identify.inference.optimal_design import NextMeasurement, NextMeasu
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.test_model.states import LEVEL_ERRORS
 from snrmjax.io.files import FilePath, read_text, write_atomically
-from snrmjax.io.results import write_values
+from snrmjax.io.results import load_named, write_values
 from snrmjax.io.tables import write_table
 from snrmjax.io.units import HERTZ
 from snrmjax.numerics.facts import Fact
@@ -38,8 +38,13 @@ def write_fitted_backbone(
     write_values(path, values_to_the_largest(fit, BAND_POINTS), added=added)
 
 
-def write_next(path: FilePath, advice: Sequence[NextMeasurement] | NextMeasurements) -> None:
-    """Write the advised measurements, the best first.
+def write_next(
+    path: FilePath,
+    advice: Sequence[NextMeasurement] | NextMeasurements,
+    *,
+    force_unit: str = "N",
+) -> None:
+    """Write the advised measurements, the best first; `force_unit` as for `results.load_named`.
 
     Where only the drive is known a column `drive_v` has it, and `force_n` is by the gain that the
     fit found.
@@ -56,14 +61,14 @@ def write_next(path: FilePath, advice: Sequence[NextMeasurement] | NextMeasureme
     drives = [measurement.drive for measurement in advice if measurement.drive is not None]
     if drives or (isinstance(advice, NextMeasurements) and advice.drive_known_only):
         columns["drive_v"] = drives
-    write_table(path, columns)
+    write_table(path, load_named(columns, force_unit))
 
 
 def summarise_fit(
     fit: JointFit, responses: Sequence[FittedResponse], shares: Sequence[Contribution] = ()
 ) -> dict:
     """What a joint fit found, by name, in the units of the files."""
-    std = np.sqrt(np.diag(fit.covariance))
+    std, unit = np.sqrt(np.diag(fit.covariance)), fit.modes.force_unit
     vector = np.asarray(fit.vector()[0])
     linear = len(fit.unknowns.linear)
     shown = len(vector) - fit.data.n_levels * len(LEVEL_ERRORS) - linear
@@ -95,10 +100,12 @@ def summarise_fit(
         },
         "modal_mass": _modal_mass(fit),
         "contributions": [share._asdict() for share in shares],
-        "resonances": [_point(p) for r in responses for p in r.resonances],
-        "folds": [_point(p) for r in responses for p in r.folds],
+        "resonances": [load_named(_point(p), unit) for r in responses for p in r.resonances],
+        "folds": [load_named(_point(p), unit) for r in responses for p in r.folds],
         "not_located": [
-            {"kind": p.kind, "force_n": p.force, "frequency_hz": p.frequency / HERTZ}
+            load_named(
+                {"kind": p.kind, "force_n": p.force, "frequency_hz": p.frequency / HERTZ}, unit
+            )
             for r in responses
             for p in r.not_located
         ],

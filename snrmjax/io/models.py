@@ -7,7 +7,7 @@ import numpy as np
 import tomli_w
 
 from snrmjax.io.files import FilePath, file_name, read_text, shown, write_atomically
-from snrmjax.io.structure_matrices import listed_sensors, structure_of_matrices
+from snrmjax.io.structure_matrices import listed_sensors, moving_base, structure_of_matrices
 from snrmjax.io.toml_table import TomlTable, parsed_toml
 from snrmjax.io.units import DEGREE, HERTZ, in_unit
 from snrmjax.model.effect_base import AbstractEffect, AbstractForce
@@ -35,7 +35,7 @@ from snrmjax.numerics.rules import BELOW_ONE, IN_RANGE_HZ, NOT_NEGATIVE, NOT_ZER
 
 _TOP_KEYS = (
     *("name", "mode_of_interest", "mode", "rigid_body_mode", "damping_coupling"),
-    *("potential", "effect", "measurement", "sensors", "structure", "force"),
+    *("potential", "effect", "measurement", "sensors", "structure", "force", "base"),
 )
 _OF_MODES = ("mode", "rigid_body_mode", "damping_coupling", "potential")
 
@@ -81,7 +81,7 @@ def read_model(path: FilePath) -> Structure:
         stiffness = [[2.0, -1.0], [-1.0, 2.0]]     # N/m
         damping_ratio = 0.01                       # or damping, a matrix in N s/m
         [force]
-        at = { a = 1.0 }                           # newtons per newton of the recorded force
+        at = { a = 1.0 }                           # newtons per newton; or [base], as above
         [[effect]]
         kind = "one_sided_stop"
         between = ["b", "a"]                       # acts on x_b − x_a
@@ -172,6 +172,9 @@ def _modes(top: TomlTable, file: str) -> LinearModes:
             f"({of_interest}) is zero at every sensor."
         )
 
+    base = moving_base(top, file)
+    if base is not None and rigid_tables:
+        raise ValueError(f"{file} has both [base] and [[rigid_body_mode]]: a base holds it.")
     names, watched = sensors, listed_sensors(top, file)
     if watched is not None:
         for sensor in watched:
@@ -208,6 +211,7 @@ def _modes(top: TomlTable, file: str) -> LinearModes:
             {name: row[: len(flexible)].tolist() for name, row in others.items()},
             _coupling(top, len(flexible)),
             lag if any(lag := stds("participation_lag")) else None,
+            base,
         ),
     )
 
@@ -378,6 +382,9 @@ def _entries(model: Structure) -> dict[str, object]:
         "effect": [_effect_entry(effect) for effect in model.effects],
         "measurement": {key: value for key, value in errors.items() if value},
         "sensors": {"points": list(modes.sensors)} if modes.points else {},
+        "base": {}
+        if modes.base is None
+        else {"motion": modes.base.motion, "along": dict(modes.base.along)},
         "damping_coupling": []
         if modes.damping_coupling is None
         else np.asarray(modes.damping_coupling).tolist(),

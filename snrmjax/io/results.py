@@ -1,7 +1,7 @@
 """Results as tables and as one summary: what the commands write."""
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -10,7 +10,10 @@ from snrmjax.io.files import FilePath
 from snrmjax.io.tables import write_table
 from snrmjax.io.units import HERTZ
 from snrmjax.simulate.balance.labelled import velocity_peaks
-from snrmjax.simulate.continuation.response_curve import ResponseCurve
+from snrmjax.simulate.continuation.response_curve import (
+    ResponseCurve,
+    recorded_velocity,
+)
 from snrmjax.simulate.continuation.stability import Stability
 from snrmjax.simulate.solutions.event_curves import EventCurve
 from snrmjax.simulate.solutions.normal_modes import NormalModeBranch
@@ -40,34 +43,34 @@ def write_response(
 
     `stable` is 1 where a motion is known to be stable and else 0; where stability was not
     computed, `event` says so with "stability_not_computed". Of several sensors the fundamentals
-    follow in columns with their names.
+    follow in columns with their names. Where a base drives the structure the velocities are those
+    that the sensors record, and a column `base_acceleration_m_s2` stands in place of `force_n`.
 
     Arguments: `sensor` is the name of one, by default the first.
     Raises `ValueError` when there is no such sensor or the file cannot be written.
     """
     r = _place(curves[0].sensors, sensor) if curves else 0
     force = np.concatenate([np.full(len(c.frequency), c.force) for c in curves])
-    velocity = np.concatenate([c.velocity[:, :, r] for c in curves])
+    recorded = [recorded_velocity(c, c.force) for c in curves]
+    velocity = np.concatenate([v[:, :, r] for v in recorded])
     named = {}
     if curves and len(curves[0].sensors) > 1:
         for place, name in enumerate(curves[0].sensors):
-            fundamental = np.concatenate([c.velocity[:, 1, place] for c in curves])
+            fundamental = np.concatenate([v[:, 1, place] for v in recorded])
             named[f"velocity_h1_{name}_re_m_s"] = fundamental.real
             named[f"velocity_h1_{name}_im_m_s"] = fundamental.imag
-    write_table(
-        path,
-        {
-            "force_n": force,
-            "point": _numbered(force),
-            "frequency_hz": np.concatenate([c.frequency for c in curves]) / HERTZ,
-            "velocity_h1_re_m_s": velocity[:, 1].real,
-            "velocity_h1_im_m_s": velocity[:, 1].imag,
-            "velocity_peak_m_s": velocity_peaks(velocity),
-            "stable": np.concatenate([c.is_stable for c in curves]),
-            "event": [event for c in curves for event in _events(c)],
-            **named,
-        },
-    )
+    columns = {
+        "force_n": force,
+        "point": _numbered(force),
+        "frequency_hz": np.concatenate([c.frequency for c in curves]) / HERTZ,
+        "velocity_h1_re_m_s": velocity[:, 1].real,
+        "velocity_h1_im_m_s": velocity[:, 1].imag,
+        "velocity_peak_m_s": velocity_peaks(velocity),
+        "stable": np.concatenate([c.is_stable for c in curves]),
+        "event": [event for c in curves for event in _events(c)],
+        **named,
+    }
+    write_table(path, load_named(columns, curves[0].force_unit if curves else "N"))
 
 
 def write_event_curves(
@@ -82,26 +85,21 @@ def write_event_curves(
         raise ValueError("there is no curve of events to write.")
     r = _place(curves[0].sensors, sensor)
     sizes = [len(c.frequency) for c in curves]
-    fundamental = np.concatenate([c.velocity[:, 1, r] for c in curves])
-    write_table(
-        path,
-        {
-            "curve": np.repeat(np.arange(len(curves)), sizes),
-            "kind": [c.kind for c, n in zip(curves, sizes, strict=True) for _ in range(n)],
-            "parameter": [
-                c.parameter for c, n in zip(curves, sizes, strict=True) for _ in range(n)
-            ],
-            "value": np.concatenate([c.value for c in curves]),
-            "force_n": np.concatenate([c.force for c in curves]),
-            "frequency_hz": np.concatenate([c.frequency for c in curves]) / HERTZ,
-            "velocity_h1_re_m_s": fundamental.real,
-            "velocity_h1_im_m_s": fundamental.imag,
-            "velocity_peak_m_s": velocity_peaks(
-                np.concatenate([c.velocity[:, :, r] for c in curves])
-            ),
-            "event": [event for c in curves for event in c.event],
-        },
-    )
+    velocity = np.concatenate([recorded_velocity(c, c.force)[:, :, r] for c in curves])
+    fundamental = velocity[:, 1]
+    columns = {
+        "curve": np.repeat(np.arange(len(curves)), sizes),
+        "kind": [c.kind for c, n in zip(curves, sizes, strict=True) for _ in range(n)],
+        "parameter": [c.parameter for c, n in zip(curves, sizes, strict=True) for _ in range(n)],
+        "value": np.concatenate([c.value for c in curves]),
+        "force_n": np.concatenate([c.force for c in curves]),
+        "frequency_hz": np.concatenate([c.frequency for c in curves]) / HERTZ,
+        "velocity_h1_re_m_s": fundamental.real,
+        "velocity_h1_im_m_s": fundamental.imag,
+        "velocity_peak_m_s": velocity_peaks(velocity),
+        "event": [event for c in curves for event in c.event],
+    }
+    write_table(path, load_named(columns, curves[0].force_unit))
 
 
 def _events(curve: ResponseCurve) -> list[str]:
@@ -134,15 +132,29 @@ def write_normal_mode(
     )
 
 
+def load_named(columns: Mapping[str, Any], unit: str) -> dict[str, Any]:
+    """Columns, or entries of a summary, with the force by what it is.
+
+    Arguments: `unit` of what drives the structure: in m/s², of a base, `force_n` is called
+    `base_acceleration_m_s2`.
+    """
+    name = "force_n" if unit == "N" else "base_acceleration_m_s2"
+    return {name if key == "force_n" else key: value for key, value in columns.items()}
+
+
 def write_points(
-    path: FilePath, identification: "Identification", *, added: tuple[str, int] | None = None
+    path: FilePath,
+    identification: "Identification",
+    *,
+    added: tuple[str, int] | None = None,
+    force_unit: str = "N",
 ) -> None:
     """Write the identified points, one row a steady state.
 
-    Arguments: `added` as for `write_values`.
+    Arguments: `added` as for `write_values`; `force_unit` as for `load_named`.
     """
     held = identification.points.variables()
-    columns = {name: held[name].values for name in _POINTS}
+    columns = load_named({name: held[name].values for name in _POINTS}, force_unit)
     write_table(path, _with_amplitude(columns, "backbone_velocity_m_s", added))
 
 
@@ -185,27 +197,30 @@ def write_prediction(
     *,
     drives: Sequence[float | None] = (),
     velocity_stds: Sequence[np.ndarray] = (),
+    force_unit: str = "N",
 ) -> None:
     """Write predicted responses at the backbone's sensor; isolated parts follow the main curve.
 
     Arguments: `drives` are the drive voltages of the responses in V where the force is known as
     one: a column `drive_v` has them; `velocity_stds` 1σ of each response's velocity amplitude at
-    fixed frequency in m/s, of a further level: a column `velocity_std_m_s`.
+    fixed frequency in m/s, of a further level: a column `velocity_std_m_s`; `force_unit` as for
+    `load_named`.
     Raises `ValueError` when the file cannot be written.
     """
     force = np.concatenate([np.full(len(c.frequency), c.force) for c in responses])
     velocity = np.concatenate([c.velocity for c in responses])
     volts = [d for d, c in zip(drives, responses, strict=False) for _ in c.frequency if d]
+    columns = {
+        "force_n": force,
+        "point": _numbered(force),
+        "frequency_hz": np.concatenate([c.frequency for c in responses]) / HERTZ,
+        "velocity_re_m_s": velocity.real,
+        "velocity_im_m_s": velocity.imag,
+        "stable": np.concatenate([c.stable for c in responses]),
+    }
     write_table(
         path,
-        {
-            "force_n": force,
-            "point": _numbered(force),
-            "frequency_hz": np.concatenate([c.frequency for c in responses]) / HERTZ,
-            "velocity_re_m_s": velocity.real,
-            "velocity_im_m_s": velocity.imag,
-            "stable": np.concatenate([c.stable for c in responses]),
-        }
+        load_named(columns, force_unit)
         | ({"drive_v": volts} if volts else {})
         | ({"velocity_std_m_s": np.concatenate(velocity_stds)} if velocity_stds else {}),
     )
@@ -229,7 +244,7 @@ def write_coupled_prediction(
         "velocity_im_m_s": velocity.imag,
         "stable": np.concatenate([c.is_stable for c in curves]),
     }
-    write_table(path, columns)
+    write_table(path, load_named(columns, curves[0].force_unit if curves else "N"))
 
 
 def summarise(identification: "Identification", values: "BackboneValues") -> dict:

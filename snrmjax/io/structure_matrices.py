@@ -12,6 +12,7 @@ from jaxtyping import Float
 from snrmjax.io.files import shown
 from snrmjax.io.toml_table import TomlTable
 from snrmjax.io.units import DEGREE
+from snrmjax.model.base_motion import MOTIONS, BaseMotion, base_motion
 from snrmjax.model.builders.matrices import from_matrices
 from snrmjax.model.effect_base import AbstractEffect
 from snrmjax.model.structures import Structure
@@ -23,7 +24,7 @@ _MATRICES = ("mass", "stiffness", "damping")
 def structure_of_matrices(
     top: TomlTable, file: str, folder: Path, effects: tuple[AbstractEffect, ...]
 ) -> Structure:
-    """The structure of [structure], [force] and [sensors].
+    """The structure of [structure], [force] or [base], and [sensors].
 
     Matrices stand in the table or in a file beside it: NPZ or MAT with arrays `mass`, `stiffness`,
     `points` and perhaps `damping`. Raises `ValueError` that names file, table and key.
@@ -48,10 +49,14 @@ def structure_of_matrices(
     damping: Any = matrices.get("damping")
     if "damping_ratio" in parts:
         damping = table.number("damping_ratio", BELOW_ONE)
+    base = moving_base(top, file)
+    if base is not None and "force" in top.entries:
+        raise ValueError(f"{file} has both [force] and [base]: a force or a base that moves.")
     try:
         return from_matrices(
             *(matrices["mass"], damping, matrices["stiffness"], points),
-            force=_force(top.table("force", f"[force] of {file}")),
+            force=None if base else _force(top.table("force", f"[force] of {file}")),
+            base=base,
             effects=effects,
             n_modes=table.whole("modes", 1) if "modes" in parts else None,
             mode_of_interest=top.whole("mode_of_interest", 1, 1) - 1,
@@ -60,6 +65,21 @@ def structure_of_matrices(
         )
     except ValueError as error:
         raise ValueError(f"{table.place} cannot be read: {error}") from error
+
+
+def moving_base(top: TomlTable, file: str) -> BaseMotion | None:
+    """The base of [base]; None where a force drives the structure."""
+    if "base" not in top.entries:
+        return None
+    table = top.table("base", f"[base] of {file}")
+    table.check_keys(("motion",), ("along",))
+    said = table.text("motion")
+    motion = next((kind for kind in MOTIONS if kind == said), None)
+    if motion is None:
+        raise table.refusal("motion", "what the sensors record, absolute or relative", said)
+    along = table.table("along", f"`along` of {table.place}") if "along" in table.entries else None
+    cosines = {} if along is None else {point: along.number(point) for point in along.entries}
+    return base_motion(motion, cosines)
 
 
 def listed_sensors(top: TomlTable, file: str) -> list[str] | None:

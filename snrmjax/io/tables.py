@@ -13,6 +13,8 @@ import numpy as np
 
 from snrmjax.io.columns import (
     AMPLITUDE,
+    BASE,
+    BASE_STD,
     FORCES,
     OPTIONAL,
     PHASOR,
@@ -23,7 +25,15 @@ from snrmjax.io.columns import (
 from snrmjax.io.files import FilePath, file_name, read_text, shown, write_atomically
 from snrmjax.io.rows import Cells, cells_of
 from snrmjax.io.units import DEGREE, HERTZ, in_unit
-from snrmjax.measure.states import NO_PHASE, UNNAMED_SENSOR, SteadyStates, steady_states
+from snrmjax.measure.base_excitation import as_recorded, base_excited_states
+from snrmjax.measure.states import (
+    NO_PHASE,
+    UNNAMED_SENSOR,
+    OptionalColumns,
+    SteadyStates,
+    steady_states,
+)
+from snrmjax.model.base_motion import BaseMotion
 from snrmjax.model.modes import LinearModes
 from snrmjax.model.structures import Structure, modes_of
 from snrmjax.numerics.facts import Fact
@@ -42,30 +52,56 @@ def read_steady_states(
     by several sensors; a sensor that comes again starts a new state. Files are in Hz and degrees,
     the result is in rad/s and rad. An empty field in an optional column is "not stated". In place
     of the two parts of the velocity's phasor a table may have `velocity_m_s`, the amplitude of its
-    fundamental: the phases are then unknown (`SteadyStates.phase_unknown`).
+    fundamental: the phases are then unknown (`SteadyStates.phase_unknown`). In place of a force it
+    may have the acceleration of a base, whose motion is taken away where the model's `[base]` says
+    that the sensors record it too.
 
     Arguments: `model` is the structure that was measured, whose sensors the table must have; in
     its place `sensors` may name them. Without either the sensors are those of the table, in the
-    order in which they appear. Returns the steady states with the sensors in the model's order;
+    order in which they appear, and of a base's acceleration velocities are kept as they stand.
+    Returns the steady states with the sensors in the model's order;
     their `notes` say what of the file was not used or not stated.
     Raises `ValueError` that names file, row, column, value and what was expected.
 
     Typical use: `data = read_steady_states("measured.csv", read_model("model.toml"))`.
     """
-    if model is not None:
-        sensors = modes_of(model).sensors
-    return _read(read_text(path), file_name(path), sensors)
+    if model is None:
+        return _read(read_text(path), file_name(path), sensors)
+    modes = modes_of(model)
+    data = _read(read_text(path), file_name(path), modes.sensors, modes.base)
+    check_driven_alike(data, modes, file_name(path))
+    return data
 
 
-def _read(text: str, file: str, sensors: tuple[str, ...] | None) -> SteadyStates:
+def check_driven_alike(data: SteadyStates, modes: LinearModes, file: str) -> None:
+    """Refuse a force where the model has a base, and the other way round."""
+    if (data.base is None) == (modes.base is None):
+        return
+    if modes.base is None:
+        raise ValueError(
+            f"{file} has the acceleration of a base, but the model has no [base]: add "
+            '`[base]` with `motion = "absolute"` (or "relative") to it, participations then being '
+            "those of the base's acceleration (`snrmjax modes --base` writes both)."
+        )
+    column = "drive_v" if np.isfinite(np.asarray(data.drive)).any() else "force_n"
+    raise ValueError(
+        f"{file} has `{column}`, but the model's [base] says that a base moves it: expected the "
+        f"columns `{BASE[0]}` and `{BASE[1]}`."
+    )
+
+
+def _read(
+    text: str, file: str, sensors: tuple[str, ...] | None, base: BaseMotion | None = None
+) -> SteadyStates:
     cells = cells_of(text, file)
     header = read_header(cells)
     cells.require_rows()
     notes = list(header.notes)
-    rules = REQUIRED | FORCES | OPTIONAL | dict.fromkeys(header.harmonics, ())
+    rules = REQUIRED | FORCES | OPTIONAL | dict.fromkeys((*header.harmonics, *BASE), ())
+    rules[BASE_STD] = OPTIONAL["force_std_n"]
     columns: dict[str, np.ndarray] = {}
     for name in [name for name in rules if name in header.used]:
-        optional = name in OPTIONAL or name in header.harmonics
+        optional = name in OPTIONAL or name in header.harmonics or name == BASE_STD
         columns[name] = cells.numbers(name, rules[name], empty_allowed=optional)
         empty = np.flatnonzero(np.isnan(columns[name]))
         if empty.size:
@@ -86,8 +122,13 @@ def _read(text: str, file: str, sensors: tuple[str, ...] | None) -> SteadyStates
         raise ValueError(f"{file} has nothing but zero velocities.")
 
     names, sensor = _sensors(cells, sensors)
-    force = columns["drive_v"] if "drive_v" in columns else columns["force_n"]
-    key_columns = [columns["level"], columns["frequency_hz"], force]
+    force = "drive_v" if "drive_v" in columns else "force_n"
+    moved = BASE[0] in columns
+    if moved and not np.all(columns[BASE[0]] ** 2 + columns[BASE[1]] ** 2 > 0):
+        row = int(np.argmin(columns[BASE[0]] ** 2 + columns[BASE[1]] ** 2))
+        raise cells.refusal(BASE[0], f"above zero together with `{BASE[1]}`", row)
+    loads = BASE if moved else (force,)
+    key_columns = [columns[name] for name in ("level", "frequency_hz", *loads)]
     if "order" in columns:
         key_columns.append(np.nan_to_num(columns["order"], nan=-1.0))
     state = group_states(np.column_stack(key_columns).tolist(), sensor)
@@ -107,22 +148,35 @@ def _read(text: str, file: str, sensors: tuple[str, ...] | None) -> SteadyStates
     for k, order in enumerate(header.harmonic_order):
         harmonics[(*at, k)] = _harmonic(cells, columns, order)
     not_stated = np.full(len(sensor), np.nan)
-    data = steady_states(
-        level=columns["level"][first_row].astype(np.int64),
-        frequency=columns["frequency_hz"][first_row] * HERTZ,
-        force=np.full(n_states, np.nan) if "drive_v" in columns else columns["force_n"][first_row],
-        velocity=per_sensor(velocity, 0.0),
-        sensors=names,
-        measured=per_sensor(np.ones(len(sensor), dtype=bool), False),
-        velocity_std=per_sensor(columns.get("velocity_std_m_s", not_stated)),
-        phase_std=per_sensor(columns.get("phase_std_deg", not_stated)) * DEGREE,
-        force_std=_force_std(cells, columns.get("force_std_n"), state),
-        drive=per_state("drive_v"),
-        order=per_state("order"),
-        harmonics=harmonics,
-        harmonic_std=per_sensor(columns.get("harmonic_std_m_s", not_stated)),
-        harmonic_order=header.harmonic_order,
-    )
+    level = columns["level"][first_row].astype(np.int64)
+    frequency = columns["frequency_hz"][first_row] * HERTZ
+    beside: OptionalColumns = {
+        "measured": per_sensor(np.ones(len(sensor), dtype=bool), False),
+        "velocity_std": per_sensor(columns.get("velocity_std_m_s", not_stated)),
+        "phase_std": per_sensor(columns.get("phase_std_deg", not_stated)) * DEGREE,
+        "force_std": _force_std(cells, columns, state),
+        "drive": per_state("drive_v"),
+        "order": per_state("order"),
+        "harmonics": harmonics,
+        "harmonic_std": per_sensor(columns.get("harmonic_std_m_s", not_stated)),
+        "harmonic_order": header.harmonic_order,
+    }
+    if moved:
+        # What the sensors record is only known with a model: as if relative without one.
+        known = base or BaseMotion("relative")
+        data = base_excited_states(
+            *(level, frequency, _phasors(*(columns[name][first_row] for name in BASE))),
+            per_sensor(velocity, 0.0),
+            sensors=names,
+            along=dict(known.along),
+            relative=known.motion == "relative",
+            **beside,
+        )
+    else:
+        newtons = columns["force_n"][first_row] if force == "force_n" else np.full(n_states, np.nan)
+        data = steady_states(
+            level, frequency, newtons, per_sensor(velocity, 0.0), sensors=names, **beside
+        )
     return dataclasses.replace(data, notes=tuple(notes))
 
 
@@ -147,17 +201,21 @@ def _phasors(real: np.ndarray, imaginary: np.ndarray) -> np.ndarray:
     return phasors
 
 
-def _force_std(cells: Cells, values: np.ndarray | None, state: Sequence[int]) -> np.ndarray | None:
+def _force_std(
+    cells: Cells, columns: Mapping[str, np.ndarray], state: Sequence[int]
+) -> np.ndarray | None:
     """The standard deviation of the force of every state, on which its rows must agree."""
-    if values is None:
+    name = BASE_STD if BASE_STD in columns else "force_std_n"
+    if name not in columns:
         return None
+    values = columns[name]
     of_state = np.full(max(state) + 1, np.nan)
     for row, (k, value) in enumerate(zip(state, values, strict=True)):
         if np.isnan(of_state[k]):
             of_state[k] = value
         elif value != of_state[k] and not np.isnan(value):
             expected = f"{of_state[k]:g} as in the other rows of this steady state"
-            raise cells.refusal("force_std_n", expected, row)
+            raise cells.refusal(name, expected, row)
     return of_state
 
 
@@ -216,7 +274,8 @@ def write_steady_states(path: FilePath, data: SteadyStates) -> None:
     phases to one rounding of the unit conversion. Columns in which nothing is stated are left out.
 
     Arguments: `data` with the forces of all states, or with the drive voltages of all where no
-    force is known. Voltages beside known forces are left out: a file has one of both.
+    force is known. Voltages beside known forces are left out: a file has one of both. Of a
+    moving base the acceleration is written, and the velocities that the sensors recorded.
     Raises `ValueError` when a file could not hold the data: the rules of the reader apply.
     """
     write_atomically(path, _table_text(_fields(data, file_name(path))))
@@ -224,7 +283,7 @@ def write_steady_states(path: FilePath, data: SteadyStates) -> None:
 
 def _fields(data: SteadyStates, file: str) -> dict[str, list[str]]:
     """The fields of a table of steady states by column, as text; `file` as messages name it."""
-    host: SteadyStates = jax.tree.map(np.asarray, data)
+    host: SteadyStates = jax.tree.map(np.asarray, as_recorded(data))
     if not np.all(np.any(host.measured, axis=1)):
         raise ValueError("each steady state must be measured by a sensor, but one is by none.")
     state, sensor = np.nonzero(host.measured)
@@ -233,7 +292,9 @@ def _fields(data: SteadyStates, file: str) -> dict[str, list[str]]:
         columns["sensor"] = [host.sensors[k] for k in sensor]
     columns["frequency_hz"] = _in_units(host.frequency[state], HERTZ)
     has_force, has_drive = ~np.isnan(host.force), ~np.isnan(host.drive)
-    if np.all(has_force):
+    if np.all(has_force) and data.base is not None:
+        columns |= dict(zip(BASE, (_texts(host.force[state]), ["0.0"] * len(state)), strict=True))
+    elif np.all(has_force):
         columns["force_n"] = _texts(host.force[state])
     elif np.all(has_drive) and not np.any(has_force):
         columns["drive_v"] = _texts(host.drive[state])
@@ -247,7 +308,7 @@ def _fields(data: SteadyStates, file: str) -> dict[str, list[str]]:
     optional = {
         "velocity_std_m_s": _texts(host.velocity_std[state, sensor]),
         "phase_std_deg": _in_units(host.phase_std[state, sensor], DEGREE),
-        "force_std_n": _texts(host.force_std[state]),
+        "force_std_n" if data.base is None else BASE_STD: _texts(host.force_std[state]),
         "order": _texts(host.order[state]),
         "harmonic_std_m_s": _texts(host.harmonic_std[state, sensor]),
     }

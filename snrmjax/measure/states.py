@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
+from snrmjax.model.base_motion import BaseMotion
 from snrmjax.numerics.compiled import value_of
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
@@ -35,7 +36,9 @@ class SteadyStates(AbstractResult):
     A sensor that did not measure a state has `measured` False and velocity 0. A standard
     deviation that is not stated is NaN. A phase with a 1σ of `PHASE_UNKNOWN` or more is unknown:
     of such a velocity and of its harmonics the amplitudes alone count. A force known only as a
-    drive voltage is in `drive` and `force` is NaN. `notes` say what a reader of files did not use
+    drive voltage is in `drive` and `force` is NaN. Of a structure on a moving base `force` is the
+    amplitude of the base's acceleration in m/s² and velocities are relative to it; `base` says what
+    the sensors recorded. `notes` say what a reader of files did not use
     or did not find stated. To differentiate by a column, change it with `dataclasses.replace`.
     """
 
@@ -66,6 +69,7 @@ class SteadyStates(AbstractResult):
         "state sensor", "m/s", "rms error of a harmonic"
     )
     notes: tuple[Fact | str, ...] = setting(default=())
+    base: BaseMotion | None = eqx.field(static=True, default=None)
 
     def summary(self) -> tuple[str, ...]:
         """Ranges, what is stated and what is missing."""
@@ -76,7 +80,9 @@ class SteadyStates(AbstractResult):
 
         n_levels = len(np.unique(np.asarray(self.level)))
         volts = np.isfinite(np.asarray(self.drive)).any() and not np.isfinite(self.force).any()
-        load = spans(self.drive, "V (force unknown)") if volts else spans(self.force, "N")
+        load = (
+            spans(self.drive, "V (force unknown)") if volts else spans(self.force, self.force_unit)
+        )
         stated = [
             name
             for name in ("velocity", "phase", "force")
@@ -87,7 +93,8 @@ class SteadyStates(AbstractResult):
         lines = [
             f"SteadyStates: {self.n_states} states of {n_levels} "
             f"level{'s' if n_levels != 1 else ''} at {', '.join(self.sensors)}",
-            f"frequency {spans(np.asarray(self.frequency) / HERTZ, 'Hz')}, force {load}",
+            f"frequency {spans(np.asarray(self.frequency) / HERTZ, 'Hz')}, "
+            f"{'force' if self.base is None else 'acceleration of the base'} {load}",
             f"velocity {spans(size, 'm/s')}",
             f"errors stated of {', '.join(stated) or 'nothing'}",
         ]
@@ -102,8 +109,15 @@ class SteadyStates(AbstractResult):
         seen: Any = np.where(self.measured, self.velocity, np.nan)
         masked = dataclasses.replace(self, velocity=seen)
         orders = np.asarray(self.harmonic_order, dtype=int)
+        columns = dict(super(SteadyStates, masked).variables())
+        if self.base is not None:
+            for name in ("force_n", "force_std_n"):
+                one = columns.pop(name)
+                meaning = one.meaning.replace("force", "acceleration of the base")
+                new = name.replace("force", "base_acceleration").replace("_n", "_m_s2")
+                columns[new] = one._replace(unit="m/s²", meaning=meaning)
         return {
-            **super(SteadyStates, masked).variables(),
+            **columns,
             "sensor": Variable(("sensor",), np.asarray(self.sensors), "", "sensor"),
             "harmonic": Variable(("harmonic",), orders, "1", "harmonic of the forcing frequency"),
         }
@@ -112,6 +126,11 @@ class SteadyStates(AbstractResult):
     def n_states(self) -> int:
         """Number of steady states."""
         return self.frequency.shape[0]
+
+    @property
+    def force_unit(self) -> str:
+        """Unit of `force`: newtons, or m/s² of a base."""
+        return "N" if self.base is None else "m/s²"
 
     @property
     def phase_unknown(self) -> Bool[Array, "state sensor"]:
@@ -143,6 +162,7 @@ class OptionalColumns(TypedDict, total=False):
     harmonics: Complex[np.ndarray, "state sensor harmonic"] | None  # m/s, relative to the force
     harmonic_std: Float[np.ndarray, "state sensor"] | None  # m/s, rms of a complex error
     harmonic_order: tuple[int, ...]  # which harmonics `harmonics` has
+    base: BaseMotion | None  # whose acceleration (m/s²) `force` is, velocities being relative to it
 
 
 UNNAMED_SENSOR = ("sensor 1",)
@@ -163,7 +183,8 @@ def steady_states(
     Arguments: `frequency` in rad/s, `force` in N, `velocity` phasors in m/s relative to the
     force; further columns by name, those of `OptionalColumns`: `measured`, `velocity_std` (m/s),
     `phase_std` (rad), `force_std` (N), `drive` (V), `order`, `harmonics` (m/s), `harmonic_std`
-    (m/s) and `harmonic_order`. Arrays are copied to the host: no derivatives pass through.
+    (m/s), `harmonic_order` and `base` (see `base_excited_states`). Arrays are copied to the host:
+    no derivatives pass through.
     Raises `ValueError` naming the argument whose shape does not fit, `TypeError` for a column that
     does not exist.
 
@@ -226,6 +247,7 @@ def steady_states(
         harmonic_std=per_sensor("harmonic_std", columns.get("harmonic_std")),
         harmonic_order=harmonic_order,
         sensors=tuple(sensors),
+        base=columns.get("base"),
     )
     # All at once: one by one they compile, a copy of every shape.
     return jax.device_put(states, may_alias=False)
@@ -291,6 +313,11 @@ def join_steady_states(*parts: SteadyStates | Iterable[SteadyStates]) -> SteadyS
             raise ValueError(
                 "tests can be joined when they have the same sensors, but one has "
                 f"{list(test.sensors)}, the first {list(tests[0].sensors)}."
+            )
+        if test.base != tests[0].base:
+            raise ValueError(
+                "tests can be joined when the same drives them, but one is of a force and another "
+                "of a base's acceleration, or what their sensors record differs."
             )
     notes = tuple(dict.fromkeys(note for test in tests for note in test.notes))
     orders = tuple(sorted({order for test in tests for order in test.harmonic_order}))

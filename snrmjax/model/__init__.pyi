@@ -1,4 +1,5 @@
 from .averaging import averaged_effect
+from .base_motion import BaseMotion, base_motion
 from .builders.arches import ArchSettings, shallow_arch
 from .builders.beams import CURVED_BEAM_FORCES, FLAT_BEAM_FORCES, curved_beam, flat_beam
 from .builders.matrices import Matrices, beam, chain, from_matrices
@@ -51,6 +52,7 @@ __all__ = [
     "AbstractMemoryless",
     "ArchSettings",
     "Argument",
+    "BaseMotion",
     "Confusion",
     "Imitation",
     "LinearModes",
@@ -66,6 +68,7 @@ __all__ = [
     "Structure",
     "Symmetry",
     "averaged_effect",
+    "base_motion",
     "beam",
     "between",
     "chain",

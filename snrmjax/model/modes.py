@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Shaped
 
+from snrmjax.model.base_motion import BaseMotion
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.names import suggestion
 from snrmjax.numerics.rules import BELOW_ONE, POSITIVE, require
@@ -49,6 +50,8 @@ class LinearModes(eqx.Module):
     damping_coupling: Float[Array, "mode mode"] | None = None
     # Of a force that acts on several points with different phases: the part of Φᵀb that lags by 90°
     participation_lag: Float[Array, " mode"] | None = None  # kg^-1/2
+    # Where the acceleration of a base drives it: participations are then −Γ, kg^1/2 per m/s².
+    base: BaseMotion | None = eqx.field(static=True, default=None)
 
     def __repr__(self) -> str:
         """A line for every mode; within `jax.jit` and for a batch, the fields' shapes."""
@@ -64,6 +67,8 @@ class LinearModes(eqx.Module):
             lines.append(f"mode {k + 1}: {hertz:.6g} Hz, damping {100 * ratio:.3g} %{chosen}")
         if self.n_modes > _SHOWN:
             lines.append(f"… and {self.n_modes - _SHOWN} more")
+        if self.base is not None:
+            lines.append(f"driven by the acceleration of its base, {self.base.motion} motion")
         return "\n  ".join(lines)
 
     @property
@@ -91,6 +96,8 @@ class LinearModes(eqx.Module):
         no sensor watches, and for one where the mode of interest stands still.
         """
         participation = self.shape_at(point)
+        if self.base is not None:
+            raise ValueError("a base drives the structure: its modes say nothing of newtons.")
         if not np.abs(participation[self.mode_of_interest]) > _STILL * np.max(
             np.abs(participation)
         ):
@@ -108,6 +115,11 @@ class LinearModes(eqx.Module):
             rigid_body_participation=rigid,
             participation_lag=None,
         )
+
+    @property
+    def force_unit(self) -> str:
+        """Unit of what drives the structure: of a force, or of a base's acceleration."""
+        return "N" if self.base is None else "m/s²"
 
     @property
     def own_modal_mass_std(self) -> Float[Array, ""] | None:
@@ -136,6 +148,7 @@ class Beside(NamedTuple):
     # Damping beside that of the damping ratios: ΦᵀCΦ less the 2ζω of its diagonal, 1/s.
     damping_coupling: Shaped[np.ndarray | Array, "mode mode"] | None = None
     participation_lag: Shaped[np.ndarray | Array, " mode"] | list[float] | None = None  # kg^-1/2
+    base: BaseMotion | None = None  # whose acceleration stands in the place of the force
 
 
 class RigidBodyModes(NamedTuple):
@@ -173,7 +186,8 @@ def linear_modes(
     sensors and participations Φᵀb in kg^-1/2; `rigid_body` modes likewise; `std` has the 1σ of
     frequencies and damping ratios, without which they are known exactly, and of modal masses
     (relative), without which they are as `UNSTATED_MODAL_MASS_STD` says; `beside` has shapes at
-    points without a sensor, damping that couples the modes, and the part of a force that lags.
+    points without a sensor, damping that couples the modes, the part of a force that lags, and
+    the base that moves in place of a force.
     Raises `ValueError` that names the argument whose shape or value is wrong. Numbers that are
     traced (within `jax.jit` and derivatives) are taken as they are.
 
@@ -238,11 +252,26 @@ def linear_modes(
     if further.participation_lag is not None:
         lag = _vector("beside.participation_lag", further.participation_lag, n_modes)
         numbers["participation_lag"] = lag
+    if further.base is not None:
+        _check_base(further.base, (*names, *points), participations)
     modes = LinearModes(
-        **numbers, sensors=tuple(names), mode_of_interest=mode_of_interest, points=tuple(points)
+        **numbers,
+        sensors=tuple(names),
+        mode_of_interest=mode_of_interest,
+        points=tuple(points),
+        base=further.base,
     )
     # All at once: one by one they compile, a copy of every shape.
     return jax.device_put(modes, may_alias=False)
+
+
+def _check_base(base: BaseMotion, points: tuple[str, ...], rigid: Any) -> None:
+    for point, _ in base.along:
+        if point not in points:
+            near = suggestion(point, points) or f"; known are {', '.join(points[:_SHOWN])}"
+            raise ValueError(f"the base's `along` names {point!r}, which is no point{near}.")
+    if np.size(rigid):
+        raise ValueError("a structure on a base has no rigid-body modes, but some are given.")
 
 
 def _numbers(value: Any) -> Any:

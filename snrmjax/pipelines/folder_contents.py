@@ -21,7 +21,8 @@ from snrmjax.io.files import read_text
 from snrmjax.io.laboratory.contents import LaboratoryFile
 from snrmjax.io.laboratory.reading import read_laboratory_file
 from snrmjax.io.models import read_model
-from snrmjax.io.tables import read_steady_states
+from snrmjax.io.tables import check_driven_alike, read_steady_states
+from snrmjax.measure.base_excitation import seen_from_base
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
 from snrmjax.measure.recordings.step_counts import StepCounts
 from snrmjax.measure.recordings.time_recording import TimeRecording
@@ -56,14 +57,16 @@ class NamedStates(NamedTuple):
         """
         if self.table is not None:
             return read_steady_states(self.table, model)
-        if self.names_no_sensor and len(model.modes.sensors) == 1:
-            return dataclasses.replace(self.states, sensors=model.modes.sensors)
-        if self.states.sensors != model.modes.sensors:
+        states, modes = self.states, model.modes
+        if self.names_no_sensor and len(modes.sensors) == 1:
+            states = dataclasses.replace(states, sensors=modes.sensors)
+        if states.sensors != modes.sensors:
             raise ValueError(
                 f"{self.file} has the sensors {', '.join(self.states.sensors)}, but the model "
-                f"{', '.join(model.modes.sensors)}."
+                f"{', '.join(modes.sensors)}."
             )
-        return self.states
+        check_driven_alike(states, modes, self.file)
+        return states if modes.base is None else seen_from_base(states, modes.base)
 
 
 class NamedResponses(NamedTuple):
@@ -139,7 +142,7 @@ def read_test_files(folder: Path, model: Path | None = None) -> TestFiles:
             texts.append((path.name, _lines(path)))
         elif suffix == ".toml":
             if not _is_model(path):
-                passed.append((path.name, "not used: it has no [[mode]]"))
+                passed.append((path.name, "not used: it has no [[mode]] and no [structure]"))
             elif model is None:
                 models.append(path)
             elif path.resolve() != model.resolve():
@@ -205,9 +208,10 @@ def _lines(path: Path) -> tuple[str, ...]:
 
 
 def _is_model(path: Path) -> bool:
-    """Whether a TOML file has modes; one that cannot be read goes on to the reader of models."""
+    """Whether a TOML file has modes or matrices; one that cannot be read is left to its reader."""
     try:
-        return "mode" in tomllib.loads(read_text(path))
+        held = tomllib.loads(read_text(path))
+        return "mode" in held or "structure" in held
     except tomllib.TOMLDecodeError:
         return True
 

@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 from snrmjax.identify.modal.free_decay import DecayModes
 from snrmjax.identify.modal.modal_fit import LinearModalFit
@@ -28,6 +28,7 @@ from snrmjax.io.units import HERTZ
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.states import SteadyStates, join_steady_states
+from snrmjax.model.base_motion import SensorMotion, base_motion
 from snrmjax.model.structures import Structure, structure
 from snrmjax.numerics.facts import Fact
 from snrmjax.pipelines.options import ModesOptions, checked
@@ -90,6 +91,10 @@ def find_linear_modes(
         ),
         free=Free(options.mass) if options.free or options.mass is not None else None,
     )
+    base = sources.base if isinstance(sources, SteadyStates) else None
+    if options.base is not None:
+        base = base_motion(cast(SensorMotion, options.base))
+    scaled = dataclasses.replace(scaled, base=base)
     return LinearModesFound(name, fitted, scaled, interest, (*notes, *scaled.notes))
 
 

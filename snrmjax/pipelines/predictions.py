@@ -41,6 +41,7 @@ class Prediction(NamedTuple):
     further: ResonanceDistribution  # of the resonance of a level that was not measured
     drive: float | None = None  # V, where the force is known as a drive voltage
     at: str | None = None  # where the force acts, if not where it did in the test
+    unit: str = "N"  # of the force; m/s² of a base
 
     @property
     def banded(self) -> list[FittedResponse]:
@@ -50,7 +51,7 @@ class Prediction(NamedTuple):
     @property
     def load(self) -> Fact:
         """The force, and its drive voltage where the force is known as one."""
-        return Fact("load", force=self.force, drive=self.drive, at=self.at)
+        return Fact("load", force=self.force, drive=self.drive, at=self.at, unit=self.unit)
 
 
 def reach_of(options: IdentifyOptions) -> float:
@@ -78,6 +79,7 @@ def predictions_of_points(
                     fit, force, of=level, self_excited=options.self_excited, **ratio
                 ),
                 at=options.predict_at,
+                unit=modes.force_unit,
             )
         )
     return tuple(predictions)
@@ -109,7 +111,8 @@ def predictions_of_fit(
         banded = fitted_response(fit, force, **settings)
         further = predicted_resonance(fit, force, self_excited=options.self_excited, **settings)
         tips = sorted((tip for one in banded for tip in one.resonances), key=lambda t: t.amplitude)
-        predictions.append(Prediction(force, tips, banded, further, record, options.predict_at))
+        place, unit = options.predict_at, fit.modes.force_unit
+        predictions.append(Prediction(force, tips, banded, further, record, place, unit))
         notes += notes_on_trends(settings["of"].trends, predictions[-1].load)
     return tuple(predictions), tuple(notes)
 

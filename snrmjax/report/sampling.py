@@ -8,7 +8,11 @@ from jax.typing import ArrayLike
 from snrmjax.identify.pointwise.prediction_result import PredictedResponse
 from snrmjax.io.units import DEGREE, HERTZ
 from snrmjax.measure.states import SteadyStates
-from snrmjax.simulate.continuation.response_curve import MotionCurve, ResponseCurve
+from snrmjax.simulate.continuation.response_curve import (
+    MotionCurve,
+    ResponseCurve,
+    recorded_velocity,
+)
 
 if TYPE_CHECKING:  # figures of a simulation do not wait for the imports of an identification
     from snrmjax.identify.joint.joint_fit import JointFit
@@ -129,7 +133,8 @@ def velocity_of(curve: PredictedResponse | MotionCurve, sensor: str) -> np.ndarr
     """
     if isinstance(curve, PredictedResponse):
         return curve.velocity
-    return curve.velocity[:, 1, sensor_index(curve.sensors, sensor)]
+    force = getattr(curve, "force", 0.0)  # a normal mode has none
+    return recorded_velocity(curve, force)[:, 1, sensor_index(curve.sensors, sensor)]
 
 
 VELOCITY = ShownAmplitude("velocity", "m/s", "velocity_m_s", 0)

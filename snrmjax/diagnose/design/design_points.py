@@ -125,6 +125,7 @@ def _states(
         harmonics=alone[:, :, None] * seen[:, None, :],
         harmonic_std=np.full((n, len(sensors)), floor),
         harmonic_order=COMPARED,
+        base=misfit.model.modes.base,
     )
 
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 from jaxtyping import Float
@@ -15,10 +15,9 @@ from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses, frequency_responses
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.states import SteadyStates, relative_errors
+from snrmjax.model.base_motion import SensorMotion
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.units import HERTZ
-
-MotionKind = Literal["absolute", "relative"]
 
 _CHANGE_STDS = 2.0  # standard errors of a difference between levels
 _POWERS = {"displacement": 0, "velocity": 1, "acceleration": 2}
@@ -29,7 +28,7 @@ def find_modes(
     source: FrequencyResponses | SteadyStates | Sequence[TimeRecording],
     *,
     level: int | None = None,
-    base: MotionKind | None = None,
+    base: SensorMotion | None = None,
     **settings: Any,
 ) -> tuple[LinearModalFit | DecayModes, tuple[Fact, ...]]:
     """Modes of what was measured, and notes on it.
@@ -46,6 +45,13 @@ def find_modes(
     if not isinstance(source, SteadyStates):
         of_decays = {name: settings[name] for name in _OF_DECAYS if name in settings}
         return fit_free_decay(source, **of_decays), ()
+    if source.base is not None and base is None:
+        if source.base.motion != "absolute":
+            raise ValueError(
+                "these states are of a moving base: say what the sensors record, `--base absolute` "
+                "or `--base relative`."
+            )
+        base = "relative"  # the base's motion is taken away already
     levels = levels_by_velocity(source)
     chosen = levels[0] if level is None else level
     lowest = responses_of_states(source, chosen)
@@ -64,7 +70,7 @@ def find_modes(
 
 
 def _of_responses(
-    responses: FrequencyResponses, base: MotionKind | None, settings: Mapping[str, Any]
+    responses: FrequencyResponses, base: SensorMotion | None, settings: Mapping[str, Any]
 ) -> LinearModalFit:
     if base is None:
         return fit_linear_modes(responses, **settings)
@@ -105,6 +111,8 @@ def responses_of_states(data: SteadyStates, level: int) -> StateResponses:
     if volts:
         force = np.asarray(data.drive)[rows]
     reference = Channel("drive", "voltage", "V") if volts else Channel("force", "force", "N")
+    if data.base is not None:
+        reference = Channel("base", "acceleration", "m/s^2")
     seen = np.asarray(data.measured)[rows]
     velocity = np.where(seen, np.asarray(data.velocity)[rows], np.nan)
     mobility = velocity / force[:, None]
@@ -182,7 +190,7 @@ class BaseResponses(NamedTuple):
 
 def relative_to_base(
     responses: FrequencyResponses,
-    motion: MotionKind,
+    motion: SensorMotion,
     *,
     along: Mapping[str, float] | None = None,
 ) -> BaseResponses:
@@ -197,7 +205,7 @@ def relative_to_base(
     Raises `ValueError` for another number or kind of references, for responses that are no motion
     and for unknown sensors.
     """
-    if motion not in get_args(MotionKind):
+    if motion not in get_args(SensorMotion):
         raise ValueError(f"the motion must be 'absolute' or 'relative', but is {motion!r}.")
     if len(responses.references) != 1 or responses.references[0].quantity not in _POWERS:
         listed = ", ".join(str(channel) for channel in responses.references)

@@ -6,7 +6,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from snrmjax.model.modes import LinearModes, LinearModesStd, RigidBodyModes, linear_modes
+from snrmjax.model.base_motion import BaseMotion
+from snrmjax.model.modes import Beside, LinearModes, LinearModesStd, RigidBodyModes, linear_modes
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
 from snrmjax.numerics.units import HERTZ
@@ -41,6 +42,7 @@ class ScaledModes(AbstractResult):
     per: str = setting(default="N")
     mass_normalised: bool = eqx.field(static=True, default=True)
     notes: tuple[Fact | str, ...] = setting(default=())
+    base: BaseMotion | None = eqx.field(static=True, default=None)
 
     @property
     def n_modes(self) -> int:
@@ -76,6 +78,7 @@ class ScaledModes(AbstractResult):
                 self.damping_ratio_std,
                 self.modal_mass_std if known else None,
             ),
+            beside=Beside(base=self.base),
         )
 
     def summary(self) -> tuple[str, ...]:

@@ -9,6 +9,7 @@ import scipy.sparse
 import scipy.sparse.linalg
 from jaxtyping import Float
 
+from snrmjax.model.base_motion import BaseMotion
 from snrmjax.model.effect_base import AbstractEffect, AbstractForce, checked_effects
 from snrmjax.model.modes import Beside, RigidBodyModes, linear_modes
 from snrmjax.model.places import Row, row_over_points
@@ -41,7 +42,8 @@ def from_matrices(
     stiffness: Any,
     points: Sequence[str] | None = None,
     *,
-    force: str | Mapping[str, Phasor],
+    force: str | Mapping[str, Phasor] | None = None,
+    base: BaseMotion | None = None,
     effects: AbstractEffect | Iterable[AbstractEffect] = (),
     n_modes: int | None = None,
     residuals: bool = True,
@@ -55,6 +57,9 @@ def from_matrices(
     dense or sparse of SciPy; `damping` may be a damping ratio of every mode instead, and None for
     none. `points` names the unknowns ("x1", "x2", … by default). `force` is where the recorded
     force acts: a point, or newtons per newton at points, complex where they lead by a phase.
+    `base` in its place: the structure stands on a base that moves, whose acceleration a acts as
+    the force −M r a, r being how far each unknown goes with the base (`base_motion`'s `along`); all
+    motion, that of the effects too, is relative to it.
     `effects` act at points by their `at`, in N and m; the matrices hold no part of them.
     `n_modes` keeps so many modes of lowest frequency, and for every place of an effect and for
     the force one vector more: what the left out modes give way there statically, exactly, as
@@ -66,7 +71,8 @@ def from_matrices(
     about (Ω/ω)² of their static part, ω being the first frequency left out, for each harmonic Ω.
     Raises `ValueError` for matrices that are not square, finite, symmetric, or of different sizes,
     a mass that is not positive definite, a stiffness that is negative, unknown or repeated points,
-    a force that no mode feels, and an effect that acts on a rigid-body mode.
+    a force or base that moves no mode, both or none of them, and an effect that acts on a
+    rigid-body mode.
     Reference: MacNeal, Comput. Struct. 1 (1971) 581, doi:10.1016/0045-7949(71)90031-9.
 
     >>> from snrmjax.model.effects import make_effect
@@ -85,13 +91,17 @@ def from_matrices(
     forces = [effect for effect in made if isinstance(effect, AbstractForce)]
     places = dict.fromkeys(row for e in forces for row in e.rows if row is not None)
     rows = [_column(names, row, "an effect") for row in places]
-    load = _column(names, force, "`force`")
+    load = _load(m, names, force, base)
     squared, shapes, rigid = _modes(m, k, n_modes)
     if n_modes is not None and residuals:
         parts = [*rows, load.real, *([load.imag] if np.any(load.imag) else [])]
         squared, shapes = _with_residuals(k, m, squared, shapes, rigid, parts)
     if not squared.size or not np.any(load @ shapes):
-        raise ValueError("`force` acts where no mode of the structure moves.")
+        raise ValueError(
+            "`force` acts where no mode of the structure moves."
+            if base is None
+            else "the base moves no mode of the structure."
+        )
     for place, row in zip(places, rows, strict=True):
         if np.any(np.abs(row @ rigid) > 1e-9 * np.linalg.norm(rigid, axis=0)):
             raise ValueError(
@@ -111,9 +121,25 @@ def from_matrices(
         sensors=watched,
         mode_of_interest=mode_of_interest,
         rigid_body=RigidBodyModes(rigid[seen], (load @ rigid).real),
-        beside=Beside(other, coupling, -acting.imag if np.any(acting.imag) else None),
+        beside=Beside(other, coupling, -acting.imag if np.any(acting.imag) else None, base),
     )
     return structure(modes, effects=made, name=name)
+
+
+def _load(
+    mass: Any,
+    names: tuple[str, ...],
+    force: str | Mapping[str, Phasor] | None,
+    base: BaseMotion | None,
+) -> np.ndarray:
+    """Newtons at the unknowns per newton, or per m/s² of the base."""
+    if (force is None) == (base is None):
+        raise ValueError("a structure has either a `force` or a `base` that moves.")
+    if base is None:
+        return _column(names, force or {}, "`force`")
+    for point, _ in base.along:
+        _place(names, point, "the base's `along`")
+    return -(mass @ base.cosines(names))
 
 
 def _checked(name: str, matrix: Any) -> Any:

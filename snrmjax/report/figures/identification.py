@@ -185,6 +185,7 @@ def response_figure(
     measured: SteadyStates | None = None,
     frequency_range: tuple[float, float] | None = None,
     force_tolerance: float = 0.03,
+    force_unit: str = "N",
 ) -> Figure:
     """Predicted responses, one row a force, beside harmonic balance and what was measured.
 
@@ -193,7 +194,7 @@ def response_figure(
 
     Arguments: `frequency_range` in rad/s, by default where a response exceeds a quarter of its
     peak; `measured` steady states appear in the row whose force is within the relative
-    `force_tolerance` of theirs.
+    `force_tolerance` of theirs; `force_unit` of what drives it, m/s² of a base.
     Returns the figure. Raises `ValueError` when there is no response or a sensor is missing.
     Reference: Kwarta & Allen, Figs. 8 and 11.
     """
@@ -245,7 +246,11 @@ def response_figure(
         for axes in (speeds, phases):
             axes.tick_params(labelbottom=last)
         bottom = "Frequency (Hz)" if last else ""
-        title, level = f"force {with_unit(force, 'N')}: ", f"Velocity amplitude ({unit.name})"
+        load = "force" if force_unit == "N" else "base acceleration"
+        title, level = (
+            f"{load} {with_unit(force, force_unit)}: ",
+            f"Velocity amplitude ({unit.name})",
+        )
         name_axes(speeds, f"{title}amplitude at {plain(sensor)}", bottom, level)
         name_axes(phases, f"{title}phase", bottom, "Velocity phase (°)")
     explain_lines(figure)
@@ -282,12 +287,13 @@ def force_velocity_figure(
     forces = np.asarray(data.force)[list(states)]
     loops = force_velocity_loop(forces, phasors, (1, *data.harmonic_order))
     frequency, indicator = np.asarray(data.frequency) / HERTZ, np.asarray(appropriation_of(data))
+    load = "Force" if data.base is None else "Base acceleration"
     columns = min(3, len(states))
     height = -(-len(states) // columns)
     figure, grid = panels(PAGE / 3 * columns, 0.2 + 2.4 * height, height, columns)
     for number, (axes, k) in enumerate(zip(grid.flat, states, strict=False)):
         force, velocity = np.asarray(loops.force)[number], np.asarray(loops.velocity)[number]
-        force_unit, unit = unit_for(force, "N"), unit_for(velocity, "m/s")
+        force_unit, unit = unit_for(force, data.force_unit), unit_for(velocity, "m/s")
         ends, phasor = np.array([-1.0, 1.0]), phasors[number, 0]
         in_phase = ends * forces[number] / force_unit.size, ends * phasor.real / unit.size
         axes.plot(*in_phase, "--", color=SIMULATED, linewidth=0.8)
@@ -295,7 +301,7 @@ def force_velocity_figure(
         turn = f"{np.angle(phasor) / DEGREE:+.0f}°".replace("-", "−")
         title = f"level {int(np.asarray(data.level)[k])}, {frequency[k]:.4g} Hz\n"
         title += f"phase {turn}, indicator {indicator[k]:.2f}"
-        name_axes(axes, title, f"Force ({force_unit.name})", f"Velocity ({unit.name})")
+        name_axes(axes, title, f"{load} ({force_unit.name})", f"Velocity ({unit.name})")
     for axes in grid.flat[len(states) :]:
         axes.remove()
     return figure

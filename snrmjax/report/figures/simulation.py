@@ -72,7 +72,7 @@ def simulated_response_figure(
             v, x = velocity_of(curve, name), curve.frequency / HERTZ
             for axes, y in ((speeds, np.abs(v) / unit.size), (phases, np.angle(v) / DEGREE)):
                 if event is None:
-                    label, colour = with_unit(curve.force, "N"), colours[curve.force]
+                    label, colour = with_unit(curve.force, curve.force_unit), colours[curve.force]
                     response_line(axes, x, y, curve.stability, label, colour, LINE)
                     continue
                 at, style = curve.at_events(event), {**HOLLOW, "marker": markers[event]}

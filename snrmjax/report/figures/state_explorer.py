@@ -98,7 +98,7 @@ def _columns(data: SteadyStates, at: int) -> tuple[dict[str, np.ndarray], Unit, 
     velocity = np.where(np.asarray(data.measured)[:, at], np.asarray(data.velocity)[:, at], np.nan)
     force, drive = np.asarray(data.force), np.asarray(data.drive)
     in_volts = not np.isfinite(force).any()
-    load = unit_for(drive, "V") if in_volts else unit_for(force, "N")
+    load = unit_for(drive, "V") if in_volts else unit_for(force, data.force_unit)
     speed = unit_for(np.abs(velocity), "m/s")
     columns = {
         "level": np.asarray(data.level),

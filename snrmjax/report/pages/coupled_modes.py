@@ -51,7 +51,9 @@ def headline(found: CoupledDetails) -> list[str]:
         for k in curve.at_events("peak"):
             size = np.abs(curve.velocity[k, 1, _reference(found, curve)])
             place = f"{curve.frequency[k] / HERTZ:.5g} Hz, {size:.3g} m/s"
-            lines.append(f"peak of the coupled modes at {curve.force:g} N: {place}")
+            lines.append(
+                f"peak of the coupled modes at {curve.force:g} {curve.force_unit}: {place}"
+            )
     return lines
 
 

@@ -139,7 +139,10 @@ def identification_report(
     sections = [Section("Backbone and damping", (), shown)]
     if responses is not None and "prediction" in figures:
         predicted, resonances, simulated, further_levels = responses
-        table = resonance_table(backbone, resonances, simulated, [c.force for c in predicted])
+        table = resonance_table(
+            *(backbone, resonances, simulated, [c.force for c in predicted]),
+            force_unit=modes.force_unit,
+        )
         shown = [ReportFigure(figures["prediction"], RESPONSE_CAPTION)]
         sections.append(Section("Predicted responses", further_levels, shown, [table]))
     return Report(
@@ -293,6 +296,8 @@ def resonance_table(
     resonances: Sequence[Resonance],
     simulated: Sequence[ResponseCurve] = (),
     forces: Iterable[float] = (),
+    *,
+    force_unit: str = "N",
 ) -> ReportTable:
     """Predicted phase resonances, with harmonic balance's nearest one under the same force.
 
@@ -304,7 +309,7 @@ def resonance_table(
     pairs += [
         (f, None) for f in sorted(set(forces) - {resonance.force for resonance in resonances})
     ]
-    load = unit_for([force for force, _ in pairs], "N")
+    load = unit_for([force for force, _ in pairs], force_unit)
     unit = unit_for([resonance.velocity for resonance in resonances], "m/s")
     header = [f"force ({load.name})", f"velocity ({unit.name})", "frequency (Hz)", "damping (%)"]
     header += ["beyond the data"]

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from snrmjax.identify.prediction.notes import where_in_words
 from snrmjax.io import joint_results, results
 from snrmjax.io.files import write_summary
+from snrmjax.io.results import load_named
 from snrmjax.io.units import HERTZ
 from snrmjax.model.structures import Structure
 from snrmjax.pipelines.identify import FitDetails, IdentifiedTest
@@ -60,7 +61,8 @@ def headline(found: IdentifiedTest) -> list[str]:
         lines += coupled_page.headline(found.coupled)
     for advised in found.advice or ():
         force, drive = advised.force, advised.drive
-        load = f"force {force:.4g} N" if drive is None else f"drive {drive:.4g} V"
+        unit = found.model.modes.force_unit
+        load = f"force {force:.4g} {unit}" if drive is None else f"drive {drive:.4g} V"
         place = f"{load}, {advised.frequency / HERTZ:.6g} Hz (expected {advised.expected})"
         lines.append(f"measure next, {advised.rank}: {place}: {advised.reason}")
     return lines
@@ -92,6 +94,7 @@ def identification_figures(
             found.resonances,
             simulated=found.simulated,
             measured=None if found.options.predict_at else found.data,
+            force_unit=modes.force_unit,
         )
     if found.joint is not None:
         figures |= joint_figures(found.joint, points, shown)
@@ -188,15 +191,15 @@ def write(
     """
     shown = SHOWN_AMPLITUDES[axis]
     done = {"data": data, "model": model or found.model.name} | settings_in_words(found)
-    added = (shown.column, shown.power)
-    results.write_points(folder / "points.csv", found.identification, added=added)
+    added, unit = (shown.column, shown.power), found.model.modes.force_unit
+    results.write_points(folder / "points.csv", found.identification, added=added, force_unit=unit)
     if found.predictions:
         drives = [
             prediction.drive for prediction in found.predictions for _ in prediction.responses
         ]
         stds = [b.velocity_std for prediction in found.predictions for b in prediction.banded]
         given = (folder / "prediction.csv", found.responses)
-        results.write_prediction(*given, drives=drives, velocity_stds=stds)
+        results.write_prediction(*given, drives=drives, velocity_stds=stds, force_unit=unit)
     summary: dict[str, object] = {"program": "snrmjax", "version": version("snrmjax"), **done}
     if found.coupled is not None:
         summary["coupled_modes"] = coupled_page.write(folder, found.coupled)
@@ -209,12 +212,13 @@ def write(
         summary["joint_fit"] = joint_results.summarise_fit(details.fit, banded, details.shares)
     summary |= results.summarise(found.identification, found.values)
     summary["resonances"] = [
-        results.summarise_resonance(each) | _further_load(prediction)
+        load_named(results.summarise_resonance(each), unit) | _further_load(prediction)
         for prediction in found.predictions
         for each in prediction.resonances
     ]
     summary["resonance_distributions"] = [
-        results.summarise_distribution(prediction.further) | _further_load(prediction)
+        load_named(results.summarise_distribution(prediction.further), unit)
+        | _further_load(prediction)
         for prediction in found.predictions
     ]
     summary["notes"] = [str(note) for note in found.notes]
@@ -238,4 +242,6 @@ def _write_fit(folder: Path, details: FitDetails, added: tuple[str, int]) -> Non
     joint_results.write_fitted_backbone(folder / "backbone.csv", details.fit, added=added)
     joint_results.write_joint_fit(folder / "fit.json", details.fit)
     if details.advice is not None:
-        joint_results.write_next(folder / "next.csv", details.advice)
+        joint_results.write_next(
+            folder / "next.csv", details.advice, force_unit=details.fit.modes.force_unit
+        )

@@ -13,7 +13,7 @@ from snrmjax.report.figures.simulation import (
     simulated_response_figure,
 )
 from snrmjax.report.style import save_figure
-from snrmjax.simulate.continuation.response_curve import Branch, ResponseCurve
+from snrmjax.simulate.continuation.response_curve import Branch, ResponseCurve, recorded_velocity
 
 
 def write(folder: Path, found: SimulatedResponses | SimulatedMode) -> None:
@@ -43,12 +43,15 @@ def headline(found: SimulatedResponses | SimulatedMode) -> list[str]:
 
 
 def _largest(curve: ResponseCurve, sensor: str) -> str:
-    speed = np.abs(curve.velocity[:, 1, curve.sensors.index(sensor)])
+    velocity = recorded_velocity(curve, curve.force)[:, 1]
+    speed = np.abs(velocity[:, curve.sensors.index(sensor)])
     name = "" if curve.branch == Branch.MAIN else f" ({curve.branch})"
+    load = "force" if curve.base is None else "base acceleration"
+    load = f"{load} {curve.force:g} {curve.force_unit}{name}"
     if not speed.size:
-        return f"force {curve.force:g} N{name}: no response"
+        return f"{load}: no response"
     top = int(np.argmax(speed))
     return (
-        f"force {curve.force:g} N{name}: {speed[top]:.4g} m/s at {sensor} at most, at "
+        f"{load}: {speed[top]:.4g} m/s at {sensor} at most, at "
         f"{curve.frequency[top] / HERTZ:.5g} Hz; {len(curve.at_events('fold'))} folds"
     )

@@ -23,8 +23,8 @@ def _equilibria(sensor: str, displacement: tuple[float, ...], stable: tuple[bool
     )
 
 
-def _load(force: float, drive: float | None, at: str | None = None) -> str:
-    newtons = f"{force:g} N" if drive is None else f"{drive:.5g} V ({force:.4g} N)"
+def _load(force: float, drive: float | None, at: str | None = None, unit: str = "N") -> str:
+    newtons = f"{force:g} {unit}" if drive is None else f"{drive:.5g} V ({force:.4g} N)"
     return newtons if at is None else f"{newtons} at {at}"
 
 

@@ -5,9 +5,11 @@ from collections.abc import Iterable, Sequence
 from enum import StrEnum
 from typing import ClassVar
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
+from snrmjax.model.base_motion import BaseMotion
 from snrmjax.numerics.blocks import by_blocks, over_cores, taken
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
@@ -39,6 +41,13 @@ class MotionCurve(AbstractResult):
     frequency: Float[np.ndarray, " point"] = quantity("point", "Hz", "frequency")
     status: CurveStatus = setting()
     sensors: tuple[str, ...] = quantity("sensor", "", "sensor", name="sensor", static=True)
+    # Where a base drives it, "forces" are its accelerations and velocities relative to it.
+    base: BaseMotion | None = eqx.field(static=True, default=None, kw_only=True)
+
+    @property
+    def force_unit(self) -> str:
+        """Unit of what drives it: newtons, or m/s² of a base."""
+        return "N" if self.base is None else "m/s²"
 
     def variables(self) -> dict[str, Variable]:
         """The quantities of the curve, and its velocities by the names of the files' columns."""
@@ -56,7 +65,21 @@ def motions_of(balance: HarmonicBalance, points: Float[np.ndarray, "point unknow
     whole = with_sines(coefficients) if balance.cosine_only else coefficients
     velocity = velocity_phasors(whole, frequency, np.asarray(modes.mode_shape))
     named = {"frequency": frequency, "coefficients": coefficients, "velocity": velocity}
-    return {**named, "sensors": modes.sensors}
+    return {**named, "sensors": modes.sensors, "base": modes.base}
+
+
+def recorded_velocity(
+    curve: MotionCurve, force: float | Float[np.ndarray, " point"]
+) -> Complex[np.ndarray, "point harmonic sensor"]:
+    """Velocities as the sensors record them, m/s: with the base's own where they see it too.
+
+    Arguments: `force` (N), or the acceleration of the base (m/s²), of the points.
+    """
+    if curve.base is None:
+        return curve.velocity
+    velocity = curve.velocity.copy()
+    velocity[:, 1] += curve.base.own_velocity(curve.sensors, curve.frequency, force)
+    return velocity
 
 
 class Branch(StrEnum):
@@ -113,7 +136,7 @@ class ResponseCurve(MotionCurve):
         """Force, range, largest velocity, stability, events and status."""
         n = len(self.frequency)
         of = "" if self.branch is Branch.MAIN else f" ({self.branch})"
-        lines = [f"forced response at {self.force:.4g} N{of}: {n} points"]
+        lines = [f"forced response at {self.force:.4g} {self.force_unit}{of}: {n} points"]
         if n:
             height = np.abs(self.velocity[:, 1])
             k, r = np.unravel_index(np.argmax(height), height.shape)

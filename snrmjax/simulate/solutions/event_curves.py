@@ -202,7 +202,7 @@ def follow_event(
         status=curve.status,
         kind=kind,
         parameter=parameter,
-        unit="N" if parameter == FORCE else parameter_unit(model, parameter),
+        unit=model.modes.force_unit if parameter == FORCE else parameter_unit(model, parameter),
         value=value,
         force=value if parameter == FORCE else np.full(len(value), float(force)),
         event=tuple(events),

@@ -285,6 +285,7 @@ def _no_curve(model: Structure, force: float, harmonic_order: int) -> ResponseCu
         velocity=np.zeros((0, harmonic_order + 1, len(sensors)), dtype=np.complex128),
         status=CurveStatus.INVALID,
         sensors=sensors,
+        base=model.modes.base,
         force=force,
         event=(),
     )

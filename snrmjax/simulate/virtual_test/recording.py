@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
 from snrmjax.measure.states import SteadyStates, steady_states
+from snrmjax.model.modes import LinearModes
 from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.simulate.balance.harmonics import displacement_phasors, velocity_phasors
 from snrmjax.simulate.continuation.response_curve import ResponseCurve
@@ -90,7 +91,7 @@ def recorded_states(
         jnp.abs(displacement_phasors(coefficients)[:, 1, modes.mode_of_interest]),
     )
     written = np.asarray(seen[0]), np.asarray(seen[1])
-    return _with_errors(states, *written, model.modes.sensors, recording)
+    return _with_errors(states, *written, model.modes, recording)
 
 
 def recorded_curves(model: Structure, curves: Sequence[ResponseCurve]) -> list[ResponseCurve]:
@@ -155,11 +156,12 @@ def _with_errors(
     states: VisitedStates,
     force: np.ndarray,
     velocity: np.ndarray,
-    sensors: tuple[str, ...],
+    modes: LinearModes,
     recording: Recording,
 ) -> SteadyStates:
     """Measured values: the exact ones with errors drawn from a seeded key."""
     errors, seed, keep_harmonics = recording
+    sensors, base = modes.sensors, modes.base
     keep_harmonics = tuple(int(h) for h in keep_harmonics)
     n, n_sensors = len(force), velocity.shape[2]
     keys = jax.random.split(jax.random.key(seed), 6)
@@ -205,4 +207,5 @@ def _with_errors(
         harmonics=harmonics,
         harmonic_order=keep_harmonics,
         harmonic_std=stated(errors.harmonic, np.ones((n, n_sensors))),
+        base=base,
     )
