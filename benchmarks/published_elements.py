@@ -2,10 +2,10 @@
 
 Run: OMP_NUM_THREADS=1 python benchmarks/published_elements.py
 
-Sources: NLvib's examples 1 to 5 and 9 (Krack and Gross; their numbers, or those of an independent
-harmonic balance where none are printed), SSMTool's three oscillators and its cantilever on a
-spring (spectral submanifolds of order 3 and 7, collocation), closed forms of a Jenkins element and
-of Segalman's four-parameter Iwan joint. `published` is what the source has, to its digits;
+Sources: NLvib's examples 1 to 5 and 8 to 10 (Krack and Gross; their numbers, or those of an
+independent harmonic balance where none are printed), SSMTool's three oscillators and cantilevers
+(spectral submanifolds of order 3 and 7, collocation), closed forms of a Jenkins element and of
+Segalman's four-parameter Iwan joint. `published` is what the source has, to its digits;
 `difference` is relative. Seconds are those of the second run, programs compiled.
 """
 
@@ -207,17 +207,95 @@ def _iwan() -> Rows:
         yield f"loss per cycle at {u}", loss, 0.045255 * u**2.5
 
 
+def _friction_at_a_node() -> Rows:
+    friction = _element("regularised_friction", "w3", force_limit=1.5, velocity=6e-7)
+    mass, _, stiffness, points = sj.model.beam(185e9 * 0.1**3 * 0.3 / 12, 7830 * 0.03, 2.0, 8)
+    held = [k for k, point in enumerate(points) if point != "w3"]
+    stuck = sj.model.from_matrices(
+        *(mass[np.ix_(held, held)], None, stiffness[np.ix_(held, held)]),
+        *([points[k] for k in held],),
+        force="w8",
+    ).modes.natural_frequency.item(0)
+    model = sj.model.from_matrices(
+        *(mass, 0.02 / stuck * stiffness, stiffness, points), force="w8", effects=friction
+    )
+    (curve,) = sj.forced_response(model, 0.2, 110.0, 370.0, harmonic_order=7, stability=False)
+    tip = curve.coefficients @ np.asarray(model.modes.shape_at("w8"))
+    rms = np.sqrt(tip[:, 0] ** 2 + 0.5 * np.sum(tip[:, 1:] ** 2, axis=1))
+    yield "largest rms at the tip", float(rms.max()), 6.70985e-8
+    yield "its frequency, rad/s (printed to 3 digits)", float(curve.frequency[rms.argmax()]), 195.0
+
+
+def _isola_of_negative_damping() -> Rows:
+    elements = (
+        _element("cubic_stiffness", "w25", coefficient=6.0),
+        _element("cubic_damping", "w25", coefficient=-0.02),
+    )
+    matrices = sj.model.beam(
+        *(45e6 * 1e4 / 12, 1780e-9 * 100, 2700.0, 25),
+        mass_damping=1.25e-4,
+        stiffness_damping=2.5e-4,
+    )
+    model = sj.model.from_matrices(
+        *matrices, force="w25", effects=elements, n_modes=8, sensors=["w25"]
+    )
+    yield "natural frequency, rad/s", model.modes.natural_frequency.item(0), 7.000497
+    yield "damping ratio", model.modes.damping_ratio.item(0), 8.840e-4
+    settings = sj.simulate.ResponseSettings(harmonic_order=5, stability=False)
+    for ratio, peak, at in (
+        (1e-3, 0.010118, 7.00077),
+        (1.7e-3, 0.020736, 7.00165),
+        (1.8e-3, 0.0252, 7.00219),
+    ):
+        main = sj.forced_response(model, 0.1 * ratio, 6.95, 7.05, harmonic_order=5, stability=False)
+        tip = _height(model, main[0], "w25")
+        yield f"largest tip at {ratio}", float(tip.max()), peak
+        yield f"its frequency at {ratio}, rad/s", float(main[0].frequency[tip.argmax()]), at
+        apart = sj.simulate.isolated_responses(
+            model, 0.1 * ratio, 6.95, 7.05, known=main, settings=settings
+        )
+        yield f"isolated responses at {ratio}", float(len(apart)), 1.0
+        if ratio == 1e-3:
+            loop, tip = apart[0], _height(model, apart[0], "w25")
+            away = loop.frequency - 7.00426
+            passed = np.flatnonzero(away[1:] * away[:-1] < 0)
+            share = away[passed] / (away[passed] - away[passed + 1])
+            crossed = np.sort(tip[passed] + share * (tip[passed + 1] - tip[passed]))
+            for found, published in zip(crossed, (0.03926, 0.04355), strict=True):
+                yield "tip of the isola at 7.00426", float(found), published
+    joined = sj.forced_response(model, 1.9e-4, 6.95, 7.05, harmonic_order=5, stability=False)
+    joined_tip = float(_height(model, joined[0], "w25").max())
+    yield "joined at 1.9e-3 (1: beyond 0.05)", float(joined_tip > 0.05), 1.0
+
+
+def _rubber_beam() -> Rows:
+    slider = _element("jenkins_slider", "w5", stiffness=1e8, slip_displacement=106e-8)
+    matrices = sj.model.beam(0.6725 * 210e9 * 0.06 * 0.05**3 / 12, 7850 * 0.05 * 0.06, 0.71, 14)
+    model = sj.model.from_matrices(*matrices, force="w14", effects=slider)
+    hertz = 2 * np.pi
+    for found, published in zip(
+        np.asarray(model.modes.natural_frequency) / hertz, (67.960, 425.903, 1192.61), strict=False
+    ):
+        yield "free frequency, Hz", float(found), published
+    for speed, end, published in ((0.01, 0, 112.675), (30.0, -1, 67.960)):
+        mode = sj.simulate.damped_normal_mode(model, speed, harmonic_order=7)
+        yield f"damped mode to {speed:g} m/s, Hz", float(mode.frequency[end] / hertz), published
+
+
 PROBLEMS: dict[str, Callable[[], Rows]] = {
     "1 Duffing": _duffing,
     "2 two masses, two cubic springs": _two_cubic_springs,
     "3 two masses, unilateral spring": _unilateral_spring,
     "4 normal modes of two masses": _mode_of_two_masses,
     "5 regularised friction, damped mode": _regularised_friction,
+    "8 regularised friction at a node of a beam": _friction_at_a_node,
     "9 cubic spring at a tip": _cubic_at_a_tip,
     "13 three oscillators, 1:1:1": _three_oscillators,
     "14 cantilever on a spring, 1:3": _cantilever_on_a_spring,
+    "17 isola of negative damping": _isola_of_negative_damping,
     "18 Jenkins element, damped mode": _jenkins,
     "19 four-parameter Iwan joint": _iwan,
+    "20 cantilever with a Jenkins element": _rubber_beam,
 }
 
 if __name__ == "__main__":

@@ -107,8 +107,8 @@ SUB_ROOMS = {
     "report.study": {"report.style", "report.html", "report.sentences"},
     "io.programs": set(),
     "model.builders": {
-        *("model.effect_base", "model.effects", "model.modes", "model.places", "model.potential"),
-        "model.structures",
+        *("model.base_motion", "model.effect_base", "model.effects", "model.modes"),
+        *("model.places", "model.potential", "model.structures"),
     },
     "io.reduction": {
         *("io.columns", "io.files", "io.rows", "io.tables", "io.toml_table", "io.units"),

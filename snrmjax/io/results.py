@@ -12,7 +12,7 @@ from snrmjax.io.units import HERTZ
 from snrmjax.simulate.balance.labelled import velocity_peaks
 from snrmjax.simulate.continuation.response_curve import (
     ResponseCurve,
-    recorded_velocity,
+    velocity_at_sensors,
 )
 from snrmjax.simulate.continuation.stability import Stability
 from snrmjax.simulate.solutions.event_curves import EventCurve
@@ -51,7 +51,7 @@ def write_response(
     """
     r = _place(curves[0].sensors, sensor) if curves else 0
     force = np.concatenate([np.full(len(c.frequency), c.force) for c in curves])
-    recorded = [recorded_velocity(c, c.force) for c in curves]
+    recorded = [velocity_at_sensors(c, c.force) for c in curves]
     velocity = np.concatenate([v[:, :, r] for v in recorded])
     named = {}
     if curves and len(curves[0].sensors) > 1:
@@ -85,7 +85,7 @@ def write_event_curves(
         raise ValueError("there is no curve of events to write.")
     r = _place(curves[0].sensors, sensor)
     sizes = [len(c.frequency) for c in curves]
-    velocity = np.concatenate([recorded_velocity(c, c.force)[:, :, r] for c in curves])
+    velocity = np.concatenate([velocity_at_sensors(c, c.force)[:, :, r] for c in curves])
     fundamental = velocity[:, 1]
     columns = {
         "curve": np.repeat(np.arange(len(curves)), sizes),

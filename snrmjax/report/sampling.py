@@ -11,7 +11,7 @@ from snrmjax.measure.states import SteadyStates
 from snrmjax.simulate.continuation.response_curve import (
     MotionCurve,
     ResponseCurve,
-    recorded_velocity,
+    velocity_at_sensors,
 )
 
 if TYPE_CHECKING:  # figures of a simulation do not wait for the imports of an identification
@@ -134,7 +134,7 @@ def velocity_of(curve: PredictedResponse | MotionCurve, sensor: str) -> np.ndarr
     if isinstance(curve, PredictedResponse):
         return curve.velocity
     force = getattr(curve, "force", 0.0)  # a normal mode has none
-    return recorded_velocity(curve, force)[:, 1, sensor_index(curve.sensors, sensor)]
+    return velocity_at_sensors(curve, force)[:, 1, sensor_index(curve.sensors, sensor)]
 
 
 VELOCITY = ShownAmplitude("velocity", "m/s", "velocity_m_s", 0)

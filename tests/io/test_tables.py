@@ -39,7 +39,7 @@ def same(one: SteadyStates, other: SteadyStates) -> bool:
         a, b = getattr(one, name), getattr(other, name)
         if name == "notes":
             continue  # about the file, not of the states
-        if name in ("sensors", "harmonic_order"):
+        if name in ("sensors", "harmonic_order", "base"):
             equal = a == b
         elif name in ("frequency", "phase_std"):
             # A quotient and a product, each correctly rounded: two units in the last place.

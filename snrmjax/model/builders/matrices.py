@@ -18,7 +18,10 @@ from snrmjax.numerics.names import suggestion
 from snrmjax.numerics.rules import POSITIVE, require
 
 _SYMMETRIC = 1e-8  # of the largest entry: what a finite-element program's output may miss by
-_RIGID = 1e-9  # of the largest: natural frequencies squared below are of rigid-body motions
+_RIGID = 1e-9  # of the largest of a few: natural frequencies squared below are of rigid motions
+_ROUNDING = 2e-14  # of the largest entry, for every unknown: what rounding leaves of zero
+_SMALL = 100  # unknowns, above which a few modes are found by themselves
+_MORE, _PASSES = 6, 4  # modes beside those wanted; shifts that are tried
 _DEPENDENT = 1e-10  # of its length: what is left of a vector that others already contain
 _DENSE = 2000  # unknowns, above which only the wanted modes are computed
 _OVERDAMPED = 0.99  # damping ratio, beyond which the rest counts as coupling
@@ -188,28 +191,59 @@ def _modes(m: Any, k: Any, n_modes: int | None) -> tuple[np.ndarray, np.ndarray,
     wanted = size if n_modes is None else n_modes
     if not 1 <= wanted <= size:
         raise ValueError(f"`n_modes` must lie between 1 and {size}, but is {n_modes}.")
-    if scipy.sparse.issparse(k) and wanted < size - 1:
-        # A shift below zero keeps the factorised matrix regular where rigid-body modes exist.
-        shift = -1e-3 * abs(k.diagonal()).min() / abs(m.diagonal()).max()
-        squared, shapes = scipy.sparse.linalg.eigsh(k, min(wanted + 6, size - 1), m, sigma=shift)
-        scale = squared.max()
+    if wanted + _MORE < size and (scipy.sparse.issparse(k) or size > _SMALL):
+        squared, shapes = _lowest_modes(m, k, wanted + _MORE)
+        rigid = _RIGID * squared.max()
     else:
         try:
             squared, shapes = scipy.linalg.eigh(_dense(k), _dense(m))
         except np.linalg.LinAlgError as error:
             raise ValueError("`mass` must be positive definite, but is not.") from error
-        scale = max(squared.max(), np.finfo(float).tiny)
+        rigid = max(_ROUNDING * size * squared.max(), np.finfo(float).tiny)
     order = np.argsort(squared)
     squared, shapes = squared[order], shapes[:, order]
-    if squared[0] < -_RIGID * scale:
+    if squared[0] < -rigid:
         raise ValueError(
             "`stiffness` must not be negative, but one of the squared natural frequencies is "
             f"{squared[0]:g} 1/s²."
         )
     shapes = shapes * np.where(shapes[np.argmax(np.abs(shapes), 0), range(len(order))] < 0, -1, 1)
-    floats = squared <= _RIGID * scale
+    floats = squared <= rigid
     keep = np.flatnonzero(~floats)[:wanted]
     return squared[keep], shapes[:, keep], shapes[:, floats]
+
+
+def _lowest_modes(m: Any, k: Any, wanted: int) -> tuple[np.ndarray, np.ndarray]:
+    """The lowest modes by Lanczos' method on the inverse, rigid-body modes among them.
+
+    A shift as large as the lowest natural frequency squared loses no digits of it; one that is far
+    larger, as entries of a fine mesh suggest, loses all.
+    """
+    mass, stiffness = scipy.sparse.csc_matrix(m), scipy.sparse.csc_matrix(k)
+    entries = abs(stiffness.diagonal()).min() / abs(mass.diagonal()).max()
+    shifts = [0.0] if _regular(stiffness) else [-1e-3 * entries]
+    for _ in range(_PASSES):
+        try:
+            squared, shapes = scipy.sparse.linalg.eigsh(stiffness, wanted, mass, sigma=shifts[-1])
+        except RuntimeError as error:
+            raise ValueError(
+                "the lowest modes are lost to rounding: the mesh is too fine for these matrices, "
+                "or `stiffness` and `mass` have motions in common that neither holds."
+            ) from error
+        flexible = squared[squared > _RIGID * squared.max()]
+        if shifts[-1] == 0 or -shifts[-1] < 0.2 * flexible.min():
+            break
+        shifts.append(-0.1 * flexible.min())
+    return squared, shapes
+
+
+def _regular(stiffness: Any) -> bool:
+    """Whether a stiffness has an inverse: no motion without a force."""
+    try:
+        pivots = np.abs(scipy.sparse.linalg.splu(stiffness).U.diagonal())
+    except RuntimeError:  # exactly singular
+        return False
+    return bool(pivots.min() > _ROUNDING * pivots.max())
 
 
 def _dense(matrix: Any) -> np.ndarray:

@@ -13,7 +13,7 @@ from snrmjax.report.figures.simulation import (
     simulated_response_figure,
 )
 from snrmjax.report.style import save_figure
-from snrmjax.simulate.continuation.response_curve import Branch, ResponseCurve, recorded_velocity
+from snrmjax.simulate.continuation.response_curve import Branch, ResponseCurve, velocity_at_sensors
 
 
 def write(folder: Path, found: SimulatedResponses | SimulatedMode) -> None:
@@ -43,7 +43,7 @@ def headline(found: SimulatedResponses | SimulatedMode) -> list[str]:
 
 
 def _largest(curve: ResponseCurve, sensor: str) -> str:
-    velocity = recorded_velocity(curve, curve.force)[:, 1]
+    velocity = velocity_at_sensors(curve, curve.force)[:, 1]
     speed = np.abs(velocity[:, curve.sensors.index(sensor)])
     name = "" if curve.branch == Branch.MAIN else f" ({curve.branch})"
     load = "force" if curve.base is None else "base acceleration"

@@ -68,7 +68,7 @@ def motions_of(balance: HarmonicBalance, points: Float[np.ndarray, "point unknow
     return {**named, "sensors": modes.sensors, "base": modes.base}
 
 
-def recorded_velocity(
+def velocity_at_sensors(
     curve: MotionCurve, force: float | Float[np.ndarray, " point"]
 ) -> Complex[np.ndarray, "point harmonic sensor"]:
     """Velocities as the sensors record them, m/s: with the base's own where they see it too.
