@@ -13,6 +13,7 @@ _READERS: dict[Kind, tuple[str, str]] = {
     "matlab": ("arrays.matlab_files", "read_matlab"),
     "hdf5": ("arrays.hdf5_tree", "read_hdf5"),
     "tdms": ("tdms_files", "read_tdms"),
+    "lvm": ("labview_text", "read_labview_text"),
     "csv": ("separated_text", "read_separated_text"),
 }
 _HEAD = 4096
@@ -23,8 +24,8 @@ _HDF5 = b"\x89HDF\r\n\x1a\n"
 def read_laboratory_file(path: FilePath, text_format: TextFormat | None = None) -> LaboratoryFile:
     """All recordings, frequency responses and tables of a file.
 
-    Formats: UFF/UNV (58, 58b), MATLAB v4 to v7.3, HDF5, netCDF 4, TDMS, and
-    CSV or other separated text. Long records are not read before they are asked for (HDF5,
+    Formats: UFF/UNV (58, 58b), MATLAB v4 to v7.3, HDF5, netCDF 4, TDMS, LabVIEW measurement files,
+    and CSV or other separated text. Long records are not read before they are asked for (HDF5,
     netCDF, MATLAB v7.3, TDMS).
     Arguments: `text_format` says how a CSV is written where that is not found out by itself.
     Returns `LaboratoryFile`. Raises `ValueError`, in one sentence that names the file, for a file
@@ -54,6 +55,8 @@ def _kind(path: FilePath) -> Kind:
         return "tdms"
     if is_old_matlab(head, Path(path).suffix):
         return "matlab"
+    if head.lstrip(b"\xef\xbb\xbf\r\n ").startswith(b"LabVIEW Measurement"):
+        return "lvm"
     first = head.lstrip(b"\r\n").split(b"\n", 1)[0].rstrip()
     if first == b"    -1":
         return "uff"

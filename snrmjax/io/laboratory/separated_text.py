@@ -1,10 +1,10 @@
 """Separated text (CSV and its relatives): separator, decimal mark and header found or told."""
 
-import csv
 import io
 import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas
@@ -13,39 +13,46 @@ from snrmjax.io.files import shown
 from snrmjax.io.laboratory.arrays.structs import read_struct
 from snrmjax.io.laboratory.arrays.value_tree import Node, held
 from snrmjax.io.laboratory.contents import LaboratoryFile, TextFormat
+from snrmjax.io.laboratory.names import role_of
 from snrmjax.io.laboratory.physical_units import unit_meaning
+from snrmjax.io.laboratory.text_files import (
+    SEPARATORS,
+    fields_of,
+    is_number,
+    number_in,
+    text_of,
+)
 from snrmjax.numerics.facts import Fact
 
-_LARGEST = 2**28  # bytes
 _LOOKED_AT = 200  # lines in which the header ends
 _MOST_COLUMNS = 4096
 _COMMENTS = ("#", "%", "//", "!")
-_POINT = re.compile(
-    r"\s*[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eEdD][+-]?[0-9]+)?\s*|\s*nan\s*", re.I
-)
-_COMMA = re.compile(r"\s*[+-]?(?:[0-9]+,?[0-9]*|,[0-9]+)(?:[eE][+-]?[0-9]+)?\s*")
 _IN_BRACKETS = re.compile(r"^(.*?)\s*[\[(]([^\])]*)[\])]\s*$")
-_SEPARATORS = {"comma": ",", "semicolon": ";", "tab": "\t", "space": " "}
+_AXES = ("time", "frequency", "level", "rate", "step")
+_DATE = re.compile(r"[0-9]+[-/.:][0-9]+[-/.:]|[0-9]:[0-9]")  # and times of day: no units
 
 
 def read_separated_text(path: Path, text_format: TextFormat | None = None) -> LaboratoryFile:
     """A table of text. Raises `ValueError` as `read_laboratory_file` does."""
     stated, file = text_format or TextFormat(), path.name
-    lines = _text(path).splitlines()
+    lines = text_of(path).splitlines()
     separator, decimal = _marks(lines, stated, file)
-    first = _first_row(lines, separator, decimal, stated, file)
-    width = len(_split(lines[first], separator))
-    names, units = _header(lines, first, separator, stated)
-    notes: list[Fact] = []
-    if len(names) != width:
-        names, units = [f"column_{k + 1}" for k in range(width)], {}
-        notes.append(Fact("columns_numbered"))
+    first, width = _first_row(lines, separator, decimal, stated, file)
+    header = _header(lines, first, width, separator, stated, file)
+    notes: list[Fact] = [] if header.is_found else [Fact("columns_numbered")]
     below = [(k, line) for k, line in enumerate(lines[first:], first + 1) if line.strip()]
     rows = [(k, line) for k, line in below if not line.lstrip().startswith(_COMMENTS)]
     if len(below) > len(rows):
         notes.append(Fact("comments_not_read", n=len(below) - len(rows)))
+    columns = _columns(rows, separator, decimal, width, header.names, file)
+    runs = _runs_side_by_side(header, columns)
+    if runs is not None:
+        columns, units, labels = runs
+        notes.append(Fact("runs_side_by_side", labels=labels, n=int(max(columns["run"]))))
+    else:
+        units = header.units
     tree: dict[str, Node] = {}
-    for name, column in _columns(rows, separator, decimal, names, file).items():
+    for name, column in columns.items():
         if isinstance(column, list):
             tree[name] = list[Node](column)
             continue
@@ -56,7 +63,15 @@ def read_separated_text(path: Path, text_format: TextFormat | None = None) -> La
         if missing:
             notes.append(Fact("empty_fields", name=name, n=missing))
         tree[name] = held(column, {"unit": units[name]} if units.get(name) else {})
-    mark = next(word for word, each in _SEPARATORS.items() if each == separator)
+    said = _said_above(lines[:first], separator, decimal)
+    axes = {role_of(name) for name in tree}
+    if said.rate and not axes & {"time", "frequency", "rate", "step"}:
+        tree["fs" if said.is_rate else "dt"] = held(np.asarray(said.rate))
+        notes.append(Fact("rate_stated_above", text=said.text))
+    signal, described = said.signal, [name for name in tree if role_of(name) not in _AXES]
+    if signal and len(described) == 1 and signal not in tree:
+        tree = {signal if name == described[0] else name: node for name, node in tree.items()}
+    mark = next(word for word, each in SEPARATORS.items() if each == separator)
     notes.append(Fact("text_read", separator=mark, decimal=decimal, first_row=first + 1))
     contents = read_struct("", tree, entry=len(rows) == 1)
     tables = tuple(table._replace(name=path.stem or "table") for table in contents.numbered())
@@ -64,39 +79,54 @@ def read_separated_text(path: Path, text_format: TextFormat | None = None) -> La
     return LaboratoryFile(file, "csv", records, (), tables, (*notes, *contents.notes))
 
 
-def _text(path: Path) -> str:
-    """The text of a file: UTF-8 or, where it is none, Windows' Western letters (µ, ², °)."""
-    size = path.stat().st_size
-    if size > _LARGEST:
-        raise ValueError(
-            f"{path.name} has {size / 2**20:.0f} MiB, more than the {_LARGEST / 2**20:.0f} MiB "
-            "that are read of a text: take HDF5, MATLAB v7.3 or TDMS for long records."
-        )
-    content = path.read_bytes()
-    wide = content.startswith((b"\xff\xfe", b"\xfe\xff"))
-    if not wide and b"\0" in content:
-        raise ValueError(f"{path.name} is of no known format (it has NUL bytes).")
-    for encoding in ("utf-16",) if wide else ("utf-8-sig", "cp1252"):
-        try:
-            return content.decode(encoding)
-        except UnicodeDecodeError:
+class _Said(NamedTuple):
+    """What lines above a table say of it."""
+
+    signal: str = ""
+    rate: float = 0.0  # Hz, or a step in s
+    is_rate: bool = True
+    text: str = ""
+
+
+def _said_above(lines: Sequence[str], separator: str, decimal: str) -> _Said:
+    """The name of the only signal, and the sampling rate or step, that a key and a value state.
+
+    "Sampling rate:<tab>5120 Hz", "dt = 0,001 s", "Signal:<tab>Vib - Velocity - Samples".
+    """
+    said = _Said()
+    for line in lines:
+        plain = line.strip().lstrip("#%!/ ").strip()
+        fields = [field for field in fields_of(plain, separator) if field]
+        if len(fields) < 2:
+            key, _, value = plain.partition("=" if "=" in plain else ":")
+            fields = [key.strip(), value.strip()]
+        key, value = fields[0].rstrip(":= "), " ".join(fields[1:])
+        if key.lower() == "signal" and value:
+            parts = value.split(" - ")  # domain, channel, what of it
+            said = said._replace(signal=parts[1] if len(parts) == 3 else value)
+        role = role_of(key)
+        if role not in ("rate", "step") or said.rate:
             continue
-    raise ValueError(f"{path.name} is of no known format (it is no text).")
-
-
-def _split(line: str, separator: str) -> list[str]:
-    """The fields of a line."""
-    if separator == " ":
-        return line.split()
-    try:
-        return [field.strip() for field in next(csv.reader([line], delimiter=separator), [])]
-    except csv.Error as error:
-        raise ValueError(f"a line of the file breaks the quotes: {shown(line)}.") from error
+        match = _IN_BRACKETS.match(key)
+        number, _, unit = value.partition(" ")
+        size = number_in(number, decimal)
+        size = number_in(number, "point") if size is None else size
+        unit = unit.strip() or (match[2] if match else "") or ("Hz" if role == "rate" else "s")
+        try:
+            meaning = unit_meaning(unit)
+        except ValueError:
+            continue
+        if size is None or size <= 0 or meaning.dimension not in ("frequency", "time"):
+            continue
+        is_rate = meaning.dimension == "frequency"
+        factor = meaning.factor / (2 * np.pi) if is_rate else meaning.factor
+        said = said._replace(rate=size * factor, is_rate=is_rate, text=plain)
+    return said
 
 
 def _marks(lines: list[str], stated: TextFormat, file: str) -> tuple[str, str]:
     """Separator and decimal mark: those with which most lines are rows of numbers."""
-    separators = [_SEPARATORS[stated.separator]] if stated.separator else _SEPARATORS.values()
+    separators = [SEPARATORS[stated.separator]] if stated.separator else SEPARATORS.values()
     decimals = [stated.decimal] if stated.decimal else ["point", "comma"]
     looked = [line for line in lines[:_LOOKED_AT] if line.strip()]
     scores = {
@@ -117,7 +147,7 @@ def _score(lines: list[str], separator: str, decimal: str) -> int | None:
 
     A field that is no number counts against them twice: "79,5" cut at its comma gives numbers too.
     """
-    split = [_split(line, separator) for line in lines]
+    split = [fields_of(line, separator) for line in lines]
     rows = [fields for fields in split if _is_row(fields, decimal)]
     if not rows:
         return None
@@ -128,8 +158,7 @@ def _score(lines: list[str], separator: str, decimal: str) -> int | None:
 
 
 def _count_numbers(fields: list[str], decimal: str) -> int:
-    shape = _POINT if decimal == "point" else _COMMA
-    return sum(bool(shape.fullmatch(field)) for field in fields)
+    return sum(is_number(field, decimal) for field in fields)
 
 
 def _is_row(fields: list[str], decimal: str) -> bool:
@@ -140,50 +169,130 @@ def _is_row(fields: list[str], decimal: str) -> bool:
 
 def _first_row(
     lines: list[str], separator: str, decimal: str, stated: TextFormat, file: str
-) -> int:
-    """The first row of numbers (from zero): from there on rows have its width."""
+) -> tuple[int, int]:
+    """The first row of numbers (from zero) and its number of columns, which all rows below have."""
     start = stated.header_row or 0
-    split = ((k, _split(lines[k], separator)) for k in range(start, len(lines))[:_LOOKED_AT])
+    split = ((k, fields_of(lines[k], separator)) for k in range(start, len(lines))[:_LOOKED_AT])
     widths = {k: len(fields) for k, fields in split if _is_row(fields, decimal)}
     if not widths:
         raise ValueError(f"{file} has no row of numbers below row {start}.")
     width = max(widths.values())
     if width > _MOST_COLUMNS:
         raise ValueError(f"{file} has {width} columns, more than {_MOST_COLUMNS}.")
-    return next(k for k in widths if widths[k] == width)
+    # A row may lack its last values: what lies between the first and the widest are rows too.
+    first = next(k for k in widths if widths[k] == width)
+    return first, width
+
+
+class _Header(NamedTuple):
+    """What stands above the columns: names (each its own), as they are written, units, labels."""
+
+    names: tuple[str, ...]
+    written: tuple[str, ...]
+    units: Mapping[str, str]
+    labels: tuple[str, ...]  # of runs, above or below the names; or none
+    is_found: bool
 
 
 def _header(
-    lines: list[str], first: int, separator: str, stated: TextFormat
-) -> tuple[list[str], dict[str, str]]:
-    """Names and units of the rows above the numbers."""
-    width = len(_split(lines[first], separator))
+    lines: list[str], first: int, width: int, separator: str, stated: TextFormat, file: str
+) -> _Header:
+    """Names and units of the rows above the numbers: of the row with most fields that fits."""
     at = (stated.header_row or 0) - 1
     rows = {
-        k: fields
+        k: (fields + [""] * width)[:width]
         for k in range(max(0, first - _LOOKED_AT), first)
-        if len(fields := _split(lines[k].lstrip("#%!/ "), separator)) == width or k == at
+        if 0 < len(fields := fields_of(lines[k].lstrip("#%!/ "), separator)) <= width or k == at
     }
-    if not rows:
-        return [], {}
-    *above, last = rows
-    names, below = rows[last], list[str]()
     if at >= 0:
-        names, below = rows.get(at, names), rows[last] if last > at else []
-    elif above and _all_units(names):
-        names, below = rows[above[-1]], names
+        count = len(fields_of(lines[at].lstrip("#%!/ "), separator)) if at < first else 0
+        if count != width:
+            raise ValueError(
+                f"--header-row {at + 1} of {file} has {count} names, but the rows of numbers below "
+                f"have {width} columns."
+            )
+        names, below = rows[at], [rows[k] for k in rows if k > at]
+    else:
+        filled = {k: sum(bool(field) for field in row) for k, row in rows.items()}
+        whole = [k for k in rows if filled[k] == width or (filled[k] > 1 and rows[k][-1])]
+        if not whole:
+            names = [f"column_{k + 1}" for k in range(width)]
+            return _Header(tuple(names), tuple(names), {}, (), False)
+        last = max(whole, key=lambda k: (filled[k], k))
+        above = [k for k in whole if k < last]
+        if above and _all_units(rows[last]):
+            last = above[-1]
+        names, below = rows[last], [rows[k] for k in rows if k > last]
+    unit_row = next((row for row in below if _all_units(row)), [""] * width)
+    # Labels stand where a group of columns begins: "002: [01-05-26 09:28]" above its first.
+    marked = (row for row in (*below, *rows.values()) if row not in (names, unit_row))
+    labels = next((row for row in marked if 1 < sum(map(bool, row)) < width and not row[0]), [])
     units: dict[str, str] = {}
     plain: list[str] = []
+    written: list[str] = []
     for k, name in enumerate(names):
         match = _IN_BRACKETS.match(name.strip())
-        word, unit = (match[1], match[2]) if match and match[1] else (name.strip(), "")
+        has_unit = match and match[1] and not _DATE.search(match[2])
+        word, unit = (match[1], match[2]) if match and has_unit else (name.strip(), "")
+        written.append(f"{word} [{unit}]")
         word = word or f"column_{k + 1}"
         while word in plain:
             word = f"{word}_{k + 1}"
         plain.append(word)
-        unit = unit or (below[k].strip("[]() ") if k < len(below) else "")
+        unit = unit or unit_row[k].strip("[]() ")
         units |= {word: unit} if unit else {}
-    return plain, units
+    return _Header(tuple(plain), tuple(written), units, tuple(labels), True)
+
+
+def _runs_side_by_side(
+    header: _Header, columns: Mapping[str, np.ndarray | list[str]]
+) -> tuple[dict[str, np.ndarray | list[str]], Mapping[str, str], tuple[str, ...]] | None:
+    """Runs that lie side by side as one table with the number of the run, or None: there are none.
+
+    They do where the same names come again: "f, v, phase, v, phase" with one frequency for all, or
+    "f, v, phase, f, v, phase" with one for each. Two columns of one name alone are two channels,
+    unless labels stand above them.
+    """
+    names, written, labels = header.names, header.written, header.labels
+    if not header.is_found or any(isinstance(column, list) for column in columns.values()):
+        return None
+    for shared in (0, 1):
+        groups = _repeated(written[shared:], 1 if labels and shared else 2)
+        if groups > 1:
+            break
+    else:
+        return None
+    size = (len(names) - shared) // groups
+    parts: dict[str, list[np.ndarray]] = {name: [] for name in names[: shared + size]}
+    number: list[np.ndarray] = []
+    for group in range(groups):
+        at = shared + group * size
+        own = [np.asarray(columns[name]) for name in names[at : at + size]]
+        there = np.isfinite(np.stack(own)).any(axis=0)
+        for name, column in zip(names[shared : shared + size], own, strict=True):
+            parts[name].append(column[there])
+        for name in names[:shared]:
+            parts[name].append(np.asarray(columns[name])[there])
+        number.append(np.full(int(there.sum()), group + 1.0))
+    run = np.concatenate(number)
+    stacked: dict[str, np.ndarray | list[str]] = {
+        name: np.concatenate(each) for name, each in parts.items()
+    }
+    said = [
+        next((word for word in labels[at : at + size] if word), "")
+        for at in range(shared, len(names), size)
+    ] * bool(labels)
+    words = {"run label": [said[int(k) - 1] for k in run]} if any(said) else {}
+    units = {name: unit for name, unit in header.units.items() if name in stacked}
+    return {"run": run} | stacked | words, units, tuple(said)
+
+
+def _repeated(names: Sequence[str], fewest: int) -> int:
+    """How many times one group of names, of `fewest` at least, makes up all of them."""
+    for size in range(fewest, len(names) // 2 + 1):
+        if len(names) % size == 0 and list(names) == list(names[:size]) * (len(names) // size):
+            return len(names) // size
+    return 1
 
 
 def _all_units(fields: list[str]) -> bool:
@@ -197,28 +306,33 @@ def _all_units(fields: list[str]) -> bool:
 
 
 def _columns(
-    rows: list[tuple[int, str]], separator: str, decimal: str, names: list[str], file: str
+    rows: list[tuple[int, str]],
+    separator: str,
+    decimal: str,
+    width: int,
+    names: Sequence[str],
+    file: str,
 ) -> dict[str, np.ndarray | list[str]]:
     """Columns of numbers or of text by name."""
-    width = len(names)
     for k, line in rows:
-        count = len(line.split()) if separator == " " else line.count(separator) + 1
-        if count > width and not ('"' in line or not line.rstrip(separator + " ")):
-            count -= line.endswith(separator)
-        if count != width and '"' not in line:
+        bare = line.rstrip(separator + " ") if separator != "\t" else line.rstrip()
+        least = len(line.split()) if separator == " " else bare.count(separator) + 1
+        most = least if separator == " " else line.count(separator) + 1
+        if (least > width or most < width) and '"' not in line:
             raise ValueError(
-                f"row {k} of {file} has {count} fields, but the first row of numbers has {width}."
+                f"row {k} of {file} has {least} fields, but the first row of numbers has {width}."
             )
+    bare_rows = [_cut(line, separator, width) for _, line in rows]
     # From 3.1 on pandas reads numbers to the last bit by itself, and says so of the option.
     exact = tuple(map(int, pandas.__version__.split(".")[:2])) >= (3, 1)
     precision: dict[str, Any] = {} if exact else {"float_precision": "round_trip"}
     try:
         table = pandas.read_csv(
-            io.StringIO("\n".join(line for _, line in rows)),
+            io.StringIO("\n".join(bare_rows)),
             sep=r"\s+" if separator == " " else separator,
             decimal="." if decimal == "point" else ",",
             header=None,
-            names=names,
+            names=list(names),
             index_col=False,
             skipinitialspace=True,
             **precision,
@@ -240,3 +354,10 @@ def _columns(
             )
         columns[name] = ["" if pandas.isna(word) else str(word) for word in column]
     return columns
+
+
+def _cut(line: str, separator: str, width: int) -> str:
+    """A row without what separators at its end add to its columns."""
+    if separator == " " or line.count(separator) < width or '"' in line:
+        return line
+    return separator.join(line.split(separator)[:width])

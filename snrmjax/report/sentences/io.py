@@ -84,6 +84,27 @@ SENTENCES: dict[str, Wording] = {
     "columns_numbered": "no row of names above the numbers: the columns are numbered.",
     "comments_not_read": "{n:#line} of comment among the numbers not read.",
     "empty_fields": "column {name} has {n:#empty field}.",
+    "text_says": lambda separator, decimal, n: (
+        f"separator {separator}, decimal {decimal}, {number_of(n, 'segment')}, as its header says."
+    ),
+    "samples_missing": "channel {name}: the file states {of} samples and holds {n}.",
+    "whole_rate_of_digits": (
+        "the step {step} s has few digits: {rate} Hz, the only whole rate that is printed so."
+    ),
+    "rate_left_open": "the step {step} s has few digits: frequencies may be off by {off:.1g} %.",
+    "channels_shifted": lambda names, seconds: (
+        "by the starting times that the file states, "
+        + ", ".join(
+            f"{name} began {1e3 * each:.6g} ms" for name, each in zip(names, seconds, strict=True)
+        )
+        + " earlier: only the time that all channels share is read."
+    ),
+    "channels_of_files": lambda files: f"one record of the channels of {', '.join(files)}.",
+    "runs_side_by_side": lambda labels, n: (
+        f"{n} runs lie side by side: one table with the column `run`"
+        + (f" ({', '.join(labels)})." if any(labels) else ".")
+    ),
+    "rate_stated_above": "the sampling is stated above the numbers: {text}.",
     "text_read": "separator {separator}, decimal {decimal}, numbers from row {first_row}.",
     "coherence_alone": "a coherence without its frequency response is not read.",
     "frequencies_do_not_rise": "frequency responses whose frequencies do not rise are in a table.",

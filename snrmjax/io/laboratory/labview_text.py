@@ -1,0 +1,318 @@
+"""LabVIEW measurement files (.lvm): their header states separator, decimal mark, steps and units.
+
+Source: NI, "LabVIEW Measurement File format specification" (tutorial 4139).
+"""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from snrmjax.io.laboratory.arrays.structs import read_struct
+from snrmjax.io.laboratory.arrays.value_tree import Node, Numbers, held
+from snrmjax.io.laboratory.contents import LaboratoryFile, NumberTable
+from snrmjax.io.laboratory.physical_units import channel_meaning
+from snrmjax.io.laboratory.shared_clock import SharedAxis, TimeAxis, note_on_shift, shared_axes
+from snrmjax.io.laboratory.text_files import SEPARATORS, fields_of, number_in, text_of
+from snrmjax.measure.recordings.channels import Channel
+from snrmjax.measure.recordings.time_recording import HeldSamples, TimeRecording, time_recording
+from snrmjax.numerics.facts import Fact
+
+_END = "***End_of_Header***"
+_X = "X_Value"
+_EVEN = 1e-3  # of a step: what rounding leaves of an even abscissa
+_ROUNDED = 1e-5  # relative, of a step, which its digits may leave open without a word
+
+
+class _Style(NamedTuple):
+    """How the file says that it is written."""
+
+    file: str
+    separator: str
+    decimal: str
+    x_columns: str  # No, One, Multi
+
+    def number(self, field: str, what: str) -> float:
+        """A number, whatever its decimal mark: old headers have points beside commas."""
+        value = number_in(field, "point")
+        value = number_in(field, "comma") if value is None else value
+        if value is None:
+            raise ValueError(f"{self.file} is damaged: its {what} is {field!r}.")
+        return value
+
+
+class _Column(NamedTuple):
+    """A channel of a segment."""
+
+    name: str
+    unit: str
+    dimension: str  # of its abscissa: Time, Frequency, …
+    start: float
+    step: float  # 0: not stated
+    stated: int | None  # number of samples
+    abscissa: np.ndarray | None
+    values: np.ndarray
+
+
+def read_labview_text(path: Path) -> LaboratoryFile:
+    """A LabVIEW measurement file. Raises `ValueError` as `read_laboratory_file` does."""
+    lines = text_of(path).splitlines()
+    style, first = _style(lines, path.name)
+    recordings: list[TimeRecording] = []
+    tables: list[NumberTable] = []
+    notes: list[Fact] = []
+    segments = _segments(lines, first, style)
+    for k, (header, rows) in enumerate(segments, 1):
+        name = path.stem if len(segments) == 1 else f"segment {k}"
+        columns, words, further = _columns(header, rows, style)
+        notes += further
+        loose: dict[str, Node] = {}
+        waves: dict[int, TimeAxis] = {}
+        for number, column in enumerate(columns):
+            if _is_even(column) and column.dimension.lower() in ("time", ""):
+                waves[number] = TimeAxis(column.step, column.start, len(column.values))
+                continue
+            is_time = column.dimension.lower() in ("time", "")
+            axis = "time" if is_time else column.dimension.lower()
+            x = column.abscissa
+            x = column.start + column.step * np.arange(len(column.values)) if x is None else x
+            known = loose.get(axis)
+            if isinstance(known, Numbers) and not np.array_equal(known.vector(axis), x):
+                axis = f"{axis} of {column.name}"
+            loose[axis] = held(x, {"unit": "s" if is_time else "Hz"})
+            loose[column.name] = held(column.values, {"unit": column.unit} if column.unit else {})
+        for shared in shared_axes({columns[n].name: axis for n, axis in waves.items()}):
+            recordings.append(_recording(name, columns, shared))
+            notes += note_on_shift(shared)
+        loose |= words if loose else {}
+        contents = read_struct("", loose)
+        recordings += contents.recordings
+        tables += [
+            table._replace(name=name if not place else f"{name}.{place}")
+            for place, table in contents.tables.items()
+        ]
+        notes += contents.notes
+    mark = next(word for word, each in SEPARATORS.items() if each == style.separator)
+    notes.append(Fact("text_says", separator=mark, decimal=style.decimal, n=len(segments)))
+    return LaboratoryFile(
+        path.name, "lvm", tuple(recordings), (), tuple(tables), tuple(dict.fromkeys(notes))
+    )
+
+
+def _style(lines: Sequence[str], file: str) -> tuple[_Style, int]:
+    """What the file's header says, and the first line below it."""
+    end = next((k for k, line in enumerate(lines) if line.startswith(_END)), None)
+    if end is None:
+        raise ValueError(f"{file} is damaged: its header has no end ({_END}).")
+    said: dict[str, str] = {}
+    for line in lines[1:end]:
+        separator = "\t" if "\t" in line else ","
+        key, _, value = line.partition(separator)
+        said[key.strip()] = value.strip().strip('"')
+    stated = said.get("Separator", "Tab").lower()
+    separator = SEPARATORS.get({"": "tab", ",": "comma", ";": "semicolon"}.get(stated, stated), "")
+    x_columns = said.get("X_Columns", "One").lower()
+    if not separator or x_columns not in ("no", "one", "multi"):
+        raise ValueError(
+            f"{file} states the separator {said.get('Separator')!r} and X_Columns "
+            f"{said.get('X_Columns')!r}: Tab, Comma or Semicolon, and No, One or Multi are known."
+        )
+    decimal = {".": "point", ",": "comma"}.get(said.get("Decimal_Separator", "."), "")
+    if not decimal or (separator, decimal) == (",", "comma"):
+        raise ValueError(
+            f"{file} states the separator {stated} and the decimal mark "
+            f"{said.get('Decimal_Separator')!r}, which cannot be told apart."
+        )
+    return _Style(file, separator, decimal, x_columns), end + 1
+
+
+def _segments(
+    lines: Sequence[str], first: int, style: _Style
+) -> list[tuple[dict[str, list[str]], list[tuple[int, list[str]]]]]:
+    """Header and rows (with the numbers of their lines) of every segment."""
+    segments: list[tuple[dict[str, list[str]], list[tuple[int, list[str]]]]] = []
+    special = in_header = False
+    for k, line in enumerate(lines[first:], first + 1):
+        special = special or line.startswith("***Start_Special***")
+        if special or not line.strip():
+            special = special and not line.startswith("***End_Special***")
+            continue
+        fields = fields_of(line, style.separator)
+        if not fields:
+            continue
+        if fields[0] in ("Channels", "Notes", "Test_Name", "Test_Numbers", "Test_Series") and (
+            not in_header
+        ):
+            segments.append(({}, []))
+            in_header = True
+        if not segments:
+            raise ValueError(
+                f"line {k} of {style.file} belongs to no segment: its header lacks Channels."
+            )
+        header, rows = segments[-1]
+        if not in_header:
+            if rows or "names" in header:
+                rows.append((k, fields))
+            else:
+                header["names"] = fields
+        elif fields[0] == _END:
+            in_header = False
+        else:
+            header[fields[0]] = fields
+    if not segments:
+        raise ValueError(f"{style.file} has no segment: its header alone is there.")
+    return segments
+
+
+def _columns(
+    header: dict[str, list[str]], rows: Sequence[tuple[int, list[str]]], style: _Style
+) -> tuple[list[_Column], dict[str, Node], list[Fact]]:
+    """The channels of a segment, its column of comments, and notes."""
+    file, names = style.file, header.get("names", [])
+    if not rows or not names:
+        return [], {}, [Fact("not_read", name="a segment without samples", why="empty")]
+    is_multi = style.x_columns == "multi"
+    last = len(names) - 1 if names[-1] == "Comment" else len(names)
+    places = range(1, last, 2 if is_multi else 1)
+    stated = header.get("Channels", ["", ""])
+    count = int(style.number(stated[1], "number of channels")) if len(stated) > 1 else 0
+    if names[0] != _X or count != len(places):
+        raise ValueError(
+            f"{file} states {count} channels, but its row of names has "
+            f"{len(places)}: {', '.join(names)}."
+        )
+    longest = max(len(fields) for _, fields in rows)
+    if longest > len(names) and not (longest == last + 1 and names[-1] != "Comment"):
+        row = next(k for k, fields in rows if len(fields) == longest)
+        raise ValueError(
+            f"line {row} of {file} has {longest} fields, but its row of names has {len(names)}."
+        )
+    table = {place: _numbers(rows, place, style) for place in range(last)}
+    plain = _unique([names[place] for place in places])
+    columns: list[_Column] = []
+    notes: list[Fact] = []
+    for name, place in zip(plain, places, strict=True):
+
+        def said(key: str, place: int = place) -> str:
+            fields = header.get(key, [])
+            return fields[place] if place < len(fields) else ""
+
+        there = np.isfinite(table[place])
+        if not there.any():
+            notes.append(Fact("not_read", name=f"channel {name}", why="empty"))
+            continue
+        end = int(np.flatnonzero(there)[-1]) + 1
+        x_place = {"no": None, "one": 0, "multi": place - 1}[style.x_columns]
+        x = None if x_place is None else table[x_place][:end]
+        x = None if x is None or not np.isfinite(x).all() else x
+        n = int(style.number(said("Samples"), "number of samples")) if said("Samples") else None
+        if n is not None and n > end:
+            notes.append(Fact("samples_missing", name=name, n=end, of=n))
+        if not there[:end].all():
+            notes.append(Fact("empty_fields", name=name, n=int((~there[:end]).sum())))
+        start = style.number(said("X0"), "X0") if said("X0") else 0.0
+        step = style.number(said("Delta_X"), "Delta_X") if said("Delta_X") else 0.0
+        step = _exact_step(said("Delta_X"), step, notes) if step > 0 else step
+        if style.x_columns == "no" and step <= 0:
+            raise ValueError(f"{file} states no step (Delta_X) of channel {name}, and no times.")
+        columns.append(
+            _Column(
+                *(name, said("Y_Unit_Label"), said("X_Dimension"), start + _clock(header, place)),
+                *(step, n, x, table[place][:end]),
+            )
+        )
+    comments = [
+        fields[last] if len(fields) > last and names[-1] == "Comment" else "" for _, fields in rows
+    ]
+    words: dict[str, Node] = {"Comment": list[Node](comments)} if any(comments) else {}
+    return columns, words, notes
+
+
+def _numbers(rows: Sequence[tuple[int, list[str]]], place: int, style: _Style) -> np.ndarray:
+    """A column of numbers; NaN where a field is empty."""
+    values = np.full(len(rows), np.nan)
+    for k, (line, fields) in enumerate(rows):
+        field = fields[place] if place < len(fields) else ""
+        if not field:
+            continue
+        value = number_in(field, style.decimal)
+        if value is None:
+            raise ValueError(
+                f"line {line} of {style.file} must be numbers with a decimal {style.decimal}, but "
+                f"has {field[:40]!r}."
+            )
+        values[k] = value
+    return values
+
+
+def _clock(header: dict[str, list[str]], place: int) -> float:
+    """Seconds by which a channel starts after the earliest of its segment, by its time of day."""
+    times: dict[int, float] = {}
+    for k, word in enumerate(header.get("Time", [])[1:], 1):
+        parts = [number_in(part, "comma" if "," in part else "point") for part in word.split(":")]
+        known = [part for part in parts if part is not None]
+        if len(known) == len(parts) == 3:
+            days = header.get("Date", [])
+            day = np.datetime64(days[k].replace("/", "-")) if k < len(days) and days[k] else None
+            since = 0.0 if day is None else float(day.astype("datetime64[D]").astype(int)) * 86400
+            times[k] = since + known[0] * 3600 + known[1] * 60 + known[2]
+    return times[place] - min(times.values()) if place in times else 0.0
+
+
+def _is_even(column: _Column) -> bool:
+    """Whether samples lie as `start` and `step` say: no times beside them say otherwise."""
+    if column.step <= 0 or not np.isfinite(column.values).all() or len(column.values) < 2:
+        return False
+    if column.abscissa is None:
+        return True
+    steps = np.diff(column.abscissa)
+    # Printed times have six decimals: their rounding is no unevenness.
+    return bool(np.all(np.abs(steps - column.step) < _EVEN * column.step + 1.01e-6))
+
+
+def _recording(name: str, columns: Sequence[_Column], shared: SharedAxis) -> TimeRecording:
+    """Channels of one clock as a record."""
+    by_name = {column.name: column for column in columns}
+    rows, channels = [], []
+    for key, skip in zip(shared.channels, shared.skipped, strict=True):
+        column = by_name[key]
+        rows.append(column.values[skip : skip + shared.axis.n_samples])
+        quantity, calibration = channel_meaning(column.unit)
+        channels.append(Channel(column.name, quantity, column.unit, calibration))
+    rate = 1 / shared.axis.step
+    whole = round(rate)
+    rate = float(whole) if whole and abs(rate / whole - 1) < 1e-12 else rate
+    return time_recording(
+        HeldSamples(np.stack(rows)), channels, rate, start_time=shared.axis.start, name=name
+    )
+
+
+def _exact_step(word: str, step: float, notes: list[Fact]) -> float:
+    """A sampling interval that was printed with few digits: of the only whole rate it can mean.
+
+    "0.000977" is 1024 Hz: no other whole rate is printed so. Where there are several, the interval
+    is taken as it stands, and a note says what its digits leave open.
+    """
+    plain, _, power = word.lower().replace(",", ".").partition("e")
+    half = 0.5 * 10.0 ** (int(power or 0) - len(plain.partition(".")[2]))
+    rate = 1 / step
+    if step <= half or abs(rate / max(1, round(rate)) - 1) < 1e-9:
+        return step
+    least, most = math.ceil(1 / (step + half)), math.floor(1 / (step - half))
+    if least == most:
+        notes.append(Fact("whole_rate_of_digits", step=word, rate=least))
+        return 1 / least
+    if half / step > _ROUNDED:
+        notes.append(Fact("rate_left_open", step=word, rate=rate, off=100 * half / step))
+    return step
+
+
+def _unique(names: Sequence[str]) -> list[str]:
+    """Names of which none occurs twice."""
+    plain: list[str] = []
+    for k, name in enumerate(names, 1):
+        word = name or f"channel {k}"
+        plain.append(f"{word} #{k}" if word in plain else word)
+    return plain

@@ -1,0 +1,144 @@
+"""Channels of one test on one clock: shifted by the starts that files state, joined over files."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Num
+
+from snrmjax.measure.recordings.channels import Channel
+from snrmjax.measure.recordings.time_recording import AbstractSamples, TimeRecording
+from snrmjax.numerics.facts import Fact
+
+_WHOLE = (
+    1e-2  # of a sample, within which a shift is one of whole samples: 3.6° at the sampling rate
+)
+_ALIKE = 1e-12  # relative, of two steps in the properties of one device
+
+
+class TimeAxis(NamedTuple):
+    """What a channel's file says of its samples' times."""
+
+    step: float  # s
+    start: float  # s, of the first sample
+    n_samples: int
+
+
+class SharedAxis(NamedTuple):
+    """Channels that were sampled at the same instants, and where in each the common part begins."""
+
+    channels: tuple[str, ...]
+    skipped: tuple[int, ...]  # samples of each channel before the common part
+    axis: TimeAxis
+
+
+def shared_axes(stated: Mapping[str, TimeAxis]) -> list[SharedAxis]:
+    """Channels in groups that have their instants in common, in the order of their first ones.
+
+    Channels of one step whose starts differ by whole samples are of one group, of which the time
+    that all have is kept; others stay apart: a fraction of a sample is an error of the phase.
+    """
+    groups: list[dict[str, TimeAxis]] = []
+    for key, axis in stated.items():
+        group = next((one for one in groups if _in_step(axis, [*one.values()])), None)
+        if group is None:
+            groups.append({key: axis})
+        else:
+            group[key] = axis
+    shared = []
+    for group in groups:
+        step = next(iter(group.values())).step
+        first = max(axis.start for axis in group.values())
+        skipped = [round((first - axis.start) / step) for axis in group.values()]
+        left = [axis.n_samples - n for axis, n in zip(group.values(), skipped, strict=True)]
+        shared.append(SharedAxis(tuple(group), tuple(skipped), TimeAxis(step, first, min(left))))
+    return shared
+
+
+def _in_step(axis: TimeAxis, group: Sequence[TimeAxis]) -> bool:
+    """Whether a channel has its instants in common with a group, and most of its time."""
+    one = group[0]
+    shift = (axis.start - one.start) / one.step
+    together = [*group, axis]
+    begins = max(each.start for each in together)
+    ends = min(each.start + each.n_samples * each.step for each in together)
+    shortest = min(each.n_samples * each.step for each in together)
+    alike = axis == one or axis.n_samples == one.n_samples or shift != 0
+    return (
+        alike
+        and abs(axis.step / one.step - 1) < _ALIKE
+        and abs(shift - round(shift)) < _WHOLE
+        and ends - begins > shortest / 2
+    )
+
+
+def note_on_shift(shared: SharedAxis) -> tuple[Fact, ...]:
+    """A note that names the channels that were shifted, if any were."""
+    if not any(shared.skipped):
+        return ()
+    # The last to begin skips nothing: the others are told by how much earlier they began.
+    shifts = dict(zip(shared.channels, shared.skipped, strict=True))
+    earlier = {name: n for name, n in shifts.items() if n}
+    return (
+        Fact(
+            "channels_shifted",
+            names=tuple(earlier),
+            seconds=tuple(n * shared.axis.step for n in earlier.values()),
+        ),
+    )
+
+
+class _JoinedSamples(AbstractSamples):
+    """Channels of several records of one length."""
+
+    def __init__(self, records: Sequence[TimeRecording]) -> None:
+        self._places = [
+            (record.samples, k) for record in records for k in range(len(record.channels))
+        ]
+        self._samples = records[0].n_samples
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Channels and samples."""
+        return len(self._places), self._samples
+
+    def read(
+        self, channels: Sequence[int], start: int, stop: int
+    ) -> Num[np.ndarray, "channel sample"]:
+        """A stretch of some channels."""
+        rows = [self._places[k] for k in channels]
+        return np.stack([samples.read([row], start, stop)[0] for samples, row in rows])
+
+
+def joined_by_clock(
+    records: Mapping[str, Sequence[TimeRecording]],
+) -> tuple[TimeRecording, str] | None:
+    """One record of the channels of several files, or None where they are none of one clock.
+
+    A test is in several files where each of them holds one record of a single channel, all of one
+    rate, start and length. Channels keep their names; those of one name get their file's.
+    Arguments: `records` of each file by its name.
+    """
+    single = {file: held[0] for file, held in records.items() if len(held) == 1}
+    if len(single) < 2 or len(single) < len(records):
+        return None
+    each = list(single.values())
+    axes = {(one.sampling_rate, one.start_time, one.n_samples) for one in each}
+    if len(axes) > 1 or any(len(one.channels) > 1 for one in each):
+        return None
+    names = [one.channels[0].name for one in each]
+    channels: list[Channel] = []
+    for file, one in single.items():
+        (channel,) = one.channels
+        doubled = names.count(channel.name) > 1
+        channels.append(channel._replace(name=file.rsplit(".", 1)[0]) if doubled else channel)
+    notes = tuple(dict.fromkeys(note for one in each for note in one.notes))
+    joined = TimeRecording(
+        tuple(channels),
+        _JoinedSamples(each),
+        each[0].sampling_rate,
+        each[0].start_time,
+        "",
+        (*notes, Fact("channels_of_files", files=tuple(single))),
+    )
+    return joined, ", ".join(single)
