@@ -21,7 +21,8 @@ def import_test(
     Raises `ValueError` as `import_files` does: a question where something cannot be told.
     """
     stated = map_of_options(None if map_file is None else Path(map_file), options)
-    return import_files([Path(file) for file in files], stated)
+    given = [key for key, value in options.items() if value]
+    return import_files([Path(file) for file in files], stated, given)
 
 
 def list_contents(file: FilePath, **options: Any) -> list[str]:

@@ -41,6 +41,10 @@ KEYS = {
     "force_unit": MapKey(
         "unit of the force: N, lbf, …; V: known as a drive voltage only", "UNIT", _NUMBERS
     ),
+    "base": MapKey(
+        "motion of a base in place of a force: as CH1:acceleration:g, 0.5:acceleration:g",
+        "NAME:KIND[:UNIT]",
+    ),
     "unit": MapKey(
         "unit of the responses; of our own table, what its velocity columns are", "UNIT", _NUMBERS
     ),
@@ -129,6 +133,7 @@ class ImportMap(NamedTuple):
     frequency_unit: str = ""
     force: str = ""
     force_unit: str = ""
+    base: str = ""
     unit: str = ""
     force_phase: str = ""
     force_amplitude: tuple[str, ...] = ()
@@ -148,6 +153,29 @@ class ImportMap(NamedTuple):
         return self._replace(separator="", decimal="", header_row=0, dataset="") == ImportMap()
 
     @property
+    def base_motion(self) -> ResponseMap:
+        """The base's channel or column with its quantity and unit; its name may be a number."""
+        return response_word(self.base, option="--base")
+
+    @property
+    def base_channel(self) -> str:
+        """The channel or column of a base's motion, if that is not stated by numbers."""
+        return "" if self.base_amplitudes or not self.base else self.base_motion.channel
+
+    @property
+    def base_amplitudes(self) -> tuple[float, ...]:
+        """The amplitudes of a base that are stated as numbers, in the unit that is stated."""
+        try:
+            return tuple(float(word) for word in self.base_motion.channel.split(","))
+        except ValueError:
+            return ()
+
+    @property
+    def load(self) -> str:
+        """The channel or column that drives the structure: of the force or of the base's motion."""
+        return self.base_channel or self.force
+
+    @property
     def text_format(self) -> "TextFormat":
         """How texts are written."""
         from snrmjax.io.laboratory.contents import TextFormat
@@ -155,8 +183,8 @@ class ImportMap(NamedTuple):
         return TextFormat(self.separator or None, self.decimal or None, self.header_row or None)
 
 
-def response_word(word: str, unit: str = "") -> ResponseMap:
-    """A response of an option: "CH2:acceleration", "CH2:acceleration:g", or "CH2".
+def response_word(word: str, unit: str = "", *, option: str = "--response") -> ResponseMap:
+    """A response (or the motion of a base) of an option: "CH2:acceleration", "CH2:acceleration:g", or "CH2".
 
     Raises `ValueError` for a quantity that is no motion.
 
@@ -170,7 +198,7 @@ def response_word(word: str, unit: str = "") -> ResponseMap:
         return ResponseMap(":".join(parts[:-2]), parts[-2], parts[-1])
     if len(parts) > 1 and parts[-1].isalpha():
         raise ValueError(
-            f"--response must be a channel and one of {', '.join(_MOTIONS)}, as "
+            f"{option} must be a channel and one of {', '.join(_MOTIONS)}, as "
             f"CH2:acceleration, but is {shown(word)}."
         )
     return ResponseMap(word, "", unit)
@@ -194,9 +222,11 @@ def map_of_options(map_file: Path | None, given: Mapping[str, Any]) -> ImportMap
             )
     if "force_amplitude" in words:
         words["force_amplitude"] = _stated_amplitudes(words["force_amplitude"])
-    base = ImportMap() if map_file is None else read_import_map(map_file)
+    if "base" in words:
+        _require_base(words["base"])
+    told = ImportMap() if map_file is None else read_import_map(map_file)
     unit, response = words.pop("unit", ""), given.get("response") or ()
-    responses = tuple(response_word(word, unit) for word in response) or base.responses
+    responses = tuple(response_word(word, unit) for word in response) or told.responses
     stated = [word for word in response if response_word(word).unit]
     if unit and stated:
         raise ValueError(
@@ -225,7 +255,24 @@ def map_of_options(map_file: Path | None, given: Mapping[str, Any]) -> ImportMap
             raise ValueError(f"{what} names {doubled[0]!r} twice.")
     if unit and not responses:  # of our own table, which has no responses to be named
         words["unit"] = unit
-    return base._replace(**words, responses=responses)
+    # Another way to drive the structure takes the place of the one that the map file has.
+    driven = {"force", "base"}.intersection(words)
+    dropped = {"force": ("base",), "base": ("force", "force_unit", "force_amplitude")}
+    gone = {key: ImportMap._field_defaults[key] for one in driven for key in dropped[one]}
+    return told._replace(**{**gone, **words}, responses=responses)
+
+
+def _require_base(word: str) -> None:
+    """Raise `ValueError` for a base's motion without a quantity, or of a number that is none."""
+    stated = response_word(word, option="--base")
+    numbers = ImportMap(base=word).base_amplitudes
+    if not stated.quantity or (numbers and not stated.unit):
+        raise ValueError(
+            f"--base must say which motion it is, as CH1:acceleration:g or 0.5:acceleration:g, but "
+            f"is {shown(word)}."
+        )
+    if not all(0 < number < float("inf") for number in numbers):
+        raise ValueError(f"--base must be above zero where it is a number, but is {shown(word)}.")
 
 
 def _option(key: str) -> str:
@@ -256,6 +303,8 @@ def read_import_map(path: FilePath) -> ImportMap:
     table = parsed_toml(read_text(path), file)
     table.check_keys((), (*KEYS, "response", "steps"))
     values = {key: _value(table, key) for key in KEYS if key in table.entries}
+    if values.get("base"):
+        _require_base(values["base"])
     responses = []
     for response in table.tables("response", file):
         response.check_keys(("channel",), ResponseMap._fields[1:])

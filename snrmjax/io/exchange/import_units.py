@@ -4,11 +4,11 @@ from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 
 from snrmjax.io.exchange.import_map import Assumptions, ImportMap
 from snrmjax.io.laboratory.physical_units import UnitMeaning, unit_meaning
-from snrmjax.measure.recordings.channels import SI_UNIT, Quantity
+from snrmjax.measure.recordings.channels import DERIVATIVE, SI_UNIT, Quantity
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.names import near_miss
 
@@ -16,14 +16,24 @@ AMPLITUDE_FACTORS = {"peak": 1.0, "": 1.0, "rms": np.sqrt(2.0), "peak_to_peak": 
 """What makes peak amplitudes of peak, rms and peak-to-peak ones."""
 
 _HERTZ = 2 * np.pi
+_LOADS = ("force", "displacement", "velocity", "acceleration")
 
 
 class Force(NamedTuple):
-    """What the numbers of a force are multiplied with."""
+    """What the numbers of a force are multiplied with, or those of a base's `motion`."""
 
     factor: float
     is_voltage: bool
     unit: str
+    motion: Quantity | None = None  # of a base, in the place of a force
+
+    def acceleration(
+        self, omega: Float[np.ndarray, " row"]
+    ) -> Complex[np.ndarray, " row"] | Float[np.ndarray, " row"]:
+        """What makes the acceleration of a base of its phasors; 1 of a force."""
+        if self.motion is None:
+            return np.ones(len(omega))
+        return (1j * omega) ** (2 - DERIVATIVE[self.motion])
 
 
 def require_name(option: str, name: str, known: Iterable[str], what: str, file: str) -> None:
@@ -48,13 +58,34 @@ def force_meaning(mapping: ImportMap, file_unit: str, what: str) -> Force:
     if meaning.dimension not in ("force", "voltage"):
         raise ValueError(
             f"{what} must be a force or a voltage, but its unit {unit} is of {meaning.dimension}: "
-            "--force names another channel, --force-unit another unit."
+            "--force names another channel, --force-unit another unit, and --base the motion of a "
+            "base."
         )
     return Force(meaning.factor, meaning.dimension == "voltage", unit)
 
 
+def load_meaning(mapping: ImportMap, file_unit: str, what: str) -> Force:
+    """What the numbers of what drives the structure are: of a force, a voltage or a base's motion.
+
+    Raises `ValueError` with a question where nobody states it.
+    """
+    if not mapping.base:
+        return force_meaning(mapping, file_unit, what)
+    stated = mapping.base_motion
+    quantity, factor, unit = motion_meaning(
+        stated.quantity, stated.unit, file_unit, stated.channel, option="--base"
+    )
+    return Force(factor, False, unit, quantity)
+
+
 def motion_meaning(
-    quantity: str, unit: str, file_unit: str, channel: str, *, is_ratio: bool = False
+    quantity: str,
+    unit: str,
+    file_unit: str,
+    channel: str,
+    *,
+    is_ratio: bool = False,
+    option: str = "--response",
 ) -> tuple[Quantity, float, str]:
     """Quantity, factor into SI and unit of a response.
 
@@ -64,14 +95,19 @@ def motion_meaning(
     if not stated:
         of: Quantity = next((known for known in SI_UNIT if known == quantity), "velocity")
         example = f"{channel}:{of}:{SI_UNIT[of]}"
+        others = ", or --unit for all responses" if option == "--response" else ""
+        raise ValueError(f"in which unit is {channel}? State it: {option} {example}{others}.")
+    said = _understood_or_none(stated)
+    over = said is not None and said.per_force
+    if over and not is_ratio:
         raise ValueError(
-            f"in which unit is {channel}? State it: --response {example}, or --unit for all "
-            "responses."
+            f"{channel} is over a force by its unit {stated}: say so by --over-force, with the "
+            "force's own column or amplitude."
         )
-    if is_ratio and not unit and "/" in stated:
+    if is_ratio and not unit and not over and "/" in stated:
         numerator, _, below = stated.rpartition("/")
         try:
-            divides_force = unit_meaning(below.strip("() ")).dimension == "force"
+            divides_force = unit_meaning(below.strip("() ")).dimension in _LOADS
         except ValueError:
             divides_force = False
         stated = numerator.strip("() ") if divides_force else stated
@@ -89,7 +125,7 @@ def motion_meaning(
         )
     if quantity and quantity != meaning.dimension:
         raise ValueError(
-            f"{channel} is called {quantity} (--response), but its unit {stated} is of "
+            f"{channel} is called {quantity} ({option}), but its unit {stated} is of "
             f"{meaning.dimension}: which of both is right?"
         )
     return meaning.quantity, meaning.factor, stated
@@ -180,6 +216,13 @@ def phase_in_rad(
         assumed.add("phase_sign", Fact("phase_ahead_of_the_force"), "lead")
     sign = -1.0 if mapping.phase_sign == "lag" else 1.0
     return sign * (np.radians(values) if unit == "deg" else values)
+
+
+def _understood_or_none(unit: str) -> UnitMeaning | None:
+    try:
+        return unit_meaning(unit)
+    except ValueError:
+        return None
 
 
 def _understood(unit: str, option: str) -> UnitMeaning:

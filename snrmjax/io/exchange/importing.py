@@ -1,7 +1,7 @@
 """An import: files and a map to steady states, or to records of decays."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,6 +11,11 @@ import numpy as np
 from snrmjax.io.columns import is_ours
 from snrmjax.io.exchange.import_levels import MeasuredPart, numbered_levels
 from snrmjax.io.exchange.import_map import Assumptions, ImportMap
+from snrmjax.io.exchange.import_options import (
+    Content,
+    refuse_unused,
+    refuse_unused_phase_unit,
+)
 from snrmjax.io.exchange.import_units import Force
 from snrmjax.io.exchange.own_tables import restated, restated_how, states_of_own_table
 from snrmjax.io.exchange.record_import import import_record, mapped_record
@@ -18,6 +23,7 @@ from snrmjax.io.exchange.response_import import import_responses
 from snrmjax.io.exchange.table_import import import_table
 from snrmjax.io.laboratory.contents import LaboratoryFile, NumberTable
 from snrmjax.io.laboratory.reading import read_laboratory_file
+from snrmjax.io.laboratory.shared_clock import joined_by_clock
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
 from snrmjax.measure.recordings.step_counts import StepCounts, joined_counts
 from snrmjax.measure.recordings.time_recording import TimeRecording
@@ -27,6 +33,7 @@ from snrmjax.measure.states import (
     steady_states,
     with_levels_apart,
 )
+from snrmjax.model.base_motion import BaseMotion
 from snrmjax.numerics.facts import Fact
 
 
@@ -53,18 +60,21 @@ class _Dataset(NamedTuple):
     z: tuple[float, ...] = ()
 
 
-def import_files(paths: Sequence[Path], mapping: ImportMap) -> Imported:
+def import_files(
+    paths: Sequence[Path], mapping: ImportMap, stated: Collection[str] = ()
+) -> Imported:
     """Import the files of one test.
 
-    Arguments: `mapping` says which channel or column is what; the same for all files.
+    Arguments: `mapping` says which channel or column is what; the same for all files; `stated` are
+    its keys that must have an effect.
     Returns `Imported`. Raises `ValueError`: as `read_laboratory_file` does, and with a question
     that names the option where something cannot be told.
     """
     assumed, notes = Assumptions(), list[Fact]()
     datasets: list[_Dataset] = []
-    for path in paths:
-        held = read_laboratory_file(path, mapping.text_format)
-        datasets += _datasets(held, mapping)
+    files = joined_files([read_laboratory_file(path, mapping.text_format) for path in paths])
+    for held in files:
+        datasets += _datasets(held, mapping, strict="dataset" in stated)
         notes += [Fact("note_of_file", file=held.name, note=note) for note in held.notes]
     if len({type(dataset.content) for dataset in datasets}) > 1:
         listed = ", ".join(f"{dataset.file}: {dataset.name}" for dataset in datasets)
@@ -75,10 +85,15 @@ def import_files(paths: Sequence[Path], mapping: ImportMap) -> Imported:
     contents = [(dataset.content, dataset.file) for dataset in datasets]
     records = [(content, name) for content, name in contents if isinstance(content, TimeRecording)]
     tables = [(content, name) for content, name in contents if isinstance(content, NumberTable)]
+    ours = [(table, name) for table, name in tables if is_ours(table.columns)]
+    own = bool(ours) and not mapping.responses
+    kind: Content = (
+        "records" if records else "own table" if own else "table" if tables else "responses"
+    )
+    refuse_unused(stated, kind, mapping, file, [held.kind for held in files])
     if records:
         return _records(records, mapping, assumed, notes)
-    ours = [(table, name) for table, name in tables if is_ours(table.columns)]
-    if ours and not mapping.responses:
+    if own:
         parts = [restated(states_of_own_table(table, name), mapping) for table, name in ours]
         notes.append(restated_how(mapping))
         return Imported(join_steady_states(parts), (), mapping, assumed, tuple(notes))
@@ -88,12 +103,24 @@ def import_files(paths: Sequence[Path], mapping: ImportMap) -> Imported:
         if not isinstance(content, TimeRecording | NumberTable)
     ]
     used, force = imported[-1][1:3]
+    refuse_unused_phase_unit(stated, used)
     measured = [part for part, *_ in imported]
     notes += [note for *_, further in imported for note in further]
     return _phasors(measured, used, force, file, mapping.level, assumed, notes)
 
 
-def _datasets(held: LaboratoryFile, mapping: ImportMap) -> list[_Dataset]:
+def joined_files(files: Sequence[LaboratoryFile]) -> list[LaboratoryFile]:
+    """Files of one channel each on one clock as one file with one record; others as they are."""
+    held = {file.name: file.recordings for file in files if file.recordings}
+    joined = joined_by_clock(held) if len(held) == len(files) else None
+    if joined is None or any(file.tables or file.responses for file in files):
+        return list(files)
+    notes = tuple(dict.fromkeys(note for file in files for note in file.notes))
+    record, name = joined
+    return [LaboratoryFile(name, files[0].kind, (record,), notes=(*record.notes, *notes))]
+
+
+def _datasets(held: LaboratoryFile, mapping: ImportMap, *, strict: bool = False) -> list[_Dataset]:
     """What of a file is imported. Raises `ValueError` with a question where that is not one."""
     parts = [_Dataset(record.name or "record", held.name, record) for record in held.recordings]
     parts += [_Dataset(table.name, held.name, table) for table in held.tables]
@@ -101,7 +128,7 @@ def _datasets(held: LaboratoryFile, mapping: ImportMap) -> list[_Dataset]:
         parts.append(_Dataset("responses", held.name, held.responses, held.levels))
     names = ", ".join(dataset.name for dataset in parts)
     named = [dataset for dataset in parts if dataset.name == mapping.dataset != ""]
-    if named or len(parts) == 1:
+    if named or (len(parts) == 1 and not strict):
         return named or parts
     if mapping.dataset:
         raise ValueError(f"--dataset names {mapping.dataset!r}, but {held.name} has {names}.")
@@ -180,6 +207,7 @@ def _phasors(
         drive=size if force.is_voltage else missing,
         velocity_std=np.concatenate([part.velocity_std for part in parts]),
         phase_std=np.concatenate([part.phase_std for part in parts]),
+        base=None if force.motion is None else BaseMotion("relative"),
     )
     # Choices that were assumed go into the map, so that the next test is read alike.
     keys = {"amplitude", "phase_sign", "phase_unit"}.intersection(assumed)

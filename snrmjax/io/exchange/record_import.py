@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from snrmjax.io.exchange.import_map import Assumptions, ImportMap, ResponseMap
-from snrmjax.io.exchange.import_units import force_meaning, motion_meaning
+from snrmjax.io.exchange.import_units import force_meaning, load_meaning, motion_meaning
 from snrmjax.io.exchange.table_import import sensor_of
 from snrmjax.measure.recordings.channels import Channel, channel_number
 from snrmjax.measure.recordings.step_counts import StepCounts
@@ -16,6 +16,9 @@ from snrmjax.measure.recordings.velocity_states import Levels
 from snrmjax.measure.states import SteadyStates
 from snrmjax.measure.sweeps.slow_sweep import sweep_states
 from snrmjax.numerics.facts import Fact
+
+ENDINGS = {"velocity": "m_s", "acceleration": "m_s2", "displacement": "m"}
+"""Units of motions in names of columns."""
 
 _DIRECT: dict[str, Levels] = {"force": "force", "drive": "drive", "runs": "runs"}
 
@@ -47,10 +50,26 @@ def mapped_record(
             calibration=force.factor,
         )
         assumed.unit("force_unit", mapping.force_unit, unit)
+    if mapping.base_amplitudes:
+        raise ValueError(
+            f"--base must name the channel of the base's motion in the time records of {file}, not "
+            f"a number, of {', '.join(record.channel_names)}."
+        )
+    if mapping.base:
+        k = _number(record, mapping.base_channel, file, "--base")
+        base = load_meaning(mapping, channels[k].unit, f"{mapping.base_channel} of {file}")
+        channels[k] = channels[k]._replace(
+            quantity=base.motion or "unknown", unit=base.unit, calibration=base.factor
+        )
     filled = []
     for number, response in enumerate(mapping.responses):
         k = _number(record, response.channel, file, "--response")
         old = channels[k]
+        if response.channel in (mapping.load, mapping.drive):
+            raise ValueError(
+                f"{response.channel} of {file} is named as the response and as what drives the "
+                "structure: one channel is one of the two."
+            )
         if old.quantity == "voltage" and not response.unit:
             old = old._replace(unit="")
         assumed.unit(f"response {number + 1}.unit", response.unit, old.unit)
@@ -80,10 +99,11 @@ def import_record(
     """
     if mapping.record in ("decay", "broadband"):
         return None, mapping, (), None
-    if not mapping.force:
+    if not mapping.load:
         raise ValueError(
             f"which channel of {file} is the force? --force CHANNEL names it, of "
-            f"{', '.join(record.channel_names)}; --record decay says that there is none."
+            f"{', '.join(record.channel_names)}; --base CHANNEL:acceleration is the motion of a "
+            "base, and --record decay says that there is none."
         )
     if mapping.level and mapping.level not in (*_DIRECT, "auto", "file"):
         raise ValueError(
@@ -95,8 +115,9 @@ def import_record(
         "level": level,
         "sensors": [response.sensor for response in mapping.responses],
         "drive": mapping.drive or None,
+        "is_base": bool(mapping.base),
     }
-    read = record, mapping.force, [response.channel for response in mapping.responses]
+    read = record, mapping.load, [response.channel for response in mapping.responses]
     failed = []
     for kind in (mapping.record,) if mapping.record else ("steps", "sweep"):
         try:
@@ -129,11 +150,13 @@ def record_columns(record: TimeRecording, mapping: ImportMap) -> dict[str, Chann
     if mapping.force:
         force = by_name[mapping.force]
         columns["drive_v" if force.quantity == "voltage" else "force_n"] = force
-    endings = {"velocity": "m_s", "acceleration": "m_s2", "displacement": "m"}
+    if mapping.base:
+        base = by_name[mapping.base_channel]
+        columns[f"base_{base.quantity}_{ENDINGS[base.quantity]}"] = base
     for response in mapping.responses:
         lead = "" if len(mapping.responses) == 1 else f"{response.sensor}."
         quantity = by_name[response.channel].quantity
-        columns[f"{lead}{quantity}_{endings[quantity]}"] = by_name[response.channel]
+        columns[f"{lead}{quantity}_{ENDINGS[quantity]}"] = by_name[response.channel]
     return columns
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from snrmjax.io.exchange.import_levels import MeasuredPart
 from snrmjax.io.exchange.import_map import Assumptions, ImportMap
-from snrmjax.io.exchange.import_units import Force, force_meaning, require_name
+from snrmjax.io.exchange.import_units import Force, force_meaning, load_meaning, require_name
 from snrmjax.io.exchange.table_import import import_table
 from snrmjax.io.laboratory.contents import NumberTable
 from snrmjax.measure.recordings.channels import Channel
@@ -29,22 +29,24 @@ class _Sets(NamedTuple):
     @property
     def has_force(self) -> bool:
         """Whether the force is among the responses: they are spectra, or over a generator."""
-        named = [self.mapping.force in _names(each.responses) for each in self.sets]
-        return bool(self.mapping.force) and all(named)
+        named = [self.mapping.load in _names(each.responses) for each in self.sets]
+        return bool(self.mapping.load) and all(named)
 
     def references(self) -> list[int]:
         """Which reference of each set the responses are over."""
-        force, file, places = self.mapping.force, self.file, []
+        force, file, places = self.mapping.load, self.file, []
+        option = "--base" if self.mapping.base else "--force"
         for each in self.sets:
             names = _names(each.references)
             if force and not self.has_force:
                 what = f"responses {', '.join(_names(each.responses))}, and over the references"
-                require_name("--force", force, names, what, file)
+                require_name(option, force, names, what, file)
                 places.append(names.index(force))
             elif len(names) > 1:
                 listed = ", ".join(names)
                 raise ValueError(
-                    f"which reference of {file} is the force? --force names it, of {listed}."
+                    f"which reference of {file} is the force? --force names it, of {listed} "
+                    "(--base NAME:acceleration, if it is the motion of a base)."
                 )
             else:
                 places.append(0)
@@ -63,6 +65,8 @@ class _Sets(NamedTuple):
 
     def amplitudes(self) -> np.ndarray:
         """The stated amplitude of the force of each set."""
+        if self.mapping.base:
+            return self._base_amplitudes()
         stated, file, n = self.mapping.force_amplitude, self.file, len(self.sets)
         has_z = bool(np.isfinite(self.z).all())
         if not stated:
@@ -86,9 +90,30 @@ class _Sets(NamedTuple):
             )
         return np.broadcast_to(values, (n,))
 
+    def _base_amplitudes(self) -> np.ndarray:
+        """The stated amplitude of the base's motion of each set."""
+        stated, n = self.mapping.base_amplitudes, len(self.sets)
+        if len(stated) not in (1, n):
+            raise ValueError(
+                f"which amplitude had the base of {self.file}, over whose motion its responses "
+                "are? --base 0.5:acceleration:g states one for all"
+                + (f", or one for each of the {n} sets with commas." if n > 1 else ".")
+            )
+        return np.broadcast_to(np.asarray(stated), (n,))
+
     def force_behind(self) -> tuple[Force, bool]:
         """What the responses are over, and whether the file says in which unit."""
         mapping, file = self.mapping, self.file
+        if mapping.base:
+            base = load_meaning(mapping, "", "the base")
+            for each, reference in zip(self.sets, self.references(), strict=True):
+                channel = each.references[reference]
+                if channel.quantity not in ("unknown", base.motion):
+                    raise ValueError(
+                        f"--base says {base.motion}, but the responses of {file} are over "
+                        f"{channel.name}, of {channel.quantity}: which of both is right?"
+                    )
+            return base, True
         pairs = zip(self.sets, self.references(), strict=True)
         for channel in [each.references[reference] for each, reference in pairs]:
             if mapping.force_unit and channel.si_unit not in ("", mapping.force_unit):
@@ -136,7 +161,12 @@ def import_responses(
     rule = mapping.level if mapping.level in _RULES else _SET
     as_table = mapping._replace(frequency=_FREQUENCY, frequency_unit="", level=rule)
     if source.has_force:
-        name, unit = mapping.force, mapping.force_unit
+        if mapping.force_amplitude:
+            raise ValueError(
+                f"--force-amplitude has no effect: {mapping.load} of {file} has the amplitudes."
+            )
+        name = mapping.load
+        unit = mapping.base_motion.unit if mapping.base else mapping.force_unit
         values, channel = source.column(name, unit, "--force")
         columns[name] = _or_nothing(values)
         units[name] = channel.unit if unit else channel.si_unit
@@ -144,9 +174,14 @@ def import_responses(
     else:
         force, is_stated = source.force_behind()
         columns[_FORCE] = np.repeat(source.amplitudes(), sizes)
-        units[_FORCE] = "V" if force.is_voltage else "N"
+        units[_FORCE] = "V" if force.is_voltage else force.unit if mapping.base else "N"
+        if mapping.base:
+            as_table = as_table._replace(base=f"{_FORCE}:{force.motion}:{force.unit}")
         as_table = as_table._replace(
-            force=_FORCE, force_unit="", force_amplitude=(), over_force=True
+            force="" if mapping.base else _FORCE,
+            force_unit="",
+            force_amplitude=(),
+            over_force=True,
         )
     for response in mapping.responses:
         name = response.channel
@@ -157,7 +192,7 @@ def import_responses(
     part, used, force, notes = import_table(table, as_table, file, assumed)
     del assumed["frequency_unit"]
     if not source.has_force:
-        del assumed["force_unit"]
+        assumed.pop("force_unit", None)
         if not (is_stated or mapping.force_unit):
             assumed.add("force_unit", Fact("reference_without_unit"), "N")
     if not mapping.level:

@@ -11,8 +11,8 @@ from snrmjax.io.exchange.import_map import Assumptions, ImportMap, ResponseMap
 from snrmjax.io.exchange.import_units import (
     Force,
     amplitude_factor,
-    force_meaning,
     frequency_in_rad,
+    load_meaning,
     motion_meaning,
     phase_in_rad,
     require_name,
@@ -96,16 +96,21 @@ def import_table(
             f"displacement) names it, of {source.listed}."
         )
     size, force = _force(source)
+    lead = force.acceleration(omega)
     units = {
         response.channel: response.unit or source.unit(response.channel)
         for response in mapping.responses
     }
     units = {} if mapping.over_force else units
-    units |= {mapping.force: force.unit} if mapping.force else {}
+    is_column = bool(mapping.load)
+    units |= {mapping.load: force.unit} if is_column else {}
     peak = amplitude_factor(mapping, units, assumed) if units else 1.0
-    size = size * peak if mapping.force else size
+    size = size * peak if is_column or mapping.amplitude else size
     # Over the force only its amplitude counts; else phases are of one clock with the force's own.
+    # Of a base phases count from its acceleration, whatever of its motion was recorded.
     turn = np.abs(size) if mapping.over_force else peak * np.exp(-1j * np.angle(size))
+    turn, size = turn * np.exp(-1j * np.angle(lead)), size * lead
+    _refuse_doubled(source)
     velocity, responses, errors = [], [], []
     for k, response in enumerate(mapping.responses):
         response = _with_errors_by_name(source, response, k + 1)
@@ -141,21 +146,29 @@ def _frequency_column(source: _Source) -> str:
 
 
 def _force(source: _Source) -> tuple[Complex[np.ndarray, " row"], Force]:
-    """The force of every row, of a column or as stated."""
-    mapping, file, name = source.mapping, source.file, source.mapping.force
+    """The force (or the motion of the base) of every row, of a column or as stated."""
+    mapping, file = source.mapping, source.file
+    option = "--base" if mapping.base else "--force"
+    name = mapping.load
     if not name:
-        if len(mapping.force_amplitude) != 1 or mapping.force_amplitude[0] == "z":
+        amplitudes = mapping.base_amplitudes or mapping.force_amplitude
+        if len(amplitudes) != 1 or amplitudes[0] == "z":
             raise ValueError(
                 f"which column of {file} is the force? --force COLUMN names it, of "
-                f"{source.listed}; --force-amplitude N states one that no column has."
+                f"{source.listed}; --force-amplitude N states one that no column has, and --base "
+                "COLUMN:acceleration the motion of a base."
             )
-        stated = float(mapping.force_amplitude[0])
-        return np.full(source.table.n_rows, stated, dtype=complex), Force(1.0, False, "N")
-    source.assumed.unit("force_unit", mapping.force_unit, source.unit(name))
-    force = force_meaning(mapping, source.unit(name), f"{name} of {file}")
-    raw = source.column(name, "--force")
+        force = load_meaning(mapping, "" if mapping.base else "N", "--force-amplitude")
+        stated = float(amplitudes[0]) * force.factor
+        return np.full(source.table.n_rows, stated, dtype=complex), force
+    if not mapping.base:
+        source.assumed.unit("force_unit", mapping.force_unit, source.unit(name))
+    force = load_meaning(mapping, source.unit(name), f"{name} of {file}")
+    raw = source.column(name, option)
     if not np.iscomplexobj(raw) and np.nanmin(raw, initial=1.0) < 0:
-        raise ValueError(f"{name} of {file} has negative amplitudes: --force names another column.")
+        raise ValueError(
+            f"{name} of {file} has negative amplitudes: {option} names another column."
+        )
     size = source.phasors(raw) * force.factor
     if mapping.force_phase:
         size = size * np.exp(1j * source.phase(mapping.force_phase, "--force-phase"))
@@ -178,6 +191,11 @@ def _response(
     if not response.quantity:
         assumed.add(f"response {number}.quantity", Fact("quantity_by_unit", unit=unit))
     imaginary, phase = response.imaginary, response.phase
+    if phase and (imaginary or np.iscomplexobj(values)):
+        raise ValueError(
+            f"--phase {phase} has no effect: {name} of {file} "
+            + (f"has the imaginary part {imaginary}." if imaginary else "is complex.")
+        )
     if not (np.iscomplexobj(values) or imaginary or phase):
         imaginary, phase = _partner(source, name)
         if not (imaginary or phase):
@@ -237,6 +255,16 @@ def _swap(name: str) -> str:
             return swapped
     last = {"X": "Y", "x": "y"}.get(name[-1:], "")
     return last and name[:-1] + last
+
+
+def _refuse_doubled(source: _Source) -> None:
+    """Raise `ValueError` where one column is both what drives the structure and its response."""
+    for response in source.mapping.responses:
+        if response.channel == source.mapping.load:
+            raise ValueError(
+                f"{response.channel} of {source.file} is named as the response and as what drives "
+                "the structure: one column is one of the two."
+            )
 
 
 def _level(source: _Source) -> tuple[str, np.ndarray | None]:

@@ -75,7 +75,8 @@ _PREFIXES = {
     **{"n": -9, "u": -6, "m": -3, "c": -2, "d": -1, "h": 2, "k": 3, "M": 6, "G": 9},
     **{"nano": -9, "micro": -6, "milli": -3, "centi": -2, "kilo": 3, "mega": 6},
 }
-_WITH_VOLTS = ("force", "displacement", "velocity", "acceleration")
+_MOTIONS = ("displacement", "velocity", "acceleration")
+_WITH_VOLTS = ("force", *_MOTIONS)
 
 
 class UnitMeaning(NamedTuple):
@@ -83,7 +84,8 @@ class UnitMeaning(NamedTuple):
 
     `dimension` is a quantity of a channel, or "frequency" (SI unit rad/s), "angle" (rad), "time",
     "mass", "other". Of a sensitivity ("10.2 mV/g") it is the quantity that volts stand for, and
-    `per_volt` is true. `size` is what a suffix says ("g rms"): "rms", "peak", "peak_to_peak", or
+    `per_volt` is true; of a motion over a force ("g/N", "(1/lbf)*(m/s^2)") it is the motion, `factor`
+    is in its SI unit per newton, and `per_force` is true. `size` is what a suffix says ("g rms"): "rms", "peak", "peak_to_peak", or
     nothing.
     """
 
@@ -91,6 +93,7 @@ class UnitMeaning(NamedTuple):
     factor: float
     size: str = ""
     per_volt: bool = False
+    per_force: bool = False
 
     @property
     def quantity(self) -> Quantity:
@@ -124,6 +127,7 @@ def unit_meaning(text: str) -> UnitMeaning:
     value = float(number[1]) if number else 1.0
     if number:
         plain = plain[number.end() :].strip()
+        plain = f"1{plain}" if plain.startswith("/") else plain
     if value <= 0 or not math.isfinite(value) or not plain:
         raise _not_understood(text)
     factor, powers = _parsed(plain, text)
@@ -132,6 +136,10 @@ def unit_meaning(text: str) -> UnitMeaning:
             return UnitMeaning(dimension, 1 / (value * factor), size, True)
         if powers[:4] == _product(_DIMENSIONS[dimension], _VOLT, -1)[:4]:
             return UnitMeaning(dimension, value * factor, size, True)
+    for dimension in _MOTIONS:
+        ratio = _product(_DIMENSIONS[dimension], _DIMENSIONS["force"], -1)
+        if powers[:4] == ratio[:4]:
+            return UnitMeaning(dimension, value * factor, size, per_force=True)
     alike = (name for name, of in _DIMENSIONS.items() if powers[:4] == of[:4])
     dimension = next(alike, "other")
     if dimension == "frequency" and not powers[4]:
@@ -142,7 +150,10 @@ def unit_meaning(text: str) -> UnitMeaning:
 
 
 def channel_meaning(text: str) -> tuple[Quantity, float]:
-    """Quantity and calibration of a channel whose file states a unit; unknown where unreadable."""
+    """Quantity and calibration of a channel whose file states a unit; unknown where unreadable.
+
+    Of a motion over a force they are those of the motion, per newton.
+    """
     try:
         meaning = unit_meaning(text)
     except ValueError:
@@ -150,6 +161,14 @@ def channel_meaning(text: str) -> tuple[Quantity, float]:
     if meaning.quantity == "unknown" or meaning.per_volt:
         return "unknown", 1.0
     return meaning.quantity, meaning.factor
+
+
+def is_per_force(text: str) -> bool:
+    """Whether a unit is that of a motion over a force, as "g/N"."""
+    try:
+        return unit_meaning(text).per_force
+    except ValueError:
+        return False
 
 
 def _not_understood(text: str, why: str = "") -> ValueError:

@@ -119,6 +119,7 @@ def stepped_sine_states(
     tolerance: float = 2e-3,
     least_amplitude_step: float = 0.05,
     least_frequency_step: float = 0.0,
+    is_base: bool = False,
 ) -> SteppedSineStates:
     """Steady states from the time record of a stepped sine.
 
@@ -133,7 +134,8 @@ def stepped_sine_states(
     `drive` names the channel by whose tone steps are recognised and levels grouped, best the
     voltage of the generator; `tolerance` is the share by which a phasor may still move over the
     part that is used; `least_amplitude_step` as a share and `least_frequency_step` in rad/s are
-    the smallest steps that there are.
+    the smallest steps that there are; `is_base` says that `force` names the motion of a base, whose
+    acceleration (m/s²) then takes the place of the force.
     Returns `SteppedSineStates`: `states` in the order of time, with standard deviations (the
     larger of that of white noise and of the scatter of blocks), harmonics and `order`; and the
     table of steps, with those left out and why.
@@ -154,7 +156,9 @@ def stepped_sine_states(
     ([2.0, 2.0], [[0.2], [0.2]])
     """
     orders = require_fundamental("harmonic_order", harmonic_order)
-    chosen = choose_channels(recording, force, responses, sensors=sensors, drive=drive)
+    chosen = choose_channels(
+        recording, force, responses, sensors=sensors, drive=drive, is_base=is_base
+    )
     if frequencies is None:
         steps = _recognised(recording, chosen, least_amplitude_step, least_frequency_step)
     else:

@@ -10,6 +10,7 @@ from jaxtyping import Complex, Float, Int
 from snrmjax.measure.recordings.channels import DERIVATIVE, Channel, channel_number
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.states import SteadyStates, steady_states
+from snrmjax.model.base_motion import BaseMotion
 from snrmjax.numerics.facts import Fact
 
 Levels = Literal["auto", "force", "drive", "runs"]
@@ -50,8 +51,9 @@ def choose_channels(
     *,
     sensors: Sequence[str] | None = None,
     drive: str | None = None,
+    is_base: bool = False,
 ) -> ChosenChannels:
-    """The channels of a verb, checked.
+    """The channels of a verb, checked; `is_base`: what stands for the force is a base's motion.
 
     Raises `ValueError` for names that no channel has, doubled ones, a force that is no force or
     voltage, responses that are no motion, and sensors of another number.
@@ -60,7 +62,11 @@ def choose_channels(
     if not wanted:
         raise ValueError("`responses` must name one channel at least, but is empty.")
     source = recording.channels[_number(recording, force, "force")]
-    if source.quantity not in ("force", "voltage"):
+    if is_base and source.quantity not in DERIVATIVE:
+        raise ValueError(
+            f"channel {force} must be the motion of a base, but its quantity is {source.quantity}."
+        )
+    if not is_base and source.quantity not in ("force", "voltage"):
         raise ValueError(
             f"channel {force} must be a force or the voltage that drives one, but its quantity is "
             f"{source.quantity}."
@@ -108,9 +114,20 @@ def states_of_phasors(
     level: Levels | int,
     notes: Sequence[Fact] = (),
 ) -> SteadyStates:
-    """Steady states of phasors of any motion, in the order of the table."""
+    """Steady states of phasors of any motion, in the order of the table.
+
+    Of a base whatever was recorded becomes its acceleration, from which phases then count.
+    """
     higher = tuple(k for k in orders if k != 1)
     phasors = np.concatenate([table.mean[:, :, None], table.phasors], axis=2)
+    base = chosen.force.quantity in DERIVATIVE
+    if base:
+        lead = (1j * table.frequency) ** (2 - DERIVATIVE[chosen.force.quantity])
+        turns = np.exp(-1j * np.angle(lead)[:, None] * np.arange(phasors.shape[2]))
+        phasors = phasors * turns[:, None, :]
+        table = table._replace(
+            force=table.force * np.abs(lead), force_std=table.force_std * np.abs(lead)
+        )
     spread = np.concatenate([np.full_like(table.mean, np.nan)[:, :, None], table.harmonic_std], 2)
     factors = velocity_factors(chosen.responses, range(phasors.shape[2]), table.frequency)
     velocity = phasors * factors
@@ -136,6 +153,7 @@ def states_of_phasors(
         harmonics=velocity[:, :, list(higher)],
         harmonic_std=floor,
         harmonic_order=higher,
+        base=BaseMotion("relative") if base else None,
     )
     return dataclasses.replace(states, notes=(*notes, *numbered))
 

@@ -95,6 +95,7 @@ def sweep_states(
     drive: str | None = None,
     cycles: float = 16.0,
     correct: bool = True,
+    is_base: bool = False,
 ) -> SweptStates:
     """Steady states from the time record of slow linear or logarithmic sweeps.
 
@@ -102,8 +103,8 @@ def sweep_states(
     state of a sweep is the steady state of another force: what the change of the phasor needs is
     taken from the force, so that amplitude and frequency stay those that were measured.
 
-    Arguments: `force`, `responses`, `harmonic_order`, `level`, `sensors` and `drive` as in
-    `stepped_sine_states`; `frequencies` in rad/s at which states are wanted (by default a grid
+    Arguments: `force`, `responses`, `harmonic_order`, `level`, `sensors`, `drive` and `is_base`
+    as in `stepped_sine_states`; `frequencies` in rad/s at which states are wanted (by default a grid
     that is finer where the response changes); `cycles` is the width of the window; `correct` takes
     the bias of the sweep out (without it, and where it cannot be told, 1σ holds the bias).
     Returns `SweptStates` with the bias that each sweep has at resonance without correction.
@@ -128,7 +129,9 @@ def sweep_states(
     ([2.0, 2.0], [[0.2], [0.2]])
     """
     orders = require_fundamental("harmonic_order", harmonic_order)
-    chosen = choose_channels(recording, force, responses, sensors=sensors, drive=drive)
+    chosen = choose_channels(
+        recording, force, responses, sensors=sensors, drive=drive, is_base=is_base
+    )
     if not cycles >= 6:
         raise ValueError(f"`cycles` must be 6 at least, but is {cycles:g}.")
     guide = drive or force

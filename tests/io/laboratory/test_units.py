@@ -23,7 +23,7 @@ GRAVITY, POUND = 9.80665, 4.4482216152605
         ("mg", "mass", 1e-6),
         ("m·s⁻²", "acceleration", 1.0),
         ("in/s²", "acceleration", 0.0254),
-        ("(mm/s)/lbf", "other", 1e-3 / POUND),
+        ("(mm/s)/lbf", "velocity", 1e-3 / POUND),
         ("rpm", "frequency", 2 * np.pi / 60),
         ("kHz", "frequency", 2e3 * np.pi),
         ("rad/s", "frequency", 1.0),
@@ -37,9 +37,9 @@ def test_units_of_the_table(text, dimension, factor):
 
 
 def test_sensitivities_and_suffixes():
-    assert unit_meaning("100 mV/g") == ("acceleration", pytest.approx(GRAVITY / 0.1), "", True)
-    assert unit_meaning("50 N/V") == ("force", 50.0, "", True)
-    assert unit_meaning("mm/s rms") == ("velocity", 1e-3, "rms", False)
+    assert unit_meaning("100 mV/g") == ("acceleration", pytest.approx(GRAVITY / 0.1), "", True, False)
+    assert unit_meaning("50 N/V") == ("force", 50.0, "", True, False)
+    assert unit_meaning("mm/s rms") == ("velocity", 1e-3, "rms", False, False)
     for text in ("pC/N", "m^12", "2*m", "qq", "0 N", "m(", "import"):
         with pytest.raises(ValueError, match="not understood"):
             unit_meaning(text)

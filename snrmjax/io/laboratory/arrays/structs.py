@@ -9,6 +9,7 @@ from snrmjax.io.laboratory.arrays.records import recording_of
 from snrmjax.io.laboratory.arrays.value_tree import Node, Numbers, held
 from snrmjax.io.laboratory.contents import Kind, LaboratoryFile, NumberTable
 from snrmjax.io.laboratory.names import role_of
+from snrmjax.io.laboratory.physical_units import channel_meaning, is_per_force
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses, frequency_responses
 from snrmjax.measure.recordings.time_recording import TimeRecording
@@ -252,12 +253,15 @@ def _responses(name: str, numbers: Mapping[str, Numbers], contents: Struct) -> d
         values = values.reshape(values.shape[0], -1, hertz.size)
         if not np.isfinite(values).any() or np.isinf(values).any():
             continue
+        quantity, calibration = channel_meaning(array.unit)
+        above = Channel("", quantity, array.unit, calibration)
+        below = Channel("", "force", "N") if is_per_force(array.unit) else Channel("")
         contents.responses.append(
             frequency_responses(
                 hertz * (1.0 if numbers[axis].unit.lower().startswith("rad") else _HERTZ),
                 values,
-                [Channel(f"{key}.{k + 1}") for k in range(values.shape[0])],
-                [Channel(f"reference {k + 1}") for k in range(values.shape[1])],
+                [above._replace(name=f"{key}.{k + 1}") for k in range(values.shape[0])],
+                [below._replace(name=f"reference {k + 1}") for k in range(values.shape[1])],
                 name=f"{name}.{key}" if name else key,
                 notes=[Fact("responses_along_first_side")],
             )

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from snrmjax.io.laboratory.physical_units import unit_meaning
+from snrmjax.io.laboratory.physical_units import is_per_force, unit_meaning
 from snrmjax.io.laboratory.uff.data_sets import stated
 from snrmjax.measure.recordings.channels import SI_UNIT, Quantity
 from snrmjax.numerics.facts import Fact
@@ -51,11 +51,18 @@ def unit_system(sets: Sequence[Mapping[str, Any]]) -> UnitSystem:
 def axis_unit(function: Mapping[str, Any], axis: str, units: UnitSystem) -> AxisUnit:
     """The unit of an axis ("ordinate", "orddenom"): its label, else the file's system of units.
 
-    A label such as (mm/s)/lbf of an ordinate is that of response over reference.
+    A label such as (mm/s)/lbf of an ordinate is that of response over reference: the reference is
+    then a force, in newtons where its own axis states nothing else.
     """
     quantity = _QUANTITIES.get(function.get(f"{axis}_spec_data_type", 0), "unknown")
     label = stated(function.get(f"{axis}_axis_units_lab", ""))
     if not label:
+        if (
+            axis == "orddenom"
+            and quantity == "unknown"
+            and is_per_force(stated(function.get("ordinate_axis_units_lab", "")))
+        ):
+            return AxisUnit("force", SI_UNIT["force"], 1.0)
         factor = 1 / (units.force if quantity == "force" else units.length)
         known = quantity != "unknown"
         return AxisUnit(
@@ -67,6 +74,8 @@ def axis_unit(function: Mapping[str, Any], axis: str, units: UnitSystem) -> Axis
         return AxisUnit(quantity, label, 1.0, (Fact("unit_unknown", unit=label),))
     if meaning.quantity == "unknown" or meaning.per_volt:
         return AxisUnit(quantity, label, meaning.factor if meaning.dimension == "other" else 1.0)
+    # What the reference's own axis states divides once more, so that it is put in here.
+    below = axis_unit(function, "orddenom", units).calibration if meaning.per_force else 1.0
     other = quantity not in ("unknown", meaning.quantity)
     notes = (Fact("unit_of_other_quantity", stated=quantity, unit=label, taken=meaning.quantity),)
-    return AxisUnit(meaning.quantity, label, meaning.factor, notes if other else ())
+    return AxisUnit(meaning.quantity, label, meaning.factor * below, notes if other else ())

@@ -1,0 +1,82 @@
+"""Options of an import that nothing would obey: refused, so that no number is silently another."""
+
+from collections.abc import Collection
+from typing import Literal
+
+from snrmjax.io.exchange.import_map import ImportMap
+
+Content = Literal["own table", "table", "responses", "records"]
+
+_TEXT = {"separator", "decimal", "header_row"}
+_ANY = {"dataset", "response", "unit", "force_unit", *_TEXT}
+_PHASORS = {*_ANY, "force", "base", "force_amplitude", "phase_sign", "amplitude", "level", "sensor"}
+_OBEYED: dict[Content, set[str]] = {
+    "own table": {"dataset", "unit", "force_unit", "amplitude", "phase_sign", *_TEXT},
+    "responses": _PHASORS,
+    "table": {
+        *_PHASORS,
+        *("frequency", "frequency_unit", "force_phase", "over_force", "phase_unit"),
+        *("phase", "imaginary", "amplitude_std", "phase_std"),
+    },
+    "records": {*_ANY, "force", "base", "record", "level", "drive", "sensor", "phase_sign"},
+}
+_WHAT: dict[Content, str] = {
+    "own table": "a table with our own columns",
+    "table": "a table",
+    "responses": "frequency responses",
+    "records": "time records",
+}
+_STAYS_RECORD = ("decay", "broadband")
+
+
+def refuse_unused(
+    stated: Collection[str], content: Content, mapping: ImportMap, file: str, kinds: Collection[str]
+) -> None:
+    """Raise `ValueError` that names an option which has no effect on what the files hold.
+
+    Arguments: `stated` are the keys of options of the command line (what a map file has may be of
+    another test); `kinds` those of the files.
+    """
+
+    def refuse(key: str, why: str) -> None:
+        raise ValueError(f"--{key.replace('_', '-')} has no effect {why}: leave it out.")
+
+    for key in stated:
+        if key not in _OBEYED[content] and not (key == "response" and content == "own table"):
+            refuse(key, f"on {_WHAT[content]}, as {file} holds")
+        if key in _TEXT and not {"csv"}.intersection(kinds):
+            refuse(key, f"on {file}, which states itself how it is written")
+    if "dataset" in stated and content == "own table":
+        return
+    for first, second in (
+        ("base", "force"),
+        ("base", "force_unit"),
+        ("base", "force_amplitude"),
+        *((("force", "force_amplitude"),) if content == "table" else ()),
+    ):
+        if first in stated and second in stated:
+            refuse(second, f"beside --{first}")
+    if "force_phase" in stated and not mapping.force:
+        refuse("force_phase", "without --force")
+    if "force_phase" in stated and mapping.over_force:
+        refuse("force_phase", "beside --over-force: phases are then relative to the force")
+    if (
+        "force_unit" in stated
+        and not (mapping.force or mapping.force_amplitude)
+        and (content != "own table")
+    ):
+        refuse("force_unit", "without --force or --force-amplitude")
+    if content == "records" and mapping.record in _STAYS_RECORD:
+        for key in ("level", "drive"):
+            if key in stated:
+                refuse(key, f"on records that stay records (--record {mapping.record})")
+
+
+def refuse_unused_phase_unit(stated: Collection[str], used: ImportMap) -> None:
+    """Raise `ValueError` where a unit of phases is stated, but no phase was read."""
+    read = bool(used.force_phase) or any(response.phase for response in used.responses)
+    if "phase_unit" in stated and not read:
+        raise ValueError(
+            "--phase-unit has no effect: no column of phases is read (--phase names one): leave it "
+            "out."
+        )
