@@ -175,7 +175,8 @@ def digest(path):
     """List a file, read what it holds, and import it; returns the outcome."""
     from snrmjax.io.exchange.import_map import ImportMap, response_word
     from snrmjax.io.exchange.importing import import_files
-    from snrmjax.io.exchange.listing import listed_contents, suggested_command
+    from snrmjax.io.exchange.listing import listed_contents
+    from snrmjax.io.exchange.proposals import proposed_commands
     from snrmjax.io.laboratory.reading import read_laboratory_file
 
     try:
@@ -184,7 +185,7 @@ def digest(path):
         return checked(error, "refused")
     outcome = "data"
     listed_contents(held)
-    suggested_command([path], held)
+    proposed_commands([path], [held])
     for record in held.recordings:
         try:
             record.values(stop=min(record.n_samples, 2**16))

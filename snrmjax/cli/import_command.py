@@ -54,8 +54,7 @@ def import_(
     from snrmjax.report.pages import imports as page
 
     if map_file is None and out is None and map_of_options(None, options).is_empty:
-        for path in files:
-            typer.echo("\n".join(list_contents(path, **options)))
+        typer.echo("\n".join(list_contents(files, **options)))
         return
     if out is None:
         raise ValueError("where shall measured.csv be written? --out DIR.")

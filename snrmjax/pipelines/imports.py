@@ -6,7 +6,8 @@ from typing import Any
 
 from snrmjax.io.exchange.import_map import map_of_options
 from snrmjax.io.exchange.importing import Imported, import_files
-from snrmjax.io.exchange.listing import listed_contents, suggested_command
+from snrmjax.io.exchange.listing import listed_contents
+from snrmjax.io.exchange.proposals import proposed_commands
 from snrmjax.io.files import FilePath
 from snrmjax.io.laboratory.reading import read_laboratory_file
 
@@ -25,8 +26,10 @@ def import_test(
     return import_files([Path(file) for file in files], stated, given)
 
 
-def list_contents(file: FilePath, **options: Any) -> list[str]:
-    """What a file holds, in lines, and the command that would import it."""
+def list_contents(files: Sequence[FilePath], **options: Any) -> list[str]:
+    """What files hold, in lines, and the command that would import them as one test."""
     text_format = map_of_options(None, options).text_format
-    held = read_laboratory_file(Path(file), text_format)
-    return [*listed_contents(held), *suggested_command([Path(file)], held)]
+    paths = [Path(file) for file in files]
+    held = [read_laboratory_file(path, text_format) for path in paths]
+    lines = [line for one in held for line in listed_contents(one)]
+    return [*lines, *proposed_commands(paths, held)]

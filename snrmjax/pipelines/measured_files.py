@@ -1,5 +1,6 @@
 """Measured data of a command: tables of steady states and time records, told apart by content."""
 
+import dataclasses
 from pathlib import Path
 
 from snrmjax.io.files import FilePath, file_name, read_text
@@ -7,7 +8,6 @@ from snrmjax.io.laboratory.reading import read_laboratory_file
 from snrmjax.io.laboratory.record_tables import (
     is_record_table,
     read_record_table,
-    with_named_channels,
 )
 from snrmjax.io.tables import read_steady_states
 from snrmjax.measure.recordings.time_recording import TimeRecording
@@ -37,7 +37,11 @@ def read_measured_test(path: FilePath, structure: Structure) -> list[SteadyState
             f"{file_name(path)} holds no time record (a CSV needs the column time_s) and no table "
             "of steady states (level, frequency_hz, …)."
         )
-    return [with_named_channels(recording, file_name(path)) for recording in held.recordings]
+    name = file_name(path)
+    return [
+        dataclasses.replace(one, name=f"{one.name} of {name}" if one.name else name)
+        for one in held.recordings
+    ]
 
 
 def _header(path: Path) -> set[str]:

@@ -184,7 +184,9 @@ class ImportMap(NamedTuple):
 
 
 def response_word(word: str, unit: str = "", *, option: str = "--response") -> ResponseMap:
-    """A response (or the motion of a base) of an option: "CH2:acceleration", "CH2:acceleration:g", or "CH2".
+    """A response of an option: "CH2:acceleration", "CH2:acceleration:g", or "CH2".
+
+    Arguments: `option` is another one that names a motion so: `--base`.
 
     Raises `ValueError` for a quantity that is no motion.
 

@@ -1,20 +1,15 @@
-"""What a laboratory's file holds, in words, and the command that would import it."""
+"""What a laboratory's file holds, in words."""
 
-import shlex
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
 from snrmjax.io.laboratory.contents import LaboratoryFile, NumberTable
-from snrmjax.io.laboratory.names import role_of
-from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.velocity_states import number_levels
 from snrmjax.numerics.facts import Fact
 
 _HERTZ = 2 * np.pi
 _MOST = 40  # lines of one kind
-_MOTIONS = ("velocity", "acceleration", "displacement")
 
 
 def listed_contents(held: LaboratoryFile) -> list[str]:
@@ -54,7 +49,7 @@ def _columns(table: NumberTable) -> list[str]:
         size = np.abs(values) if np.iscomplexobj(values) else values.astype(float)
         finite = size[np.isfinite(size)]
         span = f"{finite.min():.5g} to {finite.max():.5g}" if finite.size else "empty"
-        role = role_of(name)
+        role = table.role(name)
         count = len(np.unique(finite))
         levels = f", {count} values" if role in ("level", "force", "drive") and count < 50 else ""
         unit = f" in {table.units[name]}" if name in table.units else ""
@@ -77,38 +72,4 @@ def _columns(table: NumberTable) -> list[str]:
 
 def _first(table: NumberTable, role: str) -> str:
     """The first column with a role."""
-    return next((name for name in table.columns if role_of(name) == role), "")
-
-
-def suggested_command(paths: Sequence[Path], held: LaboratoryFile) -> list[str]:
-    """Command lines for the file, with names guessed; capitals and brackets are to be filled in."""
-    files = " ".join(shlex.quote(str(path)) for path in paths)
-    ratios = bool(held.responses) and not held.recordings
-    channels: Sequence[Channel] = ()
-    if ratios or held.recordings:
-        channels = held.responses[0].responses if ratios else held.recordings[0].channels
-    kinds = {
-        channel.name: channel.quantity for channel in channels if channel.quantity != "unknown"
-    }
-    names = [channel.name for channel in channels] or [
-        name for table in held.tables[:1] for name in table.columns
-    ]
-    roles = {name: kinds.get(name) or role_of(name) for name in names}
-
-    def likeliest(*wanted: str) -> str:
-        return next((name for role in wanted for name in names if roles[name] == role), "CHANNEL")
-
-    force = "--force-amplitude NEWTONS" if ratios else ""
-    if not ratios or "force" in kinds.values():
-        force = f"--force {shlex.quote(likeliest('force', 'voltage', 'drive'))} [--force-unit UNIT]"
-    response = shlex.quote(likeliest(*_MOTIONS, "amplitude", "real"))
-    lines = [
-        "import it (check the names; units where the file states none):",
-        f"  snrmjax import {files} {force} --response {response}[:QUANTITY:UNIT] --out imported",
-    ]
-    if ratios:
-        lines += [
-            "or, of an impact or broadband test, linear modes (the sensor at the force):",
-            f"  snrmjax modes {files} --drive-point SENSOR --out model.toml",
-        ]
-    return lines
+    return next((name for name in table.columns if table.role(name) == role), "")

@@ -65,8 +65,8 @@ class _Source(NamedTuple):
         return phase_in_rad(values, name, self.mapping, self.unit(name), self.assumed)
 
     def with_role(self, *roles: str) -> list[str]:
-        """Columns whose names say that they have one of these roles."""
-        return [name for name in self.table.columns if role_of(name) in roles]
+        """Columns whose names or units say that they have one of these roles."""
+        return [name for name in self.table.columns if self.table.role(name) in roles]
 
     @property
     def listed(self) -> str:
@@ -134,7 +134,7 @@ def import_table(
 
 
 def _frequency_column(source: _Source) -> str:
-    """The only column that is a frequency by its name."""
+    """The only column that is a frequency by its name or unit."""
     columns = source.with_role("frequency")
     if len(columns) != 1:
         raise ValueError(

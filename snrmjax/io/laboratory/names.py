@@ -23,6 +23,21 @@ _ROLES = {
 }
 _COMPILED = {role: re.compile(pattern, re.IGNORECASE) for role, pattern in _ROLES.items()}
 
+_BASE = re.compile(
+    r"(.*[^a-z])?(base|table|shaker|control|ctrl|foot|fixture|slip|basis|tisch|fu[sß]s?punkt|pot)"
+    r"([^a-z].*)?",
+    re.IGNORECASE,
+)
+
+
+def is_of_base(name: str) -> bool:
+    """Whether a name says that something is of a moving base: a shaker's table, a control channel.
+
+    >>> is_of_base("Control [g]"), is_of_base("table_acc"), is_of_base("tip")
+    (True, True, False)
+    """
+    return bool(_BASE.fullmatch(name.strip()[:60]))
+
 
 def role_of(name: str) -> str:
     """What a column is by its name, or nothing: "frequency", "force", "phase", "time", …

@@ -84,9 +84,9 @@ class UnitMeaning(NamedTuple):
 
     `dimension` is a quantity of a channel, or "frequency" (SI unit rad/s), "angle" (rad), "time",
     "mass", "other". Of a sensitivity ("10.2 mV/g") it is the quantity that volts stand for, and
-    `per_volt` is true; of a motion over a force ("g/N", "(1/lbf)*(m/s^2)") it is the motion, `factor`
-    is in its SI unit per newton, and `per_force` is true. `size` is what a suffix says ("g rms"): "rms", "peak", "peak_to_peak", or
-    nothing.
+    `per_volt` is true; of a motion over a force ("g/N", "(1/lbf)*(m/s^2)") it is the motion,
+    `factor` is in its SI unit per newton, and `per_force` is true. `size` is what a suffix says
+    ("g rms"): "rms", "peak", "peak_to_peak", or nothing.
     """
 
     dimension: str

@@ -6,6 +6,7 @@ from pathlib import Path
 from snrmjax.io.files import FilePath, file_name, read_bytes
 from snrmjax.io.laboratory.arrays.matlab_files import is_old_matlab
 from snrmjax.io.laboratory.contents import Kind, LaboratoryFile, TextFormat
+from snrmjax.io.laboratory.record_tables import with_named_channels
 
 _ROOM = "snrmjax.io.laboratory"
 _READERS: dict[Kind, tuple[str, str]] = {
@@ -40,7 +41,7 @@ def read_laboratory_file(path: FilePath, text_format: TextFormat | None = None) 
     if held.is_empty:
         why = f": {' '.join(map(str, held.notes[:_MOST_REASONS]))}" if held.notes else "."
         raise ValueError(f"{held.name} holds nothing that could be read{why}")
-    return held
+    return held._replace(recordings=tuple(map(with_named_channels, held.recordings)))
 
 
 def _kind(path: FilePath) -> Kind:

@@ -56,17 +56,14 @@ def read_record_table(path: FilePath) -> TimeRecording:
     return time_recording(values, channels, rate, start_time=start, name=file, notes=notes)
 
 
-def with_named_channels(recording: TimeRecording, file: str) -> TimeRecording:
-    """A laboratory's record under its file's name, with quantities that names of channels say.
+def with_named_channels(recording: TimeRecording) -> TimeRecording:
+    """A laboratory's record with the quantities that the names of its channels say.
 
     Where a file states no unit, `force_n`, `tip.velocity_m_s` or `tip_velocity_m_s` do; a quantity
     that the file states stays.
     """
-    return dataclasses.replace(
-        recording,
-        channels=tuple(_named(channel) for channel in recording.channels),
-        name=f"{recording.name} of {file}" if recording.name else file,
-    )
+    channels = tuple(_named(channel) for channel in recording.channels)
+    return dataclasses.replace(recording, channels=channels)
 
 
 def _named(channel: Channel) -> Channel:

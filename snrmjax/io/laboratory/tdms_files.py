@@ -14,6 +14,7 @@ from snrmjax.io.laboratory.arrays.value_tree import Node, Numbers, Selection, he
 from snrmjax.io.laboratory.contents import LaboratoryFile, NumberTable
 from snrmjax.io.laboratory.libraries import damaged_if_it_fails, library
 from snrmjax.io.laboratory.physical_units import channel_meaning
+from snrmjax.io.laboratory.shared_clock import SharedAxis, TimeAxis, note_on_shift, shared_axes
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.time_recording import (
     AbstractSamples,
@@ -24,14 +25,16 @@ from snrmjax.numerics.facts import Fact
 
 _UNITS = ("unit_string", "NI_UnitDescription", "Unit", "unit", "Units")
 _MOST_CHANNELS = 4096
-_ALIKE = 1e-12  # relative, of two steps in the properties of one device
 
 
 class _TdmsSamples(AbstractSamples):
     """Channels of one group. The file is open until this is forgotten."""
 
-    def __init__(self, file: Any, channels: Sequence[Any], n_samples: int, name: str) -> None:
-        self._channels, self._samples, self._name = tuple(channels), n_samples, name
+    def __init__(
+        self, file: Any, channels: Sequence[Any], skipped: Sequence[int], n_samples: int, name: str
+    ) -> None:
+        self._channels, self._skipped = tuple(channels), tuple(skipped)
+        self._samples, self._name = n_samples, name
         weakref.finalize(self, file.close)
 
     @property
@@ -46,7 +49,8 @@ class _TdmsSamples(AbstractSamples):
         rows = []
         for k in channels:
             with damaged_if_it_fails(self._name, "a TDMS file"):
-                rows.append(self._channels[k].read_data(start, max(0, stop - start)))
+                first = start + self._skipped[k]
+                rows.append(self._channels[k].read_data(first, max(0, stop - start)))
         if any(len(row) != stop - start for row in rows):
             raise ValueError(f"{self._name} is damaged: samples {start} to {stop} are not there.")
         return np.stack(rows)
@@ -69,7 +73,8 @@ def read_tdms(path: Path) -> LaboratoryFile:
         ]
     _check_sizes(counted, size, path.name)
     for name, channels in groups:
-        waves: dict[tuple[float, float, int], list[Any]] = {}
+        waves: dict[str, TimeAxis] = {}
+        began = _began(channels)
         loose: dict[str, Node] = {}
         for channel in channels:
             if not len(channel) or channel.dtype.kind not in "biufc":
@@ -87,19 +92,13 @@ def read_tdms(path: Path) -> LaboratoryFile:
                 loose.setdefault(axis, held(lines, {"unit": "Hz"}))
                 loose[channel.name] = _numbers(path, name, channel)
             elif step is not None and step > 0 and len(channel) > 1 and channel.dtype.kind != "c":
-                key = next(
-                    (
-                        key
-                        for key in waves
-                        if abs(key[0] / step - 1) < _ALIKE and key[1:] == (start, len(channel))
-                    ),
-                    (step, start, len(channel)),
-                )
-                waves.setdefault(key, []).append(channel)
+                start += began.get(channel.name, 0.0)
+                waves[channel.name] = TimeAxis(step, start, len(channel))
             else:
                 loose[channel.name] = _numbers(path, name, channel)
-        for (step, start, length), alike in waves.items():
-            recordings.append(_recording(path, name, alike, step, start, length))
+        for shared in shared_axes(waves):
+            recordings.append(_recording(path, name, channels, shared))
+            notes += note_on_shift(shared)
         contents = read_struct(name, loose)
         recordings.extend(contents.recordings)
         tables.extend(table._replace(name=name) for table in contents.numbered())
@@ -130,25 +129,40 @@ def _check_sizes(counted: Sequence[tuple[Any, int, dict]], size: int, file: str)
         raise ValueError(f"{file} states {total} bytes of samples, but has {size} bytes.")
 
 
-def _recording(
-    path: Path, name: str, channels: Sequence[Any], step: float, start: float, length: int
-) -> TimeRecording:
-    """Channels of one rate as a time record."""
+def _began(channels: Sequence[Any]) -> dict[str, float]:
+    """Seconds by which channels began after the first of them, by the times that they state."""
+    stated = {
+        channel.name: value
+        for channel in channels
+        if isinstance(value := channel.properties.get("wf_start_time"), np.datetime64)
+        and not np.isnat(value)
+    }
+    first = min(stated.values(), default=np.datetime64(0, "us"))
+    return {
+        name: float((value - first) / np.timedelta64(1, "ns")) * 1e-9
+        for name, value in stated.items()
+    }
+
+
+def _recording(path: Path, name: str, channels: Sequence[Any], shared: SharedAxis) -> TimeRecording:
+    """Channels of one clock as a time record."""
+    channels = [next(one for one in channels if one.name == key) for key in shared.channels]
     with ExitStack() as kept, damaged_if_it_fails(path.name, "a TDMS file"):
         file = kept.enter_context(open(path, "rb"))
         group = _contents(file)[name]
         opened = [group[channel.name] for channel in channels]
         kept.pop_all()  # it stays open until the samples are forgotten
-    samples = _TdmsSamples(file, opened, length, path.name)
+    axis = shared.axis
+    samples = _TdmsSamples(file, opened, shared.skipped, axis.n_samples, path.name)
     listed = []
     for channel in channels:
         unit = _unit(channel)
         quantity, calibration = channel_meaning(unit)
         listed.append(Channel(channel.name, quantity, unit, calibration))
-    rate = 1 / step
+    rate = 1 / axis.step
     whole = round(rate)
     rate = float(whole) if whole and abs(rate / whole - 1) < 4e-16 else rate
-    return time_recording(samples, listed, rate, start_time=start, name=name)
+    return time_recording(samples, listed, rate, start_time=axis.start, name=name)
 
 
 def _numbers(path: Path, group: str, channel: Any) -> Numbers:

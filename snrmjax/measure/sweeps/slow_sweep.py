@@ -104,9 +104,9 @@ def sweep_states(
     taken from the force, so that amplitude and frequency stay those that were measured.
 
     Arguments: `force`, `responses`, `harmonic_order`, `level`, `sensors`, `drive` and `is_base`
-    as in `stepped_sine_states`; `frequencies` in rad/s at which states are wanted (by default a grid
-    that is finer where the response changes); `cycles` is the width of the window; `correct` takes
-    the bias of the sweep out (without it, and where it cannot be told, 1σ holds the bias).
+    as in `stepped_sine_states`; `frequencies` in rad/s at which states are wanted (by default a
+    grid that is finer where the response changes); `cycles` is the width of the window; `correct`
+    takes the bias of the sweep out (without it, and where it cannot be told, 1σ holds the bias).
     Returns `SweptStates` with the bias that each sweep has at resonance without correction.
     Raises `ValueError` for channels that do not fit, a record in which no sweep is found, windows
     of fewer than six cycles, fewer than four samples a cycle, frequencies outside every sweep and

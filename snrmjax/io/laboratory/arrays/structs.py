@@ -164,7 +164,8 @@ def _read_numbers(
         repeated = single if entry or n == 1 else {}
         columns = {key: np.repeat(array.vector(key), n) for key, array in repeated.items()}
         columns |= {key: array.vector(key) for key, array in group.items()}
-        units = {key: array.unit for key, array in (repeated | group).items() if array.unit}
+        units = _listed_units(group, words)
+        units |= {key: array.unit for key, array in (repeated | group).items() if array.unit}
         texts = {
             key: tuple(word) if len(word) == n else tuple(word) * n
             for key, word in words.items()
@@ -173,6 +174,16 @@ def _read_numbers(
         in_order = {key: columns[key] for key in (*group, *repeated)}
         place = "" if len(groups) == 1 else f"rows{n}"
         contents.tables[place] = NumberTable("", in_order, units, texts)
+
+
+def _listed_units(
+    group: Mapping[str, Numbers], words: Mapping[str, Sequence[str]]
+) -> dict[str, str]:
+    """Units that a list beside the columns states, one a column in their order."""
+    for key, listed in words.items():
+        if key.lower() in ("unit", "units") and len(listed) == len(group):
+            return {name: unit for name, unit in zip(group, listed, strict=True) if unit}
+    return {}
 
 
 def _spread(
