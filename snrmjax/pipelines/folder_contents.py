@@ -2,7 +2,7 @@
 
 import dataclasses
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,7 +14,8 @@ from snrmjax.io.exchange.import_map import (
     read_import_map,
     steps_of_map,
 )
-from snrmjax.io.exchange.importing import Imported, import_files
+from snrmjax.io.exchange.import_options import STAYS_RECORD
+from snrmjax.io.exchange.importing import Imported, import_files, joined_files
 from snrmjax.io.exchange.own_tables import is_own_file
 from snrmjax.io.exchange.record_import import mapped_record
 from snrmjax.io.files import read_text
@@ -31,11 +32,15 @@ from snrmjax.model.structures import Structure
 
 _MEASURED = (
     *(".csv", ".uff", ".unv", ".unv58", ".mat", ".h5", ".hdf5", ".nc", ".nc4", ".cdf"),
-    *(".tdms", ".tsv", ".dat", ".asc"),
+    *(".tdms", ".lvm", ".tsv", ".dat", ".asc"),
 )
 MAP = "map.toml"
-_WRITTEN = (".txt", ".md", ".log")
+_WRITTEN = (".txt", ".md", ".log")  # of which the first may hold measurements, too
+_AXES = ("frequency", "time")
 _SHOWN = 60  # lines of a text
+_MOST_NAMED = 6  # files that were passed over, in a message
+_LOADS = ("force", "voltage")
+_TOLD = ("channels_shifted", "samples_missing", "runs_side_by_side", "rate_left_open")
 
 
 class NamedStates(NamedTuple):
@@ -135,6 +140,7 @@ def read_test_files(folder: Path, model: Path | None = None) -> TestFiles:
     records: list[NamedRecord] = []
     passed: list[tuple[str, str]] = []
     texts: list[tuple[str, tuple[str, ...]]] = []
+    raw: list[LaboratoryFile] = []
     for path in files:
         suffix = path.suffix.lower()
         if path in maps:
@@ -147,6 +153,8 @@ def read_test_files(folder: Path, model: Path | None = None) -> TestFiles:
                 models.append(path)
             elif path.resolve() != model.resolve():
                 passed.append((path.name, f"not used: the model is {model.name}"))
+        elif suffix == ".txt" and (written := _measured_text(path, told)) is not None:
+            raw.append(written)
         elif suffix in _WRITTEN and _readable(path):
             passed.append((path.name, "not used: a text of the laboratory, shown below"))
             texts.append((path.name, _lines(path)))
@@ -155,35 +163,35 @@ def read_test_files(folder: Path, model: Path | None = None) -> TestFiles:
         elif suffix == ".csv" and is_own_file(path):
             states.append(NamedStates(path.name, read_steady_states(path), path))
         else:
-            held = read_laboratory_file(path, told.text_format)
-            assumed = Assumptions()
-            if held.tables or (held.responses and told.force_amplitude):
-                found = _imported(path, told)
-                assumed.update(found.assumed)
-                if found.states is not None:
-                    states.append(NamedStates(path.name, found.states))
-            else:
-                responses += [NamedResponses(path.name, one) for one in _linear(held, path)]
-            for recording in held.recordings:
-                record = (
-                    recording
-                    if told.is_empty
-                    else mapped_record(recording, told, path.name, assumed)[0]
-                )
-                several = f"{path.name}: {recording.name}"
-                records.append(
-                    NamedRecord(several if len(held.recordings) > 1 else path.name, record)
-                )
-            notes += [f"{path.name}: {key}: {why}" for key, why in assumed.items()]
+            raw.append(read_laboratory_file(path, told.text_format))
+    for held, names in _joined(raw):
+        paths, file, assumed = [folder / name for name in names], held.name, Assumptions()
+        stepped = held.recordings and told.base and told.record not in STAYS_RECORD
+        if held.tables or stepped or (held.responses and (told.force_amplitude or told.base)):
+            found = _imported(paths, told)
+            assumed.update(found.assumed)
+            if found.states is not None:
+                states.append(NamedStates(file, found.states))
+        else:
+            responses += [NamedResponses(file, one) for one in _linear(held, paths[0])]
+        for recording in () if stepped else held.recordings:
+            record = (
+                recording if told.is_empty else mapped_record(recording, told, file, assumed)[0]
+            )
+            several = f"{file}: {recording.name}"
+            records.append(NamedRecord(several if len(held.recordings) > 1 else file, record))
+        notes += [f"{file}: {key}: {why}" for key, why in assumed.items()]
+        notes += [f"{file}: {note}" for note in held.notes if note.kind in _TOLD]
     if len(models) > 1:
         listed = " and ".join(model.name for model in models)
         raise ValueError(
             f"which is the model of this test, {listed}? Say so by `--model {models[0].name}`."
         )
     if not states and not responses and not records:
+        over = "; ".join(f"{name}: {why}" for name, why in passed[:_MOST_NAMED])
         raise ValueError(
             f"{folder.name} holds nothing measured: steady states (CSV), frequency responses or "
-            "time records."
+            f"time records{f' ({over})' if over else ''}."
         )
     return TestFiles(
         read_model(models[0]) if models else None,
@@ -192,6 +200,38 @@ def read_test_files(folder: Path, model: Path | None = None) -> TestFiles:
         tuple((name, lines) for name, lines in texts if lines),
         steps_of_map(maps[0]) if maps else None,
     )
+
+
+def _measured_text(path: Path, told: ImportMap) -> LaboratoryFile | None:
+    """A text that holds measurements: numbers with a frequency or a time; None of any other."""
+    try:
+        held = read_laboratory_file(path, told.text_format)
+    except ValueError:
+        return None  # what people wrote is shown as it is
+    axes = {table.role(name) for table in held.tables for name in table.columns}
+    named = told.frequency in {name for table in held.tables for name in table.columns}
+    return held if held.recordings or held.responses or named or axes & {*_AXES} else None
+
+
+def _joined(raw: Sequence[LaboratoryFile]) -> list[tuple[LaboratoryFile, list[str]]]:
+    """Files with the names of what they were read from: channels of one clock are one of them."""
+    alone = [one for one in raw if len(one.recordings) == 1 and not (one.tables or one.responses)]
+    groups: dict[tuple[float, float, int], list[LaboratoryFile]] = {}
+    for one in alone:
+        (record,) = one.recordings
+        if len(record.channels) == 1:
+            clock = record.sampling_rate, record.start_time, record.n_samples
+            groups.setdefault(clock, []).append(one)
+    found: list[tuple[LaboratoryFile, list[str]]] = []
+    taken: set[str] = set()
+    for group in groups.values():
+        joined = joined_files(group)
+        loads = [one for one in group if one.recordings[0].channels[0].quantity in _LOADS]
+        if len(joined) == 1 < len(group) and len(loads) == 1:
+            names = [one.name for one in group]
+            found.append((joined[0], names))
+            taken.update(names)
+    return [*found, *((one, [one.name]) for one in raw if one.name not in taken)]
 
 
 def _readable(path: Path) -> bool:
@@ -216,12 +256,13 @@ def _is_model(path: Path) -> bool:
         return True
 
 
-def _imported(path: Path, told: ImportMap) -> Imported:
+def _imported(paths: Sequence[Path], told: ImportMap) -> Imported:
     try:
-        return import_files([path], told)
+        return import_files(paths, told)
     except ValueError as error:
+        named = " ".join(map(str, paths))
         raise ValueError(
-            f"{error} `snrmjax import {path}` says how; put the {MAP} that the import writes "
+            f"{error} `snrmjax import {named}` says how; put the {MAP} that the import writes "
             "beside the file."
         ) from error
 

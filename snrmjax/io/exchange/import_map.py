@@ -20,6 +20,10 @@ _MOTIONS = ("displacement", "velocity", "acceleration")
 _CHANNELS, _NUMBERS, _TEXTS = "Channels and columns", "What the numbers are", "Text files"
 
 
+BY_NAME = "name"
+"""The word for amplitudes that file names state."""
+
+
 class MapKey(NamedTuple):
     """A key of a map and an option of an import: what it means, and the words it may have."""
 
@@ -50,7 +54,8 @@ KEYS = {
     ),
     "force_phase": MapKey("column of the force's own phase; empty: phases are relative to it"),
     "force_amplitude": MapKey(
-        "force in N behind responses: one for all, one a set, or z: the z axis", "N", _NUMBERS
+        "force in N: one for all, one a set or file, z: the z axis, name: file names",
+        *("N", _NUMBERS),
     ),
     "over_force": MapKey("whether responses of a table are divided by the force", "", _NUMBERS),
     "phase_unit": MapKey("unit of the phases: deg or rad", "UNIT", _NUMBERS, ("deg", "rad")),
@@ -159,8 +164,9 @@ class ImportMap(NamedTuple):
 
     @property
     def base_channel(self) -> str:
-        """The channel or column of a base's motion, if that is not stated by numbers."""
-        return "" if self.base_amplitudes or not self.base else self.base_motion.channel
+        """The channel or column of a base's motion, if no numbers and no file names state it."""
+        name = self.base_motion.channel if self.base else ""
+        return "" if self.base_amplitudes or name == BY_NAME else name
 
     @property
     def base_amplitudes(self) -> tuple[float, ...]:
@@ -282,8 +288,8 @@ def _option(key: str) -> str:
 
 
 def _stated_amplitudes(words: Sequence[str]) -> tuple[str, ...]:
-    if list(words) == ["z"]:
-        return ("z",)
+    if list(words) in (["z"], [BY_NAME]):
+        return tuple(words)
     amplitudes = []
     for word in words:
         try:
@@ -292,8 +298,8 @@ def _stated_amplitudes(words: Sequence[str]) -> tuple[str, ...]:
             number = 0.0
         if not 0 < number < float("inf"):
             raise ValueError(
-                f"--force-amplitude must be a positive number in N, or z alone, but is "
-                f"{shown(word)}."
+                "--force-amplitude must be a positive number (in --force-unit, N by default), or z "
+                f"or name alone, but is {shown(word)}."
             )
         amplitudes.append(repr(number))
     return tuple(amplitudes)
@@ -326,7 +332,11 @@ def _value(table: TomlTable, key: str) -> Any:
     if key == "header_row":
         return table.whole(key, 0)
     if key == "force_amplitude":
-        return ("z",) if value == "z" else tuple(map(repr, table.numbers(key, each="entry")))
+        return (
+            (value,)
+            if value in ("z", BY_NAME)
+            else tuple(map(repr, table.numbers(key, each="entry")))
+        )
     choices = KEYS[key].choices
     return table.choice(key, ("", *choices)) if choices else table.text(key)
 
@@ -366,7 +376,8 @@ def map_text(
     for key, spec in KEYS.items():
         value = getattr(used, key)
         if key == "force_amplitude":
-            value = "z" if value == ("z",) else [float(spec) for spec in value]
+            is_word = value in (("z",), (BY_NAME,))
+            value = value[0] if is_word else [float(number) for number in value]
         lines.append(f"{_line(key, value)}  # {_comment(key, value, assumed) or spec.meaning}")
     for k, response in enumerate(used.responses):
         lines += ["", "[[response]]"]

@@ -26,7 +26,8 @@ _WHAT: dict[Content, str] = {
     "responses": "frequency responses",
     "records": "time records",
 }
-_STAYS_RECORD = ("decay", "broadband")
+STAYS_RECORD = ("decay", "broadband")
+"""Kinds of time records that an import writes as records, not as steady states."""
 
 
 def refuse_unused(
@@ -66,7 +67,7 @@ def refuse_unused(
         and (content != "own table")
     ):
         refuse("force_unit", "without --force or --force-amplitude")
-    if content == "records" and mapping.record in _STAYS_RECORD:
+    if content == "records" and mapping.record in STAYS_RECORD:
         for key in ("level", "drive"):
             if key in stated:
                 refuse(key, f"on records that stay records (--record {mapping.record})")

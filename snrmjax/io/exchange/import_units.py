@@ -1,5 +1,6 @@
 """Units and quantities of an import: stated by the map, by the file, or asked for."""
 
+import re
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
@@ -45,6 +46,24 @@ def require_name(option: str, name: str, known: Iterable[str], what: str, file: 
             f"{option} names {name!r}, but {file} has the {what} {', '.join(names)}"
             f"{f' (did you mean {near}?)' if near else ''}."
         )
+
+
+_IN_A_NAME = re.compile(
+    r"(?<![0-9.,])([0-9]+(?:[.,][0-9]+)?)[ _-]?((?:k|m|u|µ)?N|lbf|m?V|m?g|m_s2|mm?)(?![A-Za-z0-9])"
+)
+
+
+def amplitude_of_name(file: str) -> tuple[float, str] | None:
+    """Amplitude and unit that a file's name states, as 0.4 N of "sine_0.4N_up.txt"; or None.
+
+    >>> amplitude_of_name("sine_0,4N_up.txt"), amplitude_of_name("run 2.csv")
+    ((0.4, 'N'), None)
+    """
+    found = {(match[1], match[2]) for match in _IN_A_NAME.finditer(file.rsplit(".", 1)[0])}
+    if len(found) != 1:
+        return None
+    number, unit = found.pop()
+    return float(number.replace(",", ".")), unit.replace("m_s2", "m/s^2")
 
 
 def force_meaning(mapping: ImportMap, file_unit: str, what: str) -> Force:

@@ -97,13 +97,22 @@ def import_files(
         parts = [restated(states_of_own_table(table, name), mapping) for table, name in ours]
         notes.append(restated_how(mapping))
         return Imported(join_steady_states(parts), (), mapping, assumed, tuple(notes))
-    imported = [import_table(table, mapping, name, assumed) for table, name in tables] or [
+    each = mapping.force_amplitude
+    if len(each) == len(tables) > 1:  # one a file
+        mappings = [mapping._replace(force_amplitude=(word,)) for word in each]
+    else:
+        mappings = [mapping] * len(tables)
+    imported = [
+        import_table(table, told, name, assumed)
+        for (table, name), told in zip(tables, mappings, strict=True)
+    ] or [
         import_responses(content, z, mapping, name, assumed)
         for _, name, content, z in datasets
         if not isinstance(content, TimeRecording | NumberTable)
     ]
     used, force = imported[-1][1:3]
     refuse_unused_phase_unit(stated, used)
+    used = used._replace(force_amplitude=mapping.force_amplitude)
     measured = [part for part, *_ in imported]
     notes += [note for *_, further in imported for note in further]
     return _phasors(measured, used, force, file, mapping.level, assumed, notes)

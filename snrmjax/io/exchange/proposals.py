@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from snrmjax.io.columns import is_ours
-from snrmjax.io.exchange.import_map import Assumptions, ImportMap, map_of_options
+from snrmjax.io.exchange.import_map import BY_NAME, Assumptions, ImportMap, map_of_options
+from snrmjax.io.exchange.import_units import amplitude_of_name
 from snrmjax.io.exchange.importing import import_files, joined_files
 from snrmjax.io.exchange.record_import import mapped_record
 from snrmjax.io.laboratory.contents import LaboratoryFile, NumberTable
@@ -60,6 +61,7 @@ def proposed_commands(paths: Sequence[Path], files: Sequence[LaboratoryFile]) ->
         *held.responses,
     )[0]
     found = _options_of(content)
+    _take_amplitudes_of_names(found, files)
     if len(held.recordings) + len(held.tables) + bool(held.responses) > 1:
         is_responses = isinstance(content, FrequencyResponses)
         found["dataset"] = "responses" if is_responses else content.name or "record"
@@ -79,6 +81,21 @@ def proposed_commands(paths: Sequence[Path], files: Sequence[LaboratoryFile]) ->
     ]
     lines += [f"  it will ask: {question}"] if question else []
     return [*lines, *(_modes(named, content) if held.responses else ())]
+
+
+def _take_amplitudes_of_names(found: _Options, files: Sequence[LaboratoryFile]) -> None:
+    """Amplitudes in the names of files, where nothing else states any."""
+    said = [amplitude_of_name(file.name) for file in files]
+    if found.get("force_amplitude") != ["NEWTONS"] or None in said:
+        return
+    (unit, *others) = {unit_meaning(one[1]).dimension for one in said if one is not None}
+    if others:
+        return
+    if unit in DERIVATIVE:
+        del found["force_amplitude"]
+        found["base"] = f"{BY_NAME}:{unit}"
+    elif unit in ("force", "voltage"):
+        found["force_amplitude"] = [BY_NAME]
 
 
 def _question(

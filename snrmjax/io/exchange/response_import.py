@@ -6,8 +6,14 @@ from typing import NamedTuple
 import numpy as np
 
 from snrmjax.io.exchange.import_levels import MeasuredPart
-from snrmjax.io.exchange.import_map import Assumptions, ImportMap
-from snrmjax.io.exchange.import_units import Force, force_meaning, load_meaning, require_name
+from snrmjax.io.exchange.import_map import BY_NAME, Assumptions, ImportMap
+from snrmjax.io.exchange.import_units import (
+    Force,
+    amplitude_of_name,
+    force_meaning,
+    load_meaning,
+    require_name,
+)
 from snrmjax.io.exchange.table_import import import_table
 from snrmjax.io.laboratory.contents import NumberTable
 from snrmjax.measure.recordings.channels import Channel
@@ -68,6 +74,13 @@ class _Sets(NamedTuple):
         if self.mapping.base:
             return self._base_amplitudes()
         stated, file, n = self.mapping.force_amplitude, self.file, len(self.sets)
+        if stated == (BY_NAME,):
+            said = amplitude_of_name(file)
+            if said is None or said[1] != "N":
+                raise ValueError(
+                    f"the name of {file} must state one amplitude in newtons, as frf_0.4N.uff does."
+                )
+            return np.full(n, said[0])
         has_z = bool(np.isfinite(self.z).all())
         if not stated:
             levels = ", ".join(f"{value:g}" for value in self.z)

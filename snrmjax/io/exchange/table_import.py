@@ -7,10 +7,11 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from snrmjax.io.exchange.import_levels import MeasuredPart
-from snrmjax.io.exchange.import_map import Assumptions, ImportMap, ResponseMap
+from snrmjax.io.exchange.import_map import BY_NAME, Assumptions, ImportMap, ResponseMap
 from snrmjax.io.exchange.import_units import (
     Force,
     amplitude_factor,
+    amplitude_of_name,
     frequency_in_rad,
     load_meaning,
     motion_meaning,
@@ -152,6 +153,9 @@ def _force(source: _Source) -> tuple[Complex[np.ndarray, " row"], Force]:
     name = mapping.load
     if not name:
         amplitudes = mapping.base_amplitudes or mapping.force_amplitude
+        by_name = BY_NAME in (mapping.base.split(":")[0], *mapping.force_amplitude)
+        if by_name:
+            return _by_name(source)
         if len(amplitudes) != 1 or amplitudes[0] == "z":
             raise ValueError(
                 f"which column of {file} is the force? --force COLUMN names it, of "
@@ -173,6 +177,20 @@ def _force(source: _Source) -> tuple[Complex[np.ndarray, " row"], Force]:
     if mapping.force_phase:
         size = size * np.exp(1j * source.phase(mapping.force_phase, "--force-phase"))
     return size, force
+
+
+def _by_name(source: _Source) -> tuple[Complex[np.ndarray, " row"], Force]:
+    """The force that the file's name states, in the unit that it states, or another one."""
+    mapping, file = source.mapping, source.file
+    said = amplitude_of_name(file)
+    if said is None:
+        raise ValueError(
+            f"the name of {file} must state one amplitude with its unit, as sine_0.4N.csv does: "
+            "rename it, or give --force-amplitude a number."
+        )
+    amplitude, unit = said
+    force = load_meaning(mapping, unit, f"the amplitude in the name of {file}")
+    return np.full(source.table.n_rows, amplitude * force.factor, dtype=complex), force
 
 
 def _response(

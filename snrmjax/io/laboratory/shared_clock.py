@@ -116,7 +116,8 @@ def joined_by_clock(
     """One record of the channels of several files, or None where they are none of one clock.
 
     A test is in several files where each of them holds one record of a single channel, all of one
-    rate, start and length. Channels keep their names; those of one name get their file's.
+    rate, start and length, and no two of one name and quantity: those would be two tests. Channels
+    keep their names; those of one name get their file's.
     Arguments: `records` of each file by its name.
     """
     single = {file: held[0] for file, held in records.items() if len(held) == 1}
@@ -127,6 +128,9 @@ def joined_by_clock(
     if len(axes) > 1 or any(len(one.channels) > 1 for one in each):
         return None
     names = [one.channels[0].name for one in each]
+    quantities = [one.channels[0].quantity for one in each]
+    if len({*zip(names, quantities, strict=True)}) < len(each):
+        return None
     channels: list[Channel] = []
     for file, one in single.items():
         (channel,) = one.channels
