@@ -265,6 +265,14 @@ class WholeTestOptions:
     drive_point: str | None = option(
         None, "Sensor at the force, by which mode shapes are scaled.", "NAME"
     )
+    base: Literal["absolute", "relative"] | None = option(
+        None,
+        "What the sensors record of a structure whose base moves: their own motion (absolute) or "
+        "that relative to the base. A model.toml says it itself.",
+        "KIND",
+        alone=("drive_point", "model"),
+        why_alone="a base has no drive point, and a model says itself what its sensors record",
+    )
     go_on: bool = option(False, "Go on in spite of errors that the check finds.")
     diagnose: bool = option(True, "Look for what the model lacks, too (a minute or more).")
 

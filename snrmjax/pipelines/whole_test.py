@@ -27,6 +27,7 @@ from snrmjax.measure.states import (
     with_levels_apart,
 )
 from snrmjax.methods.records.recorded_test import RecordedTest, RecordKind, recorded_test
+from snrmjax.model.base_motion import base_motion
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.facts import Fact
 from snrmjax.pipelines.check import files_of_test, is_certain, with_imports
@@ -97,6 +98,11 @@ def run_whole_test(
     read = files_of_test(folder, files)
     stage.ends("files")
     model, modes = files.model, None
+    if model is not None and options.base is not None:
+        raise ValueError(
+            f"`--base` has no effect beside {files.model_file}, whose [base] says what the sensors "
+            "record: leave it out."
+        )
     if model is None:
         modes = _linear_modes(files, options)
         model = modes.structure
@@ -188,8 +194,13 @@ def _linear_modes(files: TestFiles, options: WholeTestOptions) -> LinearModesFou
             "what are the linear modes? The folder has time records only: put a model.toml or "
             "frequency responses beside them."
         )
-    fitted, notes = find_modes(source)  # type: ignore[arg-type]
-    scaled = _scaled(fitted, DrivePoint(options.drive_point))
+    fitted, notes = find_modes(source, base=options.base)  # type: ignore[arg-type]
+    if options.base is not None:
+        # Of a base the product of shape and participation is known, and nothing else is needed.
+        scaled = scale_modes(fitted, None)
+        scaled = dataclasses.replace(scaled, base=base_motion(options.base))
+    else:
+        scaled = _scaled(fitted, DrivePoint(options.drive_point))
     return LinearModesFound("model", fitted, scaled, _nearest_mode(scaled, files), notes)
 
 

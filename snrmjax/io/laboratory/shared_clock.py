@@ -30,13 +30,15 @@ class SharedAxis(NamedTuple):
     channels: tuple[str, ...]
     skipped: tuple[int, ...]  # samples of each channel before the common part
     axis: TimeAxis
+    cut: tuple[str, ...] = ()  # channels that go on behind it
 
 
 def shared_axes(stated: Mapping[str, TimeAxis]) -> list[SharedAxis]:
     """Channels in groups that have their instants in common, in the order of their first ones.
 
     Channels of one step whose starts differ by whole samples are of one group, of which the time
-    that all have is kept; others stay apart: a fraction of a sample is an error of the phase.
+    that all have is kept, if that is most of it; others stay apart: a fraction of a sample is an
+    error of the phase.
     """
     groups: list[dict[str, TimeAxis]] = []
     for key, axis in stated.items():
@@ -51,7 +53,9 @@ def shared_axes(stated: Mapping[str, TimeAxis]) -> list[SharedAxis]:
         first = max(axis.start for axis in group.values())
         skipped = [round((first - axis.start) / step) for axis in group.values()]
         left = [axis.n_samples - n for axis, n in zip(group.values(), skipped, strict=True)]
-        shared.append(SharedAxis(tuple(group), tuple(skipped), TimeAxis(step, first, min(left))))
+        axis = TimeAxis(step, first, min(left))
+        cut = tuple(key for key, n in zip(group, left, strict=True) if n > min(left))
+        shared.append(SharedAxis(tuple(group), tuple(skipped), axis, cut))
     return shared
 
 
@@ -62,30 +66,28 @@ def _in_step(axis: TimeAxis, group: Sequence[TimeAxis]) -> bool:
     together = [*group, axis]
     begins = max(each.start for each in together)
     ends = min(each.start + each.n_samples * each.step for each in together)
-    shortest = min(each.n_samples * each.step for each in together)
-    alike = axis == one or axis.n_samples == one.n_samples or shift != 0
+    longest = max(each.n_samples * each.step for each in together)
     return (
-        alike
-        and abs(axis.step / one.step - 1) < _ALIKE
+        abs(axis.step / one.step - 1) < _ALIKE
         and abs(shift - round(shift)) < _WHOLE
-        and ends - begins > shortest / 2
+        and ends - begins > longest / 2
     )
 
 
 def note_on_shift(shared: SharedAxis) -> tuple[Fact, ...]:
-    """A note that names the channels that were shifted, if any were."""
+    """Notes on the channels that were shifted or cut, if any were."""
+    cut = (Fact("channels_cut", names=shared.cut, n=shared.axis.n_samples),) if shared.cut else ()
     if not any(shared.skipped):
-        return ()
+        return cut
     # The last to begin skips nothing: the others are told by how much earlier they began.
     shifts = dict(zip(shared.channels, shared.skipped, strict=True))
     earlier = {name: n for name, n in shifts.items() if n}
-    return (
-        Fact(
-            "channels_shifted",
-            names=tuple(earlier),
-            seconds=tuple(n * shared.axis.step for n in earlier.values()),
-        ),
+    shifted = Fact(
+        "channels_shifted",
+        names=tuple(earlier),
+        seconds=tuple(n * shared.axis.step for n in earlier.values()),
     )
+    return (shifted, *cut)
 
 
 class _JoinedSamples(AbstractSamples):

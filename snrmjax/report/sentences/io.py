@@ -99,6 +99,10 @@ SENTENCES: dict[str, Wording] = {
         )
         + " earlier: only the time that all channels share is read."
     ),
+    "channels_cut": lambda names, n: (
+        f"{', '.join(names)} {'has' if len(names) == 1 else 'have'} further samples than the {n} "
+        "that all channels share: left out."
+    ),
     "channels_of_files": lambda files: f"one record of the channels of {', '.join(files)}.",
     "runs_side_by_side": lambda labels, n: (
         f"{n} runs lie side by side: one table with the column `run`"

@@ -37,7 +37,13 @@ def test_units_of_the_table(text, dimension, factor):
 
 
 def test_sensitivities_and_suffixes():
-    assert unit_meaning("100 mV/g") == ("acceleration", pytest.approx(GRAVITY / 0.1), "", True, False)
+    assert unit_meaning("100 mV/g") == (
+        "acceleration",
+        pytest.approx(GRAVITY / 0.1),
+        "",
+        True,
+        False,
+    )
     assert unit_meaning("50 N/V") == ("force", 50.0, "", True, False)
     assert unit_meaning("mm/s rms") == ("velocity", 1e-3, "rms", False, False)
     for text in ("pC/N", "m^12", "2*m", "qq", "0 N", "m(", "import"):

@@ -1,0 +1,202 @@
+"""Texts that describe themselves, as controllers, LabVIEW and vibrometers write them."""
+
+import numpy as np
+import pytest
+from truths.import_runs import run_import
+
+from snrmjax.io.laboratory import read_laboratory_file
+from snrmjax.io.laboratory.contents import TextFormat
+
+RATE = 1000
+TIME = np.arange(80) / RATE
+FORCE, MOTION = np.cos(300 * TIME), 0.5 * np.sin(300 * TIME)
+END = "***End_of_Header***"
+
+
+def lvm(separator="\t", decimal=".", x_columns="No", *, step="1.000000E-3", rows=None, **header):
+    """A measurement file of LabVIEW with one segment or more, as its specification says."""
+    sides = 1 if x_columns != "Multi" else 2
+
+    def line(*fields):
+        return separator.join(str(field).replace(".", decimal) for field in fields)
+
+    def spread(*fields):
+        return [
+            word for k, field in enumerate(fields) for word in ([""] * (k and sides - 1), field)
+        ]
+
+    general = [
+        *(("Writer_Version", 2), ("Reader_Version", 2)),
+        ("Separator", "Tab" if separator == "\t" else "Comma"),
+        *(("Multi_Headings", "Yes"), ("X_Columns", x_columns), ("Time_Pref", "Relative")),
+    ]
+    lines = [f"LabVIEW Measurement{separator}"]
+    lines += [f"{key}{separator}{value}" for key, value in general]
+    lines += [f"Decimal_Separator{separator}{decimal}", f"{END}{separator}"]
+    for values in rows or [[FORCE, MOTION]]:
+        names, units = ["Force", "Tip velocity"][: len(values)], ["Newtons", "mm/s"][: len(values)]
+
+        def stated(key, *fields):
+            gap = [""] if sides == 2 else []
+            return line(key, *[w for k, f in enumerate(fields) for w in [*(gap if k else []), f]])
+
+        n = len(values)
+        lines += ["", line("Channels", n), stated("Samples", *map(len, values))]
+        lines += [stated("Y_Unit_Label", *units), stated("X_Dimension", *["Time"] * n)]
+        lines += [stated(key, *given) for key, given in header.items()]
+        lines += [stated("X0", *["0.0000000000000000E+0"] * n), stated("Delta_X", *[step] * n)]
+        lines += [f"{END}{separator * n}"]
+        heads = [w for name in names for w in (["X_Value", name] if sides == 2 else [name])]
+        lines += [line(*([] if sides == 2 else ["X_Value"]), *heads, "Comment")]
+        for k in range(max(map(len, values))):
+            fields = [f"{one[k]:.9f}" if k < len(one) else "" for one in values]
+            x = f"{TIME[k]:.6f}"
+            if sides == 2:
+                lines.append(line(*[word for field in fields for word in (x, field)]))
+            else:
+                lines.append(line(x if x_columns == "One" else "", *fields))
+    return "\n".join(lines) + "\n"
+
+
+def read(tmp_path, text, name="test.lvm", encoding="utf-8", **told):
+    (tmp_path / name).write_bytes(text.encode(encoding))
+    return read_laboratory_file(tmp_path / name, TextFormat(**told) if told else None)
+
+
+@pytest.mark.parametrize(
+    ("separator", "decimal", "x_columns"),
+    [
+        ("\t", ",", "No"),
+        ("\t", ".", "One"),
+        ("\t", ",", "Multi"),
+        (",", ".", "No"),
+        (",", ".", "One"),
+    ],
+)
+def test_labview_measurement_files(tmp_path, separator, decimal, x_columns):
+    found = read(tmp_path, lvm(separator, decimal, x_columns))
+    (record,) = found.recordings
+    assert (found.kind, record.sampling_rate, record.start_time) == ("lvm", 1000.0, 0.0)
+    assert [one.quantity for one in record.channels] == ["force", "velocity"]
+    np.testing.assert_allclose(record.values(["Force"])[0], FORCE, rtol=0, atol=5.1e-10)
+    np.testing.assert_allclose(record.values(["Tip velocity"])[0], 1e-3 * MOTION, atol=5.1e-13)
+
+
+def test_segments_ragged_ends_and_few_digits_of_labview(tmp_path):
+    text = lvm(rows=[[FORCE, MOTION[:70]], [FORCE, MOTION]], step="0.000977")
+    found = read(tmp_path, text)
+    assert [one.n_samples for one in found.recordings] == [70, 80]
+    assert "Force has further samples than the 70" in " ".join(map(str, found.notes))
+    assert {one.sampling_rate for one in found.recordings} == {1024.0}
+    assert any("only whole rate" in str(note) for note in found.notes)
+    late = {"Date": ["2026/01/05"] * 2, "Time": ["10:00:00.000", "10:00:00.020"]}
+    found = read(tmp_path, lvm(**late))
+    (record,) = found.recordings
+    assert record.n_samples == 60  # of 80, where both are
+    np.testing.assert_allclose(record.values(["Force"])[0], FORCE[20:], atol=5.1e-10)
+    np.testing.assert_allclose(record.values(["Tip velocity"])[0], 1e-3 * MOTION[:60], atol=1e-12)
+    assert "Force began 20 ms earlier" in " ".join(map(str, found.notes))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "complaint"),
+    [
+        ("Separator\tTab", "Separator\tPipe", "states the separator 'Pipe'"),
+        ("Channels\t2", "Channels\t3", "states 3 channels, but its row of names has 2"),
+        (f"{END}\t", "", "header has no end"),
+        ("1.000000000", "one", "must be numbers with a decimal point"),
+        ("Delta_X\t1.000000E-3\t1.000000E-3", "Delta_X\t0\t0", "states no step"),
+        ("\t0.955336489", "\t0.955336489\t1\t2\t3", "has 6 fields"),
+    ],
+)
+def test_a_labview_file_that_contradicts_itself_is_refused(tmp_path, old, new, complaint):
+    text = lvm()
+    assert old in text
+    with pytest.raises(ValueError, match=complaint):
+        read(tmp_path, text.replace(old, new))
+
+
+HERTZ = [31.0, 31.05, 31.1, 31.15]
+SPEED = [0.04678, 0.04926, 0.05201, 0.05508]
+PHASE = [-95.4, -95.7, -96.0, -96.4]
+
+
+def runs(separator, decimal, head, labels, *, shared=True, end=""):
+    """Two runs side by side, the second backwards."""
+
+    def line(*fields):
+        return separator.join(str(field).replace(".", decimal) for field in fields) + end
+
+    lines = [line(*head), *([line(*labels)] if labels else [])]
+    for k in range(4):
+        other = 3 - k if not shared else k
+        second = [SPEED[other] * 2, PHASE[other] - 1]
+        second = second if shared else [HERTZ[other], *second]
+        lines.append(line(HERTZ[k], SPEED[k], PHASE[k], *second))
+    return "\n".join(lines) + "\n"
+
+
+ONE = ["X-Data [Hz]", "Vib (Filtered) [m/s]", "Phase [Deg]"]
+LABELS = ["", "002: [01-05-26 09:28]", "", "003: [01-05-26 09:35]", ""]
+
+
+@pytest.mark.parametrize(
+    ("separator", "decimal", "head", "labels", "shared", "end"),
+    [
+        ("\t", ",", [*ONE, *ONE[1:]], LABELS, True, ""),
+        ("\t", ",", [*ONE, *ONE[1:], ""], LABELS, True, "\t"),
+        (";", ",", [*ONE, *ONE[1:]], [], True, ";"),
+        (",", ".", [*ONE, *ONE], [], False, ""),
+        (";", ".", [*ONE, *ONE], ["up", "", "", "down", "", ""], False, ""),
+    ],
+)
+def test_runs_side_by_side_are_one_table(tmp_path, separator, decimal, head, labels, shared, end):
+    text = runs(separator, decimal, head, labels, shared=shared, end=end)
+    (table,) = read(tmp_path, text, "run.txt", "cp1252").tables
+    assert table.units == {"X-Data": "Hz", "Vib (Filtered)": "m/s", "Phase": "Deg"}
+    assert table.columns["run"].tolist() == [1.0] * 4 + [2.0] * 4
+    second = HERTZ if shared else HERTZ[::-1]
+    assert table.columns["X-Data"].tolist() == HERTZ + second
+    speeds = [2 * one for one in (SPEED if shared else SPEED[::-1])]
+    np.testing.assert_allclose(table.columns["Vib (Filtered)"], SPEED + speeds, rtol=1e-15)
+    if labels is LABELS:
+        assert set(table.words["run label"]) == {LABELS[1], LABELS[3]}
+
+
+def test_a_trailing_separator_adds_no_column_and_a_row_of_names_is_obeyed(tmp_path):
+    text = "f [Hz]\tv [mm/s]\tph [deg]\t\n1,5\t2,5\t-3\t\n2,5\t3,5\t-4\t\n"
+    (table,) = read(tmp_path, text, "a.txt").tables
+    assert list(table.columns) == ["f", "v", "ph"]
+    (told,) = read(tmp_path, text, "a.txt", header_row=1).tables
+    assert told.units == table.units == {"f": "Hz", "v": "mm/s", "ph": "deg"}
+    below = "title\tof a test\n" + text
+    with pytest.raises(ValueError, match=r"--header-row 1 of a\.txt has 2 names, but .* 3 columns"):
+        read(tmp_path, below, "a.txt", header_row=1)
+
+
+@pytest.mark.parametrize("line", ["Sampling rate:\t1000 Hz", "dt = 0.001 s", "# fs\t1 kHz"])
+def test_a_rate_that_is_stated_above_the_numbers(tmp_path, line):
+    rows = "\n".join(f"{a!r}\t{b!r}" for a, b in zip(FORCE.tolist(), MOTION.tolist(), strict=True))
+    (record,) = read(tmp_path, f"{line}\nF [N]\tv [mm/s]\n{rows}\n", "a.txt").recordings
+    assert record.sampling_rate == pytest.approx(1000, rel=1e-15)
+    np.testing.assert_array_equal(record.values(["F"])[0], FORCE)
+
+
+def vibrometer(signal, unit, values):
+    head = f"Source File Name:\thit1\nComponent:\tRoot\nSignal:\tTime - {signal} - Samples\n\n"
+    rows = "\n".join(f"{t:.3f}\t{v!r}" for t, v in zip(TIME, values.tolist(), strict=True))
+    return f"{head}Time\tTime Signal\n[ s ]\t[ {unit} ]\n{rows}\n"
+
+
+def test_channels_in_several_files_are_one_record(tmp_path):
+    (tmp_path / "force.txt").write_text(vibrometer("Ref1 Force", "N", FORCE))
+    (tmp_path / "velocity.txt").write_text(vibrometer("Vib Velocity", "mm/s", MOTION))
+    files = tmp_path / "force.txt", tmp_path / "velocity.txt"
+    words = ["--force", "Ref1 Force", "--response", "Vib Velocity", "--record", "broadband"]
+    code, said = run_import(*files, *words, "--out", tmp_path / "out")
+    assert code == 0, said
+    held = np.loadtxt(tmp_path / "out" / "record.csv", delimiter=",", skiprows=1)
+    np.testing.assert_allclose(held[:, 1:], np.stack([FORCE, 1e-3 * MOTION], axis=1), rtol=1e-15)
+    code, said = run_import(files[0], *words[:3], "Ref1 Force:velocity:m/s", "--out", tmp_path)
+    assert code == 2
+    assert "as the response and as what drives the structure" in said
