@@ -27,6 +27,7 @@ Kind = Literal[
     "shape_not_mass_normalised",
     "missing_anti_alias",
     "wrong_unit",
+    "motion_of_base",
 ]
 
 KINDS: tuple[str, ...] = get_args(Kind)

@@ -215,6 +215,8 @@ class CheckedStates(NamedTuple):
     order: Float[np.ndarray, " state"]  # of the test, 0 to 1
     noise: float  # stated 1σ of velocities, relative; NaN where none is
     files: tuple[tuple[int, ...], ...]  # levels of each table, where there are several
+    # m/s, of a base itself, and whether velocities are as recorded: its motion may be in them.
+    own: tuple[Complex[np.ndarray, " state"], bool] | None = None
 
     @property
     def recorded(self) -> Complex[np.ndarray, " state"]:
@@ -276,7 +278,11 @@ def checked_states(
         *(level, omega, force, sign * (velocity - beside), errors, False),
         *(abs(constant) or 1.0, stds, MODAL_MASS),
     )
-    return CheckedStates(test, at, sign * beside, order, noise, files)
+    own = None
+    if data.base is not None and model is not None:
+        moving = data.base._replace(motion="absolute").own_velocity(data.sensors, omega, force)
+        own = sign * moving[:, sensor], data.base.motion == "relative"
+    return CheckedStates(test, at, sign * beside, order, noise, files, own)
 
 
 def usable_rows(data: SteadyStates, sensor: int) -> Bool[np.ndarray, " state"]:

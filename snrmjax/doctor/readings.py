@@ -25,12 +25,28 @@ class Meaning(NamedTuple):
     kind: Kind | None  # None as recorded
     correction: ImportCorrection | None = None
     log_jacobian: float = 0.0  # of a recorded phasor's logarithm to the one that is read
+    lead: float = 0.0  # rad, by which the phases that were misread lead the velocity's
 
 
 _ACCELERATION: Kind = "acceleration_as_velocity"
 _DISPLACEMENT: Kind = "displacement_as_velocity"
 _PHASE: Kind = "conjugated_response"
 _UNIT: Kind = "degrees_for_radians"
+_BASE: Kind = "motion_of_base"
+
+
+def _in_radians(lead: float) -> Meaning:
+    """Phases in radians that were read as degrees, of a motion that leads the velocity so."""
+
+    def turned(v: Phasors, _: Float[np.ndarray, " state"]) -> Phasors:
+        stated = np.angle(v * np.exp(1j * lead))
+        return np.abs(v) * np.exp(1j * (_DEGREES * stated - lead))
+
+    correction = ImportCorrection(phase_unit="rad")
+    size = float(np.log(_DEGREES))
+    return Meaning("radians_as_degrees", turned, _UNIT, correction, size, lead)
+
+
 AS_RECORDED = Meaning("as_recorded", lambda v, _: v, None)
 OPPOSITE = Meaning("opposite", lambda v, _: -v, "shape_not_mass_normalised")
 CONJUGATED = Meaning("conjugated", lambda v, _: v.conj(), _PHASE, ImportCorrection(conjugate=True))
@@ -50,11 +66,8 @@ OTHERS = (
         _DISPLACEMENT,
         ImportCorrection(quantity="displacement"),
     ),
-    Meaning(
-        "radians_as_degrees",
-        lambda v, _: np.abs(v) * np.exp(1j * _DEGREES * np.angle(v)),
-        *(_UNIT, ImportCorrection(phase_unit="rad"), float(np.log(_DEGREES))),
-    ),
+    # The table states phases of velocities, but a laboratory those of what was recorded.
+    *(_in_radians(lead) for lead in (0.0, 0.5 * np.pi, -0.5 * np.pi)),
 )
 OF_SIZES = (
     Meaning("sizes_of_acceleration", lambda v, w: v / w, _ACCELERATION),
@@ -118,7 +131,7 @@ def best_reading(seen: CheckedStates, known_mass: bool) -> tuple[Reading, Readin
         return recorded, sized
     # Conjugates of a held response pass for curves as steep as their noise asks for.
     well = recorded.judged.damped and recorded.judged.misfit < enough
-    others = (CONJUGATED,) if well else OTHERS
+    others = (*((CONJUGATED,) if well else OTHERS), *_of_base(seen))
     meant = [
         (other, seen.read(other.change(seen.recorded, seen.test.frequency))) for other in others
     ]
@@ -132,9 +145,20 @@ def best_reading(seen: CheckedStates, known_mass: bool) -> tuple[Reading, Readin
         tried += _in_degrees(seen, known_mass)
     damped = [one for one in tried if one.judged.damped]
     best = max(damped, key=lambda one: one.evidence, default=recorded)
-    if not best.judged.beats(recorded.judged):
+    # The motion of a base is of known size: nothing else that lies beside the mode has it.
+    if not best.judged.beats(recorded.judged, beside=best.meaning.kind != _BASE):
         return recorded, recorded
     return recorded, _rescaled(best, SCATTER)
+
+
+def _of_base(seen: CheckedStates) -> tuple[Meaning, ...]:
+    """The motion of the base where the model says the other thing of it than the sensors record."""
+    if seen.own is None:
+        return ()
+    own, is_in = seen.own
+    name = "base_left_in" if is_in else "base_taken_away_twice"
+    sign = -1.0 if is_in else 1.0
+    return (Meaning(name, lambda v, _: v + sign * own, _BASE),)
 
 
 def _rescaled(one: Reading, enough: float) -> Reading:
@@ -146,7 +170,8 @@ def _rescaled(one: Reading, enough: float) -> Reading:
 
 def _possible(seen: CheckedStates, meaning: Meaning, states: TestStates) -> bool:
     """Whether the force works on the motion in most states, and phases are less than a turn."""
-    turned = np.max(np.abs(np.angle(seen.recorded))) * np.exp(meaning.log_jacobian)
+    stated = np.angle(seen.recorded * np.exp(1j * meaning.lead))
+    turned = np.max(np.abs(stated)) * np.exp(meaning.log_jacobian)
     whole = meaning.log_jacobian == 0 or turned <= np.pi
     return bool(whole and np.median(states.velocity.real) > 0)
 

@@ -16,6 +16,8 @@ _RESPONSES = {
     "displacement": "displacements (m)",
     "radians_as_degrees": "phases in radians that were read as degrees",
     "degrees_as_radians": "phases in degrees that were read as radians",
+    "base_left_in": "absolute: the motion of the base was not taken away",
+    "base_taken_away_twice": "relative to the base already: its motion was taken away once more",
     "sizes_of_acceleration": "amplitudes of accelerations (m/s²) with the phases of velocities",
     "sizes_of_displacement": "amplitudes of displacements (m) with the phases of velocities",
 }
@@ -28,6 +30,8 @@ _ADVICE_ON_RESPONSES = {
     "displacement": "multiply by iΩ: import again as displacements.",
     "radians_as_degrees": "import again with phases in radians.",
     "degrees_as_radians": "import again with phases in degrees.",
+    "base_left_in": 'say `motion = "absolute"` in the [base] of the model.',
+    "base_taken_away_twice": 'say `motion = "relative"` in the [base] of the model.',
     "sizes_of_acceleration": "divide the amplitudes by Ω = 2πf, not the phases, in the "
     "laboratory's file.",
     "sizes_of_displacement": "multiply the amplitudes by Ω = 2πf, not the phases, in the "
