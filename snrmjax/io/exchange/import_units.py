@@ -17,7 +17,6 @@ AMPLITUDE_FACTORS = {"peak": 1.0, "": 1.0, "rms": np.sqrt(2.0), "peak_to_peak": 
 """What makes peak amplitudes of peak, rms and peak-to-peak ones."""
 
 _HERTZ = 2 * np.pi
-_LOADS = ("force", "displacement", "velocity", "acceleration")
 
 
 class Force(NamedTuple):
@@ -27,6 +26,11 @@ class Force(NamedTuple):
     is_voltage: bool
     unit: str
     motion: Quantity | None = None  # of a base, in the place of a force
+
+    @property
+    def dimension(self) -> str:
+        """What it is: a force, a voltage, or which motion."""
+        return self.motion or ("voltage" if self.is_voltage else "force")
 
     def acceleration(
         self, omega: Float[np.ndarray, " row"]
@@ -103,11 +107,13 @@ def motion_meaning(
     file_unit: str,
     channel: str,
     *,
-    is_ratio: bool = False,
+    over: Force | None = None,
     option: str = "--response",
 ) -> tuple[Quantity, float, str]:
     """Quantity, factor into SI and unit of a response.
 
+    Arguments: `over` is the force (or the base's motion) that the response is divided by: by its
+    numbers as they stand, where the unit does not say "m/s/N" or "g/g".
     Raises `ValueError` with a question where they are not stated or contradict one another.
     """
     stated = unit or file_unit
@@ -117,19 +123,18 @@ def motion_meaning(
         others = ", or --unit for all responses" if option == "--response" else ""
         raise ValueError(f"in which unit is {channel}? State it: {option} {example}{others}.")
     said = _understood_or_none(stated)
-    over = said is not None and said.per_force
-    if over and not is_ratio:
+    is_per_force = said is not None and said.per_force
+    if is_per_force and (over is None or over.is_voltage or over.motion is not None):
         raise ValueError(
             f"{channel} is over a force by its unit {stated}: say so by --over-force, with the "
-            "force's own column or amplitude."
+            "force's own column or amplitude in a unit of force."
         )
-    if is_ratio and not unit and not over and "/" in stated:
-        numerator, _, below = stated.rpartition("/")
-        try:
-            divides_force = unit_meaning(below.strip("() ")).dimension in _LOADS
-        except ValueError:
-            divides_force = False
-        stated = numerator.strip("() ") if divides_force else stated
+    below = 1.0 if over is None or is_per_force else over.factor
+    if over is not None and not is_per_force and "/" in stated:
+        numerator, _, divisor = (part.strip("() ") for part in stated.rpartition("/"))
+        under = _understood_or_none(divisor)
+        if under is not None and under.dimension == over.dimension:
+            stated, below = numerator, under.factor
     meaning = _understood(stated, "--unit")
     if meaning.per_volt:
         raise ValueError(
@@ -147,7 +152,7 @@ def motion_meaning(
             f"{channel} is called {quantity} ({option}), but its unit {stated} is of "
             f"{meaning.dimension}: which of both is right?"
         )
-    return meaning.quantity, meaning.factor, stated
+    return meaning.quantity, meaning.factor / below, stated
 
 
 def amplitude_factor(mapping: ImportMap, units: Mapping[str, str], assumed: Assumptions) -> float:

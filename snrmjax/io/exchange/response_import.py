@@ -16,7 +16,7 @@ from snrmjax.io.exchange.import_units import (
 )
 from snrmjax.io.exchange.table_import import import_table
 from snrmjax.io.laboratory.contents import NumberTable
-from snrmjax.measure.recordings.channels import Channel
+from snrmjax.measure.recordings.channels import SI_UNIT, Channel
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
 from snrmjax.numerics.facts import Fact
 
@@ -118,7 +118,7 @@ class _Sets(NamedTuple):
         """What the responses are over, and whether the file says in which unit."""
         mapping, file = self.mapping, self.file
         if mapping.base:
-            base = load_meaning(mapping, "", "the base")
+            base, known = load_meaning(mapping, "", "the base"), False
             for each, reference in zip(self.sets, self.references(), strict=True):
                 channel = each.references[reference]
                 if channel.quantity not in ("unknown", base.motion):
@@ -126,7 +126,8 @@ class _Sets(NamedTuple):
                         f"--base says {base.motion}, but the responses of {file} are over "
                         f"{channel.name}, of {channel.quantity}: which of both is right?"
                     )
-            return base, True
+                known = known or channel.quantity != "unknown"
+            return base, known
         pairs = zip(self.sets, self.references(), strict=True)
         for channel in [each.references[reference] for each, reference in pairs]:
             if mapping.force_unit and channel.si_unit not in ("", mapping.force_unit):
@@ -186,10 +187,13 @@ def import_responses(
         assumed.add("force_amplitude", Fact("spectra_of_one_reference"))
     else:
         force, is_stated = source.force_behind()
-        columns[_FORCE] = np.repeat(source.amplitudes(), sizes)
-        units[_FORCE] = "V" if force.is_voltage else force.unit if mapping.base else "N"
-        if mapping.base:
-            as_table = as_table._replace(base=f"{_FORCE}:{force.motion}:{force.unit}")
+        amplitudes = np.repeat(source.amplitudes(), sizes)
+        if is_stated and force.motion is not None:  # the responses are over SI
+            columns[_FORCE], units[_FORCE] = amplitudes * force.factor, SI_UNIT[force.motion]
+        else:
+            columns[_FORCE], units[_FORCE] = amplitudes, force.unit
+        if force.motion is not None:
+            as_table = as_table._replace(base=f"{_FORCE}:{force.motion}:{units[_FORCE]}")
         as_table = as_table._replace(
             force="" if mapping.base else _FORCE,
             force_unit="",
@@ -206,7 +210,7 @@ def import_responses(
     del assumed["frequency_unit"]
     if not source.has_force:
         assumed.pop("force_unit", None)
-        if not (is_stated or mapping.force_unit):
+        if not (is_stated or mapping.force_unit or mapping.base):
             assumed.add("force_unit", Fact("reference_without_unit"), "N")
     if not mapping.level:
         assumed.add("level", Fact("level_a_set"))

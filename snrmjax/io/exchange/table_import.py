@@ -115,7 +115,7 @@ def import_table(
     velocity, responses, errors = [], [], []
     for k, response in enumerate(mapping.responses):
         response = _with_errors_by_name(source, response, k + 1)
-        row, filled, scale = _response(source, response, omega, k + 1)
+        row, filled, scale = _response(source, response, force, omega, k + 1)
         velocity.append(row * turn)
         responses.append(filled)
         errors.append(_errors(source, filled, np.abs(scale * turn)))
@@ -194,7 +194,11 @@ def _by_name(source: _Source) -> tuple[Complex[np.ndarray, " row"], Force]:
 
 
 def _response(
-    source: _Source, response: ResponseMap, omega: Float[np.ndarray, " row"], number: int
+    source: _Source,
+    response: ResponseMap,
+    force: Force,
+    omega: Float[np.ndarray, " row"],
+    number: int,
 ) -> tuple[Complex[np.ndarray, " row"], ResponseMap, Complex[np.ndarray, " row"]]:
     """The velocity phasors of one response (over the force where the table has it so).
 
@@ -203,7 +207,11 @@ def _response(
     mapping, file, assumed, name = source.mapping, source.file, source.assumed, response.channel
     values = source.column(name, "--response")
     quantity, factor, unit = motion_meaning(
-        response.quantity, response.unit, source.unit(name), name, is_ratio=mapping.over_force
+        response.quantity,
+        response.unit,
+        source.unit(name),
+        name,
+        over=force if mapping.over_force else None,
     )
     assumed.unit(f"response {number}.unit", response.unit, source.unit(name))
     if not response.quantity:

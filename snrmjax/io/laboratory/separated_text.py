@@ -211,6 +211,8 @@ def _header(
                 f"--header-row {at + 1} of {file} has {count} names, but the rows of numbers below "
                 f"have {width} columns."
             )
+        if not re.search(r"[^\W\d]", "".join(rows[at]).lower().replace("e", "")):
+            raise ValueError(f"--header-row {at + 1} of {file} holds numbers, not names.")
         names, below = rows[at], [rows[k] for k in rows if k > at]
     else:
         filled = {k: sum(bool(field) for field in row) for k, row in rows.items()}

@@ -89,6 +89,33 @@ def folder(tmp_path_factory):
         ("frf.uff " + OVER + " --force-amplitude 1 --force-amplitude 1", "3 are stated"),
         ("frf.uff --force-amplitude -1 --response a:velocity:m/s", "must be a positive number"),
         ("frf.uff --force-amplitude z --response a:velocity:m/s", "needs positive values"),
+        ("t.csv " + TOLD + " --header-row 2", "row 2 of t.csv holds numbers"),
+        ("t.csv " + TOLD + " --record steps", "--record has no effect on a table"),
+        ("t.csv " + TOLD + " --dataset b", "names 'b', but t.csv has t"),
+        ("t.csv " + TOLD + " --force-amplitude 2", "--force-amplitude has no effect beside"),
+        ("t.csv " + TOLD + " --base v:velocity:m/s", "--force has no effect beside --base"),
+        ("t.csv " + TOLD + " --force-phase ph --over-force", "--force-phase has no effect beside"),
+        ("t.csv " + TOLD + " --imaginary ph --phase-unit deg", "--phase-unit has no effect"),
+        ("t.csv " + TOLD + " --imaginary ph --phase ph", "--phase ph has no effect"),
+        (
+            "t.csv --force v --force-unit N --response v:velocity:m/s",
+            "one column is one of the two",
+        ),
+        (
+            "t.csv --force-amplitude 2 --force-unit banana --response v:velocity:m/s",
+            "not understood",
+        ),
+        ("t.csv --force-amplitude 2 --force-unit g --response v:velocity:m/s", "--base the motion"),
+        ("t.csv --force-amplitude name --response v:velocity:m/s", "must state one amplitude"),
+        ("t.csv --base F --response v:velocity:m/s", "--base must say which motion"),
+        ("t.csv --base -1:acceleration:g --response v:velocity:m/s", "--base must be above zero"),
+        ("t.csv --base F:acceleration --response v:velocity:m/s", "--base F:acceleration:m/s"),
+        ("record.mat --base a:acceleration:g --response a:velocity:m/s", "as what drives the"),
+        ("record.mat --base 1:acceleration:g --response b:velocity:m/s", "must name the channel"),
+        (
+            "record.mat " + TOLD.replace("F", "a").replace("v:", "b:") + " --decimal comma",
+            "how it is",
+        ),
     ],
 )
 def test_what_is_wrong_or_unclear_is_asked_for(tmp_path, folder, words, question, monkeypatch):
