@@ -3,21 +3,25 @@
 Run: python benchmarks/hostile_files.py [--runs 20000] [--seed 0] [--only KIND]
 
 Valid files of every format (UFF 58, 58b and 55, MATLAB v4, v5 and v7.3, HDF5, netCDF, TDMS, CSV in
-two dialects) are mutated: cut, bits flipped, counts made huge, runs overwritten, NaN put in, parts
-doubled, text for binary, two formats spliced, gzip and zip around them, one in another. Each is
+two dialects, a LabVIEW measurement file, runs side by side, a vibrometer's export) are mutated:
+cut, bits flipped, counts made huge, runs overwritten, NaN put in, parts doubled, text for binary,
+two formats spliced, gzip and zip around them, one in another. Each is
 listed, and what it holds is read and imported, in a child process whose address space may grow by
 1 GiB, with ten seconds a file; the peak of resident memory above that after the imports is
-measured file by file (Linux). Good is: data, or a `ValueError` of one sentence. Everything else is
-bad and is kept beside the temporary folder for a look.
+measured file by file (Linux). Good is: data, or a `ValueError` of one sentence; of a text every
+number that was read must stand in it. Everything else is bad and is kept beside the temporary
+folder for a look.
 
 One JSON line: files, outcomes by kind, worst memory in MB, worst time in s, and the bad ones.
 """
 
 import collections
+import contextlib
 import gzip
 import io
 import multiprocessing
 import os
+import re
 import resource
 import signal
 import tempfile
@@ -103,7 +107,68 @@ def valid_files(folder):
     (folder / "a.csv").write_text("\n".join(["f (Hz),F (N),v (mm/s),phase (deg)", *lines]))
     dialect = [line.replace(",", ";").replace(".", ",") for line in lines]
     (folder / "b.txt").write_text("\n".join(["Titel", "f;F;v;phase", "Hz;N;g;°", *dialect]))
+    write_texts(folder, rng, hertz)
     return {one.name: one.read_bytes() for one in sorted(folder.iterdir())}
+
+
+def write_texts(folder, rng, hertz):
+    """Texts that describe themselves, and channels that start apart."""
+    from nptdms import ChannelObject, TdmsWriter
+
+    def comma(*fields, by="\t"):
+        return by.join(str(field).replace(".", ",") for field in fields)
+
+    numbers = rng.normal(size=(90, 2)).round(6)
+    head = ["LabVIEW Measurement\t", "Writer_Version\t2", "Separator\tTab", "Decimal_Separator\t,"]
+    head += ["X_Columns\tNo", "Time_Pref\tRelative", "***End_of_Header***\t"]
+    part = ["", "Channels\t2", "Samples\t90\t90", "Date\t2026/01/05\t2026/01/05"]
+    part += ["Y_Unit_Label\tNewtons\tm/s^2", "X_Dimension\tTime\tTime", "X0\t0,0\t0,0"]
+    part += ["Delta_X\t1,0E-3\t1,0E-3", "***End_of_Header***\t\t", "X_Value\tF\ta\tComment"]
+    part += [comma("", *row) for row in numbers.tolist()]
+    (folder / "c.lvm").write_text("\n".join([*head, *part, *part]))
+    names = comma("X-Data [Hz]", *["Vib [m/s]", "Phase [Deg]"] * 2)
+    labels = comma("", "002: [01-05-26 09:28]", "", "003: [01-05-26 09:35]", "")
+    four = rng.normal(size=(40, 4)).round(6)
+    rows = [comma(f, *row) for f, row in zip(hertz.round(4).tolist(), four.tolist(), strict=True)]
+    (folder / "d.txt").write_text("\r\n".join([names + "\t", labels + "\t", *rows]))
+    rows = [f"{k / 1000:.3f}\t{value!r}" for k, value in enumerate(numbers[:, 0].tolist())]
+    head = ["Point Index:\t1", "Signal:\tTime - Vib Velocity - Samples", "", "Time\tTime Signal"]
+    (folder / "e.txt").write_text("\n".join([*head, "[ s ]\t[ m/s ]", *rows]))
+    start = np.datetime64("2026-01-05T10:00:00.000000")
+    with TdmsWriter(folder / "f.tdms") as writer:
+        for k in range(2):
+            wave = {"wf_increment": 1e-3, "unit_string": "N"}
+            wave |= {"wf_start_time": start + np.timedelta64(5000 * k, "us")}
+            writer.write_segment([ChannelObject("g", f"CH{k}", rng.normal(size=300), wave)])
+
+
+def invented(path, held):
+    """A number that a text does not have, or nothing: each that was read must stand there."""
+    if path.suffix not in (".lvm", ".txt", ".csv"):
+        return ""
+    text = path.read_bytes().decode("cp1252", errors="replace")
+    fields = re.split(r"[\t;\s\"]+", text) + re.split(r"[\t;,\s\"]+", text)
+    there = {0.0}
+    for field in fields:
+        for word in (field, field.replace(",", ".")):
+            with contextlib.suppress(ValueError):
+                there.add(float(word.lower().replace("d", "e")))
+    columns = {
+        name: values
+        for table in held.tables
+        for name, values in table.columns.items()
+        if name not in ("run", "time", "frequency")
+    }
+    columns |= {
+        channel.name: record.samples.read([k], 0, record.n_samples)[0]
+        for record in held.recordings
+        for k, channel in enumerate(record.channels)
+    }
+    for name, values in columns.items():
+        for value in np.asarray(values).tolist():
+            if value == value and value not in there:
+                return f"{name} has {value!r}, which the file does not"
+    return ""
 
 
 def mutated(files, name, rng):
@@ -186,6 +251,8 @@ def digest(path):
     outcome = "data"
     listed_contents(held)
     proposed_commands([path], [held])
+    if other := invented(path, held):
+        return f"BAD number: {other}"
     for record in held.recordings:
         try:
             record.values(stop=min(record.n_samples, 2**16))

@@ -64,7 +64,7 @@ _KNOWN: tuple[tuple[str, Decimal, _Powers], ...] = (
     ("Hz hertz", Decimal(1), _DIMENSIONS["frequency"]),
     ("rpm", Decimal(_PI) / 30, (0, 0, -1, 0, 1)),
     ("rad radian", Decimal(1), _DIMENSIONS["angle"]),
-    ("deg degree", Decimal(_PI) / 180, _DIMENSIONS["angle"]),
+    ("deg degree Grad", Decimal(_PI) / 180, _DIMENSIONS["angle"]),
     ("Pa pascal", Decimal(1), (-1, 1, -2, 0, 0)),
     ("1", Decimal(1), (0, 0, 0, 0, 0)),
 )
@@ -233,6 +233,9 @@ def _unit(name: str) -> tuple[Decimal, _Powers]:
             if rest != word and rest in _UNITS and rest not in _ALONE:
                 size, powers = _GRAM if rest == "g" else _UNITS[rest]
                 return size.scaleb(power), powers
+    alike = {_UNITS[known] for known in _UNITS if len(known) > 1 and known.lower() == name.lower()}
+    if len(alike) == 1:  # "Deg", "HZ": in another case
+        return alike.pop()
     base = _registry().Quantity(Decimal(1), _registry().parse_units(name)).to_base_units()
     of = {str(key).strip("[]"): int(power) for key, power in base.dimensionality.items()}
     length, mass, time, current = (of.pop(key, 0) for key in ("length", "mass", "time", "current"))

@@ -258,7 +258,8 @@ def _runs_side_by_side(
     names, written, labels = header.names, header.written, header.labels
     if not header.is_found or any(isinstance(column, list) for column in columns.values()):
         return None
-    for shared in (0, 1):
+    # Columns of a frequency and of a control channel may be those of all runs.
+    for shared in range(len(names) - 1):
         groups = _repeated(written[shared:], 1 if labels and shared else 2)
         if groups > 1:
             break

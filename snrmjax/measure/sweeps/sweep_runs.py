@@ -30,6 +30,8 @@ def track_speed(track: ToneTrack, phase: np.ndarray) -> Float[np.ndarray, " fram
 
 def sweep_runs(track: ToneTrack, phase: np.ndarray) -> list[slice]:
     """Stretches of frames in which the frequency moves in one direction."""
+    if len(track.middle) < _FEWEST_FRAMES:
+        return []
     level = np.log(np.maximum(track_speed(track, phase), np.finfo(float).tiny))
     gaps = np.flatnonzero(
         np.diff(track.middle) > _GAP * np.maximum(track.length[1:], track.length[:-1])
