@@ -165,6 +165,9 @@ def invented(path, held):
         for k, channel in enumerate(record.channels)
     }
     for name, values in columns.items():
+        steps = np.diff(np.asarray(values))
+        if len(steps) and np.allclose(steps, steps[0], rtol=1e-6):
+            continue  # an abscissa that a step states
         for value in np.asarray(values).tolist():
             if value == value and value not in there:
                 return f"{name} has {value!r}, which the file does not"

@@ -57,8 +57,8 @@ def refuse_unused(
     ):
         if first in stated and second in stated:
             refuse(second, f"beside --{first}")
-    if "force_phase" in stated and not mapping.force:
-        refuse("force_phase", "without --force")
+    if "force_phase" in stated and not mapping.load:
+        refuse("force_phase", "without the column of a force or a base")
     if "force_phase" in stated and mapping.over_force:
         refuse("force_phase", "beside --over-force: phases are then relative to the force")
     if (

@@ -81,7 +81,8 @@ def read_labview_text(path: Path) -> LaboratoryFile:
             known = loose.get(axis)
             if isinstance(known, Numbers) and not np.array_equal(known.vector(axis), x):
                 axis = f"{axis} of {column.name}"
-            loose[axis] = held(x, {"unit": "s" if is_time else "Hz"})
+            unit = "s" if is_time else "Hz" if axis.startswith("frequency") else ""
+            loose[axis] = held(x, {"unit": unit} if unit else {})
             loose[column.name] = held(column.values, {"unit": column.unit} if column.unit else {})
         for shared in shared_axes({columns[n].name: axis for n, axis in waves.items()}):
             recordings.append(_recording(name, columns, shared))

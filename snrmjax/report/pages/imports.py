@@ -29,4 +29,10 @@ def headline(found: Imported) -> list[str]:
             f"{data.n_states} steady states on {levels} levels, {hertz.min():.5g} to "
             f"{hertz.max():.5g} Hz, of {', '.join(data.sensors)}"
         )
+        if data.base is not None:
+            lines.append(
+                "a base moves the structure, and velocities are as recorded: `--base absolute` of "
+                "modes and test (or relative), or [base] in a model, says whether the base's "
+                "motion is in them"
+            )
     return lines
