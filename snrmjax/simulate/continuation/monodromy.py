@@ -50,7 +50,7 @@ def monodromy(
         # Their slip cannot be followed between samples here.
         unknown = (frequency.shape[0], 2 * model.n_modes, 2 * model.n_modes)
         return jnp.full(unknown, jnp.nan)
-    if not all(map(_is_spring, model.forces)) or model.modes.damping_coupling is not None:
+    if not all(map(_is_spring, model.forces)):
         return _by_magnus(model, coefficients, frequency, steps_per_cycle)
     return _by_kicks(model, coefficients, frequency, steps_per_cycle)
 
@@ -67,11 +67,12 @@ def _by_kicks(
 ) -> Float[Array, "point state state"]:
     """The map of springs and potential: oscillators that a varying stiffness kicks equally often.
 
-    Between kicks every mode moves by itself with its own damping and mean tangent stiffness,
-    which is exact; the kicks hold what varies and what couples, K(t). With K − h²K²/12 in place of
-    K the map is that of a fourth-order method but for a change of coordinates, which its
-    eigenvalues do not see. Points lie along the last axis, so that one instruction works on
-    several.
+    Between kicks every mode moves by itself with its own damping and mean tangent stiffness, or
+    all together where the damping couples them, which is exact; the kicks hold what else varies and
+    couples, K(t). With K − h²K²/12 in place of K the map is that of a fourth-order method but for a
+    change of coordinates, which its eigenvalues do not see: [B, [A, B]] of the flow A and the kicks
+    B holds K² alone, whatever the damping. Points lie along the last axis, so that one instruction
+    works on several.
     Reference: Takahashi & Imada, J. Phys. Soc. Jpn. 53 (1984) 3765, doi:10.1143/JPSJ.53.3765;
     López-Marcos, Sanz-Serna & Skeel, SIAM J. Sci. Comput. 18 (1997) 223,
     doi:10.1137/S1064827595288085.
@@ -97,25 +98,39 @@ def _by_kicks(
         return jnp.moveaxis(tangent.reshape(n, n, len(tau), n_points), 2, 0) / per_mass
 
     varying = stiffness(2 * jnp.pi * jnp.arange(48) / 48)
-    mean = jnp.mean(varying, axis=0)[modes, modes]
+    coupled = model.modes.damping_coupling is not None
+    mean = jnp.mean(varying, axis=0)
     linear = terms.stiffness[:, None] / per_mass[:, 0]
     rate = jnp.max(jnp.sum(jnp.abs(varying.at[:, modes, modes].add(linear)), axis=2))
-    kicks = jnp.maximum(_KICKS * steps_per_cycle * jnp.nan_to_num(jnp.sqrt(rate)), _LEAST_KICKS)
+    cycles = jnp.nan_to_num(jnp.sqrt(rate))
+    if coupled:
+        damping = terms.damping_matrix()[:, :, None] / (terms.mass[:, None, None] * frequency)
+        cycles = jnp.maximum(cycles, 0.5 * jnp.max(jnp.sum(jnp.abs(damping), axis=1)))
+    kicks = jnp.maximum(_KICKS * steps_per_cycle * cycles, _LEAST_KICKS)
     n_segments, step = _segments(kicks, _KICKS * _MOST_SEGMENTS)
     speed = jnp.max(terms.stiffness / terms.mass) ** 0.5 / frequency  # of δq̇, over Ω
-    damping = terms.damping[:, None] / (terms.mass[:, None] * frequency)
-    stay, go, back, last = (
-        part[:, None] for part in _oscillation(linear + mean, damping, step, speed)
-    )
+    if coupled:
+        flow = _flow(mean.at[modes, modes].add(linear), damping, step, speed)
+    else:
+        mean = mean * np.eye(n)[:, :, None]
+        damping = terms.damping[:, None] / (terms.mass[:, None] * frequency)
+        stay, go, back, last = (
+            part[:, None]
+            for part in _oscillation(linear + mean[modes, modes], damping, step, speed)
+        )
 
     def kick(state: tuple, stiffness: Array) -> tuple[tuple, None]:
         q, v = state
-        q, v = stay * q + go * v, back * q + last * v
+        if coupled:
+            moved = sum(flow[:, j, None] * part for j, part in enumerate([*q, *v]))
+            q, v = moved[:n], moved[n:]
+        else:
+            q, v = stay * q + go * v, back * q + last * v
         return (q, v - sum(stiffness[:, j, None] * q[j] for j in range(n))), None
 
     def segment(number: Array, state: tuple) -> tuple:
         tau = (number * _SEGMENT + jnp.arange(_SEGMENT) + 0.5) * step
-        k = stiffness(tau).at[:, modes, modes].add(-mean)
+        k = stiffness(tau) - mean
         square = sum(k[:, :, j, None] * k[:, None, j] for j in range(n))
         return jax.lax.scan(kick, state, (k - step**2 / 12 * square) * (step / speed))[0]
 
@@ -142,6 +157,20 @@ def _oscillation(stiffness: Array, damping: Array, step: Array, speed: Array) ->
     left = jnp.exp(-0.5 * damping * step)
     stay, last = even + 0.5 * damping * odd, even - 0.5 * damping * odd
     return left * stay, left * odd * speed, -left * stiffness * odd / speed, left * last
+
+
+def _flow(
+    stiffness: Float[Array, "mode mode point"],
+    damping: Float[Array, "mode mode point"],
+    step: Array,
+    speed: Float[Array, " point"],
+) -> Float[Array, "state state point"]:
+    """The map of (q, q̇/speed) over a step: y″ + damping y′ + stiffness y = 0 of coupled modes."""
+    go = jnp.eye(len(stiffness))[:, :, None] * speed
+    above = jnp.concatenate([jnp.zeros_like(stiffness), go], axis=1)
+    below = jnp.concatenate([-stiffness / speed, -damping], axis=1)
+    generator = jnp.concatenate([above, below])
+    return jnp.moveaxis(_exponential(jnp.moveaxis(generator * step, 2, 0)), 0, 2)
 
 
 def _by_magnus(

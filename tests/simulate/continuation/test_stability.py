@@ -8,8 +8,10 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.special import mathieu_a, mathieu_b
 
+from snrmjax.model.builders.matrices import chain, from_matrices
 from snrmjax.model.effects import make_effect
 from snrmjax.model.modes import linear_modes
+from snrmjax.model.places import between
 from snrmjax.model.potential import polynomial_potential
 from snrmjax.model.structures import structure
 from snrmjax.simulate.continuation.stability import (
@@ -167,6 +169,42 @@ def test_both_methods_give_the_same_multipliers(distance_between):
     assert np.abs(found).max() > 1.05  # one of them is unstable
     for one, two in zip(found, other, strict=True):
         assert distance_between(one, two) < 1e-6 * max(np.abs(one).max(), 1.0)
+
+
+@pytest.mark.parametrize("heaviest", [0.2, 30.0], ids=["light", "overdamped"])
+def test_multipliers_with_coupled_damping_are_those_of_the_integrated_equations(
+    heaviest, distance_between
+):
+    """Three masses with cubic springs; a damper that swings all modes, or stops one of them."""
+    mass, damping, stiffness, names = chain(
+        [1.0, 2.0, 0.5], [1.0, 2.0, 1.0, 0.0], [0.02, 0.0, heaviest, 0.0]
+    )
+    springs = [
+        make_effect("cubic_stiffness", {"coefficient": 0.8}, at="x1"),
+        make_effect("cubic_stiffness", {"coefficient": 0.5}, at=between("x3", "x2")),
+    ]
+    model = from_matrices(mass, damping, stiffness, names, force="x1", effects=springs)
+    assert model.modes.damping_coupling is not None
+    x = np.zeros((5, 3))  # of the points: mean, first and third harmonic
+    x[0], x[1], x[2], x[3] = [0.1, 0.0, 0.2], [1.5, 0.4, -0.3], [0.2, -0.5, 0.1], [0.1, 0.2, 0.0]
+    omega, shapes = 0.9, np.asarray(model.modes.mode_shape)
+    modal = np.linalg.solve(shapes, x.T).T
+    found = floquet_multipliers(model, modal[None], np.array([omega]))[0]
+
+    def rate(t, y):
+        waves = [1.0, *(f(k * omega * t) for k in (1, 2) for f in (np.cos, np.sin))]
+        one, _, three = waves @ x
+        apart = three - (waves @ x)[1]
+        relative = np.array([0.0, -1.0, 1.0])
+        tangent = stiffness + 2.4 * one**2 * np.diag([1.0, 0.0, 0.0])
+        tangent = tangent + 1.5 * apart**2 * np.outer(relative, relative)
+        q, v = np.split(y.reshape(6, 6), 2)
+        return np.concatenate([v, np.linalg.solve(mass, -tangent @ q - damping @ v)]).ravel()
+
+    period = (0.0, 2 * np.pi / omega)
+    ways = {"method": "Radau" if heaviest > 1 else "DOP853", "rtol": 1e-10, "atol": 1e-12}
+    map_ = solve_ivp(rate, period, np.eye(6).ravel(), **ways).y[:, -1].reshape(6, 6)
+    assert distance_between(found, np.linalg.eigvals(map_)) < 1e-6
 
 
 # ------------------------------------------------------------------- against maps of the motion
