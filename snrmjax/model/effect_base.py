@@ -198,8 +198,11 @@ class AbstractKinked(AbstractMemoryless):
     """A memoryless force whose slope jumps where a contact opens or closes.
 
     Harmonic balance evaluates a cycle at samples, of which a contact that opens between two of them
-    would make jumps; `cycle_force` therefore finds these times (see `with_kinks`).
+    would make jumps; `cycle_force` therefore finds these times (see `with_kinks`). A class whose
+    force is a straight line between kinks may say so by `is_straight`.
     """
+
+    is_straight: ClassVar[bool] = False
 
     @abstractmethod
     def kinks(self) -> Kinks:

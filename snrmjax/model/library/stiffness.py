@@ -99,6 +99,7 @@ class BilinearStiffness(AbstractKinked):
     """
 
     kind: ClassVar[str] = "bilinear_stiffness"
+    is_straight: ClassVar[bool] = True
     description: ClassVar[str] = (
         "A spring with one stiffness for each direction, as a crack or a contact that opens and "
         "closes makes it."
@@ -127,6 +128,7 @@ class GapStiffness(AbstractKinked):
     """
 
     kind: ClassVar[str] = "gap_stiffness"
+    is_straight: ClassVar[bool] = True
     description: ClassVar[str] = (
         "A clearance with contacts on both sides: a further spring that engages where the "
         "displacement exceeds the gap."
@@ -159,6 +161,7 @@ class OneSidedStop(AbstractKinked):
     """
 
     kind: ClassVar[str] = "one_sided_stop"
+    is_straight: ClassVar[bool] = True
     description: ClassVar[str] = (
         "A stop on one side: a further spring that engages where the displacement exceeds the gap."
     )

@@ -100,8 +100,8 @@ def _memory_of(effects: AbstractHysteresis, there: Elements, x: Array, v: Array)
 def friction_along(model: Structure, coefficients: Array, frequency: Array) -> Friction:
     """Friction along the motions.
 
-    The period begins at the largest displacement of the first sliders' place: there every one of
-    them that slips at all is being dragged, so that its position is no state of its own.
+    The period begins at the largest displacement of the first sliders' place: until there every one
+    of them that slips at all is being dragged, so that its position is no state of its own.
     """
     n_points, n = len(frequency), model.n_modes
     sliders = [e for e in model.hysteretic if isinstance(e, AbstractSliders)]
@@ -134,7 +134,9 @@ def friction_along(model: Structure, coefficients: Array, frequency: Array) -> F
     if not sliders:
         none_sliding = places, np.zeros(0, int), *no_sliders
         return Friction(begin, nothing, viscous, memories, *none_sliding)
-    largest = jnp.argmax(scaled(sliders[0])[2], axis=0)
+    first = scaled(sliders[0])[2]
+    largest = jnp.argmax(first, axis=0)
+    turn = jnp.take_along_axis(_turns(first), largest[None], axis=0)[0] * tau[1]
     stiffness, slip, owner, stuck = [], [], [], nothing
     for effect in sliders:
         each, there, x, _ = scaled(effect)
@@ -146,11 +148,19 @@ def friction_along(model: Structure, coefficients: Array, frequency: Array) -> F
         owner += [[e.at for e in distinct].index(effect.at)] * stiffness[-1].shape[1]
         stuck = stuck + there.matrix(jax.vmap(lambda e: e.added_stiffness())(each)[:, None])
     at_first, onsets, ends = (jnp.concatenate(part, axis=1) for part in zip(*slip, strict=True))
+    events = (jnp.moveaxis(part, 2, 0) - turn[:, None] for part in (onsets, ends))
     return Friction(
-        *(tau[largest], stuck, viscous, memories, places, np.array(owner)),
+        *(tau[largest] + turn, stuck, viscous, memories, places, np.array(owner)),
         jnp.concatenate(stiffness, axis=1),
-        Slip(at_first, jnp.moveaxis(onsets, 2, 0), jnp.moveaxis(ends, 2, 0)),
+        Slip(at_first, *events),
     )
+
+
+def _turns(x: Float[Array, "sample *batch"]) -> Float[Array, "sample *batch"]:
+    """Where a parabola through a sample and its neighbours turns, in samples from it."""
+    ahead, behind = jnp.roll(x, -1, axis=0), jnp.roll(x, 1, axis=0)
+    bend = 2 * x - ahead - behind
+    return jnp.clip(0.5 * (ahead - behind) / jnp.where(bend != 0, bend, 1.0), -0.5, 0.5)
 
 
 def _slip_of(x: Array, position: Array, size: Array) -> tuple[Array, Array, Array]:
@@ -161,7 +171,6 @@ def _slip_of(x: Array, position: Array, size: Array) -> tuple[Array, Array, Arra
     """
     n = x.shape[0]
     width = 2 * jnp.pi / n
-    ahead, behind = jnp.roll(x, -1), jnp.roll(x, 1)
     moves = position != jnp.roll(position, -1)
 
     def phases(starts: Array, share: Array) -> Array:
@@ -170,13 +179,11 @@ def _slip_of(x: Array, position: Array, size: Array) -> tuple[Array, Array, Arra
         there = (index + share[jnp.minimum(index, n - 1)]) * width
         return jnp.where(known, there, jnp.inf)
 
-    rise = ahead - x
+    rise = jnp.roll(x, -1) - x
     reach = position + jnp.sign(rise) * size
     onset = jnp.clip((reach - x) / jnp.where(rise != 0, rise, 1.0), 0.0, 1.0)
-    bend = 2 * x - ahead - behind
-    turn = jnp.clip(0.5 * (ahead - behind) / jnp.where(bend != 0, bend, 1.0), -0.5, 0.5)
     before = jnp.roll(moves, 1)
-    return before[0], phases(moves & ~before, onset), phases(before & ~moves, turn)
+    return before[0], phases(moves & ~before, onset), phases(before & ~moves, _turns(x))
 
 
 def viscous_slope(

@@ -15,6 +15,7 @@ from snrmjax.model.effect_base import (
 from snrmjax.model.effect_metadata import Argument
 from snrmjax.model.elements import elements_of
 from snrmjax.model.kinks import crossings
+from snrmjax.model.library.friction import AbstractSliders
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.compiled import compiled
 from snrmjax.simulate.continuation.friction_along import (
@@ -180,21 +181,16 @@ def _by_magnus(
 
     Magnus' method of order 6 with steps that resolve the fastest tangent frequency of all points.
     The propagators of a segment of steps are computed side by side and then applied one after the
-    other.
+    other. A linear structure with sliders and stops has constant coefficients from one contact or
+    slip to the next: these are then the steps, and exact.
     Reference: Blanes, Casas & Ros, BIT 40 (2000) 434, Eq. (3.10), doi:10.1023/A:1022311628317.
     """
     n, n_points = model.n_modes, frequency.shape[0]
     terms = model.linear_terms()
     friction = friction_along(model, coefficients, frequency)
-    phases = 2 * jnp.pi * jnp.arange(48)[:, None] / 48
-    k, c = _tangents(model, friction, coefficients, frequency, phases)
-    hidden = sum((memory.stiffness() for memory in friction.memories), jnp.zeros(()))
-    hidden = hidden / (terms.mass * frequency[:, None] ** 2)[..., None]
-    rate = jnp.sqrt(jnp.max(jnp.sum(jnp.abs(k) + jnp.abs(hidden), axis=-1)))
-    cycles = jnp.nan_to_num(jnp.maximum(rate, 0.5 * jnp.max(jnp.sum(jnp.abs(c), axis=-1))))
-    n_segments, step = _segments(jnp.maximum(steps_per_cycle * cycles, 512), _MOST_SEGMENTS)
+    in_pieces = _is_piecewise_linear(model)
     contacts = _contacts(model, coefficients, frequency, friction)
-    if 0 < friction.owner.size <= _FEW_SLIDERS:
+    if in_pieces or 0 < friction.owner.size <= _FEW_SLIDERS:
         few = [jnp.moveaxis(part, 2, 1) for part in (friction.slip.onsets, friction.slip.ends)]
         contacts = jnp.concatenate([contacts, *(part.reshape(-1, n_points) for part in few)])
     unit = jnp.sqrt(jnp.max(terms.stiffness / terms.mass)) / frequency  # of δq̇, over Ω
@@ -203,15 +199,14 @@ def _by_magnus(
     size = own + n_places
     of_place = np.eye(n_places)[owner]  # (slider, place)
 
-    def generators(start: Array, length: Array, held: Array) -> Array:
-        """The matrices A of y' = A y at the Gauss points of a segment's steps."""
-        tau = start[:, None] + length[:, None] * _GAUSS[:, None]
-        tau = friction.begin + tau.reshape(-1, n_points)
+    def generators(phase: Array, held: Array) -> Array:
+        """The matrices A of y' = A y (time, point, state, state) at phases behind the beginning."""
+        tau = friction.begin + phase
         k, c = _tangents(model, friction, coefficients, frequency, tau)
         a = jnp.zeros((len(tau), n_points, size, size))
         if n_places:
             loose = jnp.where(held, 0.0, friction.stiffness) @ of_place
-            moving = places.matrix(jnp.repeat(loose, 3, axis=0))
+            moving = places.matrix(loose)
             k = k - moving / (terms.mass * frequency[:, None] ** 2)[..., None]
             pulls = jnp.broadcast_to(places.rows.T, (n, n_places)) / terms.mass[:, None]
             a = a.at[:, :, n : 2 * n, own:].set(pulls / (unit * frequency**2)[:, None, None])
@@ -236,26 +231,34 @@ def _by_magnus(
         a = a.at[:, :, modes, n + modes].set(unit[:, None])
         a = a.at[:, :, n : 2 * n, :n].set(-k / unit[:, None, None])
         a = a.at[:, :, n : 2 * n, n : 2 * n].set(-c)
-        return a.reshape(_SEGMENT, 3, n_points, size, size)
+        return a
+
+    def advance(state: tuple, item: tuple) -> tuple[tuple, None]:
+        y, z = state
+        propagator, stuck = item
+        if not n_places:
+            return (propagator @ y, z), None
+        held_by = jnp.where(stuck, friction.stiffness, 0.0)[:, :, None] * z
+        pull = of_place.T @ held_by
+        y = propagator[:, :own, :own] @ y + propagator[:, :own, own:] @ pull
+        return (y, jnp.where(stuck[:, :, None], z, sliding(y))), None
 
     def segment(number: Array, state: tuple) -> tuple:
         ends = _step_ends(number * _SEGMENT + jnp.arange(_SEGMENT + 1), step, contacts)
         held = ~friction.slip.dragged(0.5 * (ends[1:] + ends[:-1]))
         length = ends[1:] - ends[:-1]
-        per_step = generators(ends[:-1], length, held)
-        propagators = _magnus(per_step, length[..., None, None])
+        gauss = (ends[:-1, None] + length[:, None] * _GAUSS[:, None]).reshape(-1, n_points)
+        a = generators(gauss, jnp.repeat(held, 3, axis=0))
+        a = a.reshape(_SEGMENT, 3, n_points, size, size)
+        return jax.lax.scan(advance, state, (_magnus(a, length[..., None, None]), held))[0]
 
-        def advance(state: tuple, item: tuple) -> tuple[tuple, None]:
-            y, z = state
-            propagator, stuck = item
-            if not n_places:
-                return (propagator @ y, z), None
-            held_by = jnp.where(stuck, friction.stiffness, 0.0)[:, :, None] * z
-            pull = of_place.T @ held_by
-            y = propagator[:, :own, :own] @ y + propagator[:, :own, own:] @ pull
-            return (y, jnp.where(stuck[:, :, None], z, sliding(y))), None
-
-        return jax.lax.scan(advance, state, (propagators, held))[0]
+    def piece(number: Array, state: tuple) -> tuple:
+        begin, end = edges[number], edges[number + 1]
+        middle = 0.5 * (begin + end)[None]
+        held = ~friction.slip.dragged(middle)
+        length = (end - begin)[:, None, None]
+        propagator = _long_exponential(generators(middle, held)[0] * length)
+        return advance(state, (propagator, held[0]))[0]
 
     def sliding(y: Array) -> Array:
         """The motion of every slider's place."""
@@ -270,9 +273,31 @@ def _by_magnus(
     if n_places:
         start = sliding(y).at[:, free].set(np.eye(own + free.size)[own:])
         z = jnp.where(slips, start, 0.0)
+    if in_pieces:
+        # Behind the last contact of a motion there are pieces of no length.
+        inside = jnp.where(jnp.isfinite(contacts), jnp.mod(contacts, 2 * jnp.pi), 2 * jnp.pi)
+        edges = jnp.pad(jnp.sort(inside, axis=0), ((1, 0), (0, 0)))
+        edges = jnp.pad(edges, ((0, 1), (0, 0)), constant_values=2 * jnp.pi)
+        n_pieces = 1 + jnp.max(jnp.sum((inside < 2 * jnp.pi), axis=0))
+        y, z = jax.lax.fori_loop(0, n_pieces, piece, (y, z))
+        return jnp.concatenate([y, jnp.where(slips, z, 0.0)[:, free]], axis=1)
+    phases = 2 * jnp.pi * jnp.arange(48)[:, None] / 48
+    k, c = _tangents(model, friction, coefficients, frequency, phases)
+    hidden = sum((memory.stiffness() for memory in friction.memories), jnp.zeros(()))
+    hidden = hidden / (terms.mass * frequency[:, None] ** 2)[..., None]
+    rate = jnp.sqrt(jnp.max(jnp.sum(jnp.abs(k) + jnp.abs(hidden), axis=-1)))
+    cycles = jnp.nan_to_num(jnp.maximum(rate, 0.5 * jnp.max(jnp.sum(jnp.abs(c), axis=-1))))
+    n_segments, step = _segments(jnp.maximum(steps_per_cycle * cycles, 512), _MOST_SEGMENTS)
     y, z = jax.lax.fori_loop(0, n_segments, segment, (y, z))
     whole = jnp.concatenate([y, jnp.where(slips, z, 0.0)[:, free]], axis=1)
     return jnp.where(n_segments > 0, whole, jnp.nan)
+
+
+def _is_piecewise_linear(model: Structure) -> bool:
+    """Whether a structure is linear from one contact or slip to the next."""
+    straight = all(isinstance(e, AbstractKinked) and e.is_straight for e in model.memoryless)
+    sliders = all(isinstance(e, AbstractSliders) for e in model.hysteretic)
+    return straight and sliders and not model.potential.monomials
 
 
 def _contacts(
@@ -346,6 +371,14 @@ def _exponential(matrix: Float[Array, "*batch state state"]) -> Float[Array, "*b
     for _ in range(4):
         result = result @ result
     return result
+
+
+def _long_exponential(matrix: Float[Array, "point state state"]) -> Array:
+    """e^M of any size: that of M/2^k, squared k times."""
+    size = jnp.nan_to_num(jnp.max(jnp.sum(jnp.abs(matrix), axis=-1)), posinf=0.0)
+    doublings = jnp.ceil(jnp.log2(jnp.maximum(size, 1.0))).astype(int)
+    short = _exponential(matrix * 0.5**doublings)
+    return jax.lax.fori_loop(0, doublings, lambda _, found: found @ found, short)
 
 
 def _tangents(
