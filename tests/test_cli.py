@@ -199,6 +199,8 @@ def test_simulate_and_nnm_write_what_the_contract_says(files, tmp_path):
         "velocity_h1_m_s",
         "velocity_peak_m_s",
         "energy_j",
+        "stable",
+        "internal_resonance",
     ]
 
 

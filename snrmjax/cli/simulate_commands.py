@@ -128,7 +128,7 @@ def nnm(
 ) -> None:
     """Follow the undamped nonlinear normal mode of interest from its linear frequency.
 
-    Writes nnm.csv (frequency, velocity, energy) and nnm.png.
+    Writes nnm.csv (frequency, velocity, energy, stability, internal resonances, shape) and nnm.png.
     """
     from snrmjax.io.models import read_model
     from snrmjax.pipelines.simulate import simulate_mode

@@ -114,22 +114,38 @@ def _events(curve: ResponseCurve) -> list[str]:
 def write_normal_mode(
     path: FilePath, branch: NormalModeBranch, *, sensor: str | None = None
 ) -> None:
-    """Write a nonlinear normal mode: frequency, velocity at one sensor, energy.
+    """Write a nonlinear normal mode: frequency, velocity at one sensor, energy, and its shape.
+
+    `stable` is 1 or 0, and empty where it was not computed; `internal_resonance` names the tongue
+    that a point is on. Of several modes their shares of the mean kinetic energy follow, of several
+    sensors their fundamentals, with the sign that they have when the first one's is positive.
 
     Arguments: `sensor` is the name of one, by default the first.
     Raises `ValueError` when there is no such sensor or the file cannot be written.
     """
     r = _place(branch.sensors, sensor)
-    write_table(
-        path,
-        {
-            "point": np.arange(len(branch.frequency)),
-            "frequency_hz": branch.frequency / HERTZ,
-            "velocity_h1_m_s": np.abs(branch.velocity[:, 1, r]),
-            "velocity_peak_m_s": velocity_peaks(branch.velocity[:, :, r]),
-            "energy_j": branch.energy,
-        },
-    )
+    known = branch.stability != int(Stability.NOT_COMPUTED)
+    columns: dict[str, Any] = {
+        "point": np.arange(len(branch.frequency)),
+        "frequency_hz": branch.frequency / HERTZ,
+        "velocity_h1_m_s": np.abs(branch.velocity[:, 1, r]),
+        "velocity_peak_m_s": velocity_peaks(branch.velocity[:, :, r]),
+        "energy_j": branch.energy,
+        "stable": [
+            str(value) if told else ""
+            for value, told in zip(branch.stability.tolist(), known.tolist(), strict=True)
+        ],
+        "internal_resonance": list(branch.resonance),
+    }
+    n_modes = branch.mode_share.shape[1]
+    if n_modes > 1:
+        columns |= {f"energy_share_mode_{k + 1}": branch.mode_share[:, k] for k in range(n_modes)}
+    if len(branch.sensors) > 1:
+        shape = branch.shape()
+        columns |= {
+            f"velocity_h1_{name}_m_s": shape[:, place] for place, name in enumerate(branch.sensors)
+        }
+    write_table(path, columns)
 
 
 def load_named(columns: Mapping[str, Any], unit: str) -> dict[str, Any]:

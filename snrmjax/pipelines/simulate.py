@@ -148,13 +148,25 @@ def simulate_mode(
                 mode=tongue.mode + 1,
                 from_hz=tongue.from_frequency / HERTZ,
                 to_hz=tongue.to_frequency / HERTZ,
+                share=tongue.energy_share,
             )
             for tongue in branch.tongues
         ),
+        *_notes_on_instability(branch),
     ]
     if branch.status not in _ENDS:
         notes.append(Fact("mode_not_followed", status=branch.status))
     return SimulatedMode(branch, _sensor(model), tuple(notes))
+
+
+def _notes_on_instability(branch: NormalModeBranch) -> Iterator[Fact]:
+    """Stretches of a normal mode on which it is unstable."""
+    unstable = np.pad(branch.stability == int(Stability.UNSTABLE), 1).astype(int)
+    edges = np.flatnonzero(np.diff(unstable))
+    for first, stop in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        hertz = branch.frequency[first:stop] / HERTZ
+        ends = {"from_hz": float(hertz.min()), "to_hz": float(hertz.max())}
+        yield Fact("mode_unstable", n=stop - first, **ends)
 
 
 def _sensor(model: Structure) -> str:

@@ -11,6 +11,7 @@ from truths.printed_page import unreadable
 import snrmjax as sj
 from snrmjax.io.units import HERTZ
 from snrmjax.report.figures import simulation as plot
+from snrmjax.report.style import SERIES
 
 
 def named(axes, label):
@@ -54,21 +55,48 @@ def test_simulated_responses_refuse_nothing(virtual):
 def test_normal_mode_against_frequency_and_energy(mode):
     figure = plot.normal_mode_figure(mode)
     speeds, energies = figure.axes
-    fundamental = named(speeds, "fundamental")
+    fundamental, peak = (
+        next(line for line in speeds.lines if line.get_color() == colour and len(line.get_xdata()))
+        for colour in (named(speeds, "fundamental").get_color(), SERIES[5])
+    )
     np.testing.assert_array_equal(fundamental.get_xdata(), mode.frequency / HERTZ)
     np.testing.assert_array_equal(fundamental.get_ydata(), np.abs(mode.velocity[:, 1, 0]))
-    (curve,) = energies.lines
+    (curve,) = (line for line in energies.lines if len(line.get_xdata()))
     np.testing.assert_array_equal(curve.get_xdata(), mode.energy)
     np.testing.assert_array_equal(curve.get_ydata(), mode.frequency / HERTZ)
     assert energies.get_xscale() == "log"
     assert energies.get_xlabel() == "Energy (J)"
     # The second harmonic falls with the amplitude: below 1 % at a fiftieth of the largest one.
-    peak = named(speeds, "peak of the signal").get_ydata()
+    peak = peak.get_ydata()
     small = fundamental.get_ydata() < 0.02 * fundamental.get_ydata().max()
     assert small.any()
     np.testing.assert_allclose(peak[small], fundamental.get_ydata()[small], rtol=0.01)
     with pytest.raises(ValueError, match="the branch has no point"):
         plot.normal_mode_figure(dataclasses.replace(mode, frequency=np.zeros(0)))
+
+
+def test_normal_mode_of_a_pair_shows_shares_shape_and_instability():
+    """One mass hits a cubic spring: the mode leaves it to the other mass, and loses stability."""
+    spring = sj.model.make_effect("cubic_stiffness", {"coefficient": 0.5}, at="x1")
+    matrices = sj.model.chain([1.0, 1.0], [1.0, 1.0, 1.0], [0.01, 0.01, 0.01])
+    model = sj.model.from_matrices(*matrices, force="x1", effects=spring)
+    branch = sj.nonlinear_normal_mode(model, 1.3, harmonic_order=5)
+    figure = branch.plot()
+    _, energies, shares, shapes = figure.axes
+    assert {"mode 1", "mode 2", "at x1", "at x2", "unstable"} <= legend_names(figure)
+    dashed = [line for line in energies.lines if line.get_linestyle() == "--"]
+    drawn = np.concatenate([line.get_ydata() for line in dashed])
+    assert drawn.min() == pytest.approx(branch.frequency[branch.stability == 0].min() / HERTZ)
+    ends = {named(shares, f"mode {k}").get_color(): [] for k in (1, 2)}
+    for line in shares.lines:
+        if len(line.get_xdata()):
+            ends[line.get_color()].append(line.get_ydata()[-1])
+    np.testing.assert_allclose(sum(np.array(v) for v in ends.values()), 100.0, rtol=1e-12)
+    over = [line.get_ydata()[-1] for line in shapes.lines if len(line.get_xdata())]
+    assert over[-1] == pytest.approx(
+        branch.velocity[-1, 1, 1].imag / branch.velocity[-1, 1, 0].imag
+    )
+    assert unreadable(figure) == []
 
 
 def test_events_are_drawn_over_their_parameter():

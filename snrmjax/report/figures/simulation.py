@@ -1,11 +1,13 @@
 """Figures of simulated motions: responses, nonlinear modes, batches and virtual tests."""
 
 from collections.abc import Sequence
+from itertools import cycle
 from typing import Any
 
 import numpy as np
 from jaxtyping import Array, Float
 from matplotlib import colormaps
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from snrmjax.io.units import DEGREE, HERTZ
@@ -44,6 +46,8 @@ from snrmjax.simulate.solutions.controlled import DampedModeBranch
 from snrmjax.simulate.solutions.event_curves import EventCurve
 from snrmjax.simulate.solutions.forced_response import ResponseBatch, ResponseCurve
 from snrmjax.simulate.solutions.normal_modes import NormalModeBranch
+
+_SEEN_SHARE = 1e-3  # of the energy: the width of a line in its panel
 
 
 def simulated_response_figure(
@@ -127,11 +131,13 @@ def event_curve_figure(curves: Sequence[EventCurve], *, sensor: str | None = Non
 
 
 def normal_mode_figure(branch: NormalModeBranch, *, sensor: str | None = None) -> Figure:
-    """A nonlinear normal mode: velocity against frequency, and frequency against energy.
+    """A nonlinear normal mode: velocity, frequency, and how its shape changes with the energy.
 
     The velocity is shown as amplitude of the fundamental and as peak of the whole signal: they
-    part where an internal resonance puts energy into higher harmonics. The energy axis shows the
-    last five decades.
+    part where an internal resonance puts energy into higher harmonics. Unstable motions are dashed;
+    markers name internal resonances where the other mode has most of the energy. Of several modes a
+    panel shows their shares of it, of several sensors one their fundamentals over the first one's.
+    The energy axes show the last five decades.
 
     Arguments: `sensor` by default the branch's first.
     Returns the figure. Raises `ValueError` when the branch has no point or not this sensor.
@@ -144,17 +150,66 @@ def normal_mode_figure(branch: NormalModeBranch, *, sensor: str | None = None) -
     fundamental = np.abs(velocity_of(branch, name))
     peak = velocity_peaks(branch.velocity[:, :, branch.sensors.index(name)])
     unit, omega = unit_for(peak, "m/s"), branch.frequency / HERTZ
-    figure, ((speeds, energies),) = panels(PAGE, 3.2, 1, 2)
-    speeds.plot(omega, peak / unit.size, color=SERIES[5], **CURVE, label="peak of the signal")
-    speeds.plot(omega, fundamental / unit.size, color=SIMULATED, **CURVE, label="fundamental")
-    energies.semilogx(branch.energy, omega, color=SIMULATED, **CURVE)
-    energies.set_xlim(left=max(1e-5 * branch.energy.max(), branch.energy.min()))
+    several = branch.mode_share.shape[1] > 1
+    figure, grid = panels(PAGE, 6.0 if several else 3.2, 2 if several else 1, 2)
+    speeds, energies = grid[0]
+    stable = branch.stability
+    response_line(*(speeds, omega, peak / unit.size, stable, "peak of the signal", SERIES[5], LINE))
+    response_line(speeds, omega, fundamental / unit.size, stable, "fundamental", SIMULATED, LINE)
+    response_line(energies, branch.energy, omega, stable, "fundamental", SIMULATED, LINE)
+    _energy_axis(energies, branch)
+    drawn = [t for t in branch.tongues if t.last >= t.first]  # not those left out
+    for tongue, marker in zip(drawn, cycle("osD^v"), strict=False):
+        share = branch.mode_share[tongue.first : tongue.last + 1, tongue.mode]
+        tip = tongue.first + int(np.argmax(share))
+        style: Style = {**HOLLOW, "marker": marker}
+        marks(energies, branch.energy[tip], omega[tip], style, f"internal resonance {tongue.name}")
     speeds.set_ylim(bottom=0.0)
     title, level = f"(a) amplitude at {plain(name)}", f"Velocity amplitude ({unit.name})"
     name_axes(speeds, title, "Frequency (Hz)", level)
     name_axes(energies, "(b) frequency and energy", "Energy (J)", "Frequency (Hz)")
+    if several:
+        _draw_shapes(branch, *grid[1], branch.sensors.index(name))
+    explain_lines(figure)
     legend(figure)
     return figure
+
+
+def _draw_shapes(branch: NormalModeBranch, shares: Axes, shapes: Axes, reference: int) -> None:
+    """Shares of the modes in the energy, and fundamentals of the sensors over one of them."""
+    energy, stable = branch.energy, branch.stability
+    seen = np.flatnonzero(branch.mode_share.max(axis=0) > _SEEN_SHARE)
+    for k, colour in zip(seen.tolist(), _many_colours(len(seen)), strict=True):
+        share = 100.0 * branch.mode_share[:, k]
+        response_line(shares, energy, share, stable, f"mode {k + 1}", colour, LINE)
+    name_axes(shares, "(c) share of the modes", "Energy (J)", "Share of the kinetic energy (%)")
+    _energy_axis(shares, branch)
+    if len(branch.sensors) == 1:
+        spec = shares.get_subplotspec()
+        shapes.remove()
+        if spec is not None:
+            shares.set_subplotspec(spec.get_gridspec()[1, :])
+        return
+    shape = branch.shape(reference)
+    over = shape / np.maximum(np.abs(shape[:, [reference]]), np.finfo(float).tiny)
+    for k, colour in enumerate(_many_colours(len(branch.sensors))):
+        label = f"at {plain(branch.sensors[k])}"
+        response_line(shapes, energy, over[:, k], stable, label, colour, LINE)
+    name_axes(shapes, "(d) shape", "Energy (J)", f"Over that at {plain(branch.sensors[reference])}")
+    _energy_axis(shapes, branch)
+    fit_axis(shapes, "y", over.ravel())
+
+
+def _many_colours(number: int) -> Sequence[Any]:
+    """So many colours that differ."""
+    if number <= len(SERIES):
+        return SERIES[:number]
+    return list(colormaps["viridis"](np.linspace(0.0, 0.9, number)))
+
+
+def _energy_axis(axes: Axes, branch: NormalModeBranch) -> None:
+    axes.set_xscale("log")
+    axes.set_xlim(left=max(1e-5 * branch.energy.max(), branch.energy.min()))
 
 
 def motions_figure(

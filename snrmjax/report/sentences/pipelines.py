@@ -81,8 +81,12 @@ SENTENCES: dict[str, Wording] = {
         "somewhere; use more --harmonics."
     ),
     "internal_resonance": (
-        "internal resonance: harmonic {harmonic} drives mode {mode} from {from_hz:.2f} to "
-        "{to_hz:.2f} Hz"
+        "internal resonance 1:{harmonic} with mode {mode} from {from_hz:.5g} to {to_hz:.5g} Hz: "
+        "harmonic {harmonic} drives it, with up to {share:%.3g} of the energy"
+    ),
+    "mode_unstable": (
+        "the mode is unstable on {n} points from {from_hz:.5g} to {to_hz:.5g} Hz: free motions "
+        "leave it there"
     ),
     "mode_not_followed": _not_followed,
     "curve_ended": _ended,

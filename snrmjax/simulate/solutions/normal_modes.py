@@ -5,9 +5,11 @@ from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Complex, Float, Int
 
-from snrmjax.model.effect_base import AbstractHysteresis
+from snrmjax.model.effect_base import AbstractForce, AbstractMemoryless
+from snrmjax.model.effect_metadata import Argument
+from snrmjax.model.effect_shape import shape_of
 from snrmjax.model.structures import (
     Structure,
     displacement_scale,
@@ -18,6 +20,7 @@ from snrmjax.numerics.blocks import by_blocks
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.result import quantity
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, harmonic_balance
+from snrmjax.simulate.balance.harmonics import with_sines
 from snrmjax.simulate.continuation.continuation import (
     Curve,
     CurveRange,
@@ -26,6 +29,7 @@ from snrmjax.simulate.continuation.continuation import (
     trace_curve,
 )
 from snrmjax.simulate.continuation.response_curve import MotionCurve, motions_of
+from snrmjax.simulate.continuation.stability import Stability, floquet_multipliers, stability_of
 
 DEFAULT_STEPS = StepControl(first=1e-3, largest=0.02, angle=0.06)
 _TONGUE_SHARE = 0.05  # of the energy, in a harmonic of another mode: an internal resonance
@@ -42,6 +46,11 @@ class Tongue(NamedTuple):
     first: int  # index of its first point on the branch; with "skip", of the first one behind it
     last: int  # index of its last point; with "skip", of the last one before it
 
+    @property
+    def name(self) -> str:
+        """The resonance as one says it, modes counted from one: "1:3 with mode 2"."""
+        return f"1:{self.harmonic} with mode {self.mode + 1}"
+
 
 class NormalModeBranch(MotionCurve):
     """A nonlinear normal mode as a curve of periodic motions, from small amplitude on.
@@ -50,7 +59,35 @@ class NormalModeBranch(MotionCurve):
     """
 
     energy: Float[np.ndarray, " point"] = quantity("point", "J", "energy of the motion")
+    mode_share: Float[np.ndarray, "point mode"] = quantity(
+        "point mode", "1", "share of the mean kinetic energy"
+    )
     tongues: tuple[Tongue, ...] = ()
+    # Those of the flow and of the energy, which are one, left out; None: not asked for.
+    multipliers: Complex[np.ndarray, "point multiplier"] | None = None
+
+    @property
+    def stability(self) -> Int[np.ndarray, " point"]:
+        """A `Stability` of every point: small disturbances of a stable motion do not grow."""
+        if self.multipliers is None:
+            return np.full(len(self.frequency), int(Stability.NOT_COMPUTED))
+        if not self.multipliers.shape[1]:
+            return np.full(len(self.frequency), int(Stability.STABLE))
+        return stability_of(self.multipliers)
+
+    def shape(self, sensor: int = 0) -> Float[np.ndarray, "point sensor"]:
+        """Velocity fundamentals (m/s) at the sensors, that of one of them taken as positive."""
+        # Motions that start from rest have velocities of sines alone.
+        speed = self.velocity[:, 1].imag
+        return speed * np.where(speed[:, sensor] < 0, -1.0, 1.0)[:, None]
+
+    @property
+    def resonance(self) -> tuple[str, ...]:
+        """The name of the tongue that every point is on; empty on the backbone."""
+        return tuple(
+            next((t.name for t in self.tongues if t.first <= k <= t.last), "")
+            for k in range(len(self.frequency))
+        )
 
 
 def nonlinear_normal_mode(
@@ -62,6 +99,7 @@ def nonlinear_normal_mode(
     largest_amplitude: float | None = None,
     n_samples: int | None = None,
     tongues: Literal["follow", "skip"] = "follow",
+    stability: bool = True,
 ) -> NormalModeBranch:
     """Trace the nonlinear normal mode that starts at the linear mode of interest.
 
@@ -77,7 +115,8 @@ def nonlinear_normal_mode(
     Where a harmonic of the mode meets another mode, the curve runs out on a tongue and back: more
     than a twentieth of the energy is then in that harmonic of that mode. Tongues are reported;
     with `tongues="skip"` their points are left out, which leaves the backbone in pieces of one
-    curve.
+    curve. With `stability` Floquet multipliers say whether the motions are orbitally stable: two
+    of them, for shifts in time and in energy, are one and left out.
     Returns a `NormalModeBranch` whose `status` says how it ended.
     Raises `ValueError` for a frequency that is not positive or the linear one.
     Reference: Kerschen et al., Mech. Syst. Signal Process. 23 (2009) 170,
@@ -90,9 +129,7 @@ def nonlinear_normal_mode(
             "`to_frequency` must be positive and differ from the linear frequency "
             f"{omega:g} rad/s, but is {to_frequency:g} rad/s."
         )
-    model = simulated_structure(model)
-    kept = tuple(e for e in model.effects if not isinstance(e, AbstractHysteresis))
-    model = dataclasses.replace(model, effects=kept)
+    model = conservative(simulated_structure(model))
     scale = float(displacement_scale(model)[j])
     balance = harmonic_balance(
         model, 0.0, scale, harmonic_order=harmonic_order, n_samples=n_samples, cosine_only=True
@@ -105,13 +142,42 @@ def nonlinear_normal_mode(
     cosines, frequency = balance.motions(curve.points)
     at_rest = np.sum(cosines, axis=1)  # q(0), where the velocity vanishes
     (energy,) = by_blocks(lambda rows: (_energy(model, rows),), 128, at_rest)
+    share = _kinetic_shares(balance, cosines)
+    multipliers = None
+    if stability:
+        found = floquet_multipliers(model, with_sines(cosines), frequency)
+        trivial = np.argsort(np.abs(found - 1), axis=1)
+        multipliers = np.take_along_axis(found, trivial[:, 2:], axis=1)
     branch = NormalModeBranch(
         **motions_of(balance, curve.points),
         status=curve.status,
         energy=energy,
-        tongues=_tongues(balance, frequency, cosines),
+        mode_share=share.sum(axis=1),
+        tongues=_tongues(model, frequency, share),
+        multipliers=multipliers,
     )
     return _without_tongues(branch) if tongues == "skip" else branch
+
+
+def conservative(model: Structure) -> Structure:
+    """The structure without damping, friction and forces that depend on velocity."""
+
+    def stays(effect: object) -> bool:
+        if not isinstance(effect, AbstractForce):
+            return True
+        shape = shape_of(type(effect))
+        of_place = shape is not None and shape.argument is Argument.DISPLACEMENT
+        return isinstance(effect, AbstractMemoryless) and of_place
+
+    def with_ratio(ratio: Array) -> Structure:
+        modes = dataclasses.replace(model.modes, damping_ratio=ratio, damping_coupling=None)
+        return dataclasses.replace(model, modes=modes, effects=effects)
+
+    effects = tuple(effect for effect in model.effects if stays(effect))
+    ones = jnp.ones(model.n_modes)
+    # Damping ratios that cancel what linear changes add, which depends linearly on them.
+    none, whole = (linear_terms_of(with_ratio(k * ones)).damping for k in (0.0, 1.0))
+    return with_ratio(jnp.asarray(none) / (jnp.asarray(none) - jnp.asarray(whole)))
 
 
 @compiled
@@ -133,14 +199,23 @@ def _trace(balance: HarmonicBalance, ends: Array, steps: StepControl) -> Curve:
     )
 
 
+def _kinetic_shares(
+    balance: HarmonicBalance, coefficients: Float[np.ndarray, "point coefficient mode"]
+) -> Float[np.ndarray, "point coefficient mode"]:
+    """The share of every harmonic of every mode in the mean kinetic energy."""
+    order = np.arange(coefficients.shape[1])[:, None]
+    mass = np.asarray(linear_terms_of(balance.model).mass)
+    energy = mass * (order * coefficients) ** 2  # twice the mean, over Ω²
+    return energy / np.maximum(energy.sum(axis=(1, 2), keepdims=True), np.finfo(float).tiny)
+
+
 def _tongues(
-    balance: HarmonicBalance, frequency: np.ndarray, coefficients: np.ndarray
+    model: Structure,
+    frequency: np.ndarray,
+    energy_share: Float[np.ndarray, "point coefficient mode"],
 ) -> tuple[Tongue, ...]:
     """Stretches with more than `_TONGUE_SHARE` of the kinetic energy in one other pair."""
-    j, mass = balance.model.modes.mode_of_interest, np.asarray(linear_terms_of(balance.model).mass)
-    order = np.arange(coefficients.shape[1])[:, None]
-    energy = mass * (order * coefficients) ** 2  # twice the mean kinetic energy, over Ω²
-    share = energy / np.maximum(energy.sum(axis=(1, 2), keepdims=True), np.finfo(float).tiny)
+    j, share = model.modes.mode_of_interest, energy_share.copy()
     # The mode's own harmonics are its shape in time; others' fundamentals its shape in space.
     share[:, :, j] = 0.0
     share[:, :2] = 0.0
@@ -177,6 +252,8 @@ def _without_tongues(branch: NormalModeBranch) -> NormalModeBranch:
         coefficients=branch.coefficients[keep],
         velocity=branch.velocity[keep],
         energy=branch.energy[keep],
+        mode_share=branch.mode_share[keep],
+        multipliers=None if branch.multipliers is None else branch.multipliers[keep],
         tongues=tuple(
             tongue._replace(first=int(place[tongue.first]), last=int(place[tongue.first]) - 1)
             for tongue in branch.tongues

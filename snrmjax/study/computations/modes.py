@@ -52,7 +52,9 @@ class NormalModes(AbstractModes):
 
     def member(self, model: Structure, force: np.ndarray | None, seed: int) -> dict:
         """See `AbstractSingly.member`."""
-        mode = nonlinear_normal_mode(model, self.to_frequency, harmonic_order=self.harmonic_order)
+        mode = nonlinear_normal_mode(
+            model, self.to_frequency, harmonic_order=self.harmonic_order, stability=False
+        )
         speed = np.abs(mode.velocity[:, 1, 0])
         return {**_rows(mode.status, mode.frequency, speed), "point_energy_j": mode.energy}
 

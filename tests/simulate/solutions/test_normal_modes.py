@@ -6,16 +6,18 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.integrate import quad
+from scipy.integrate import quad, solve_ivp
 from scipy.optimize import brentq
 from scipy.special import ellipk
 
 from snrmjax.model.builders.beams import curved_beam, flat_beam
+from snrmjax.model.builders.matrices import from_matrices
 from snrmjax.model.effects import make_effect
 from snrmjax.model.modes import linear_modes
 from snrmjax.model.potential import polynomial_potential
 from snrmjax.model.structures import structure
-from snrmjax.simulate.continuation.continuation import CurveStatus
+from snrmjax.simulate.balance.harmonics import with_sines
+from snrmjax.simulate.continuation.continuation import CurveStatus, StepControl
 from snrmjax.simulate.solutions.normal_modes import DEFAULT_STEPS, nonlinear_normal_mode
 
 HZ = 2 * np.pi
@@ -208,6 +210,59 @@ def test_flat_beam_motions_close_and_keep_their_energy(flat_branch, time_domain)
     assert worst["tongue"] < 3e-3
 
 
+def test_stability_along_the_tongue_is_that_of_integrated_motions(
+    flat_branch, time_domain, state_of
+):
+    """Two of the multipliers are one: a motion may be shifted in time and in energy."""
+    branch = flat_branch
+    model = eqx.tree_at(lambda m: m.modes.damping_ratio, flat_beam(), jnp.zeros(4))
+    assert np.all(branch.stability[branch.frequency < 87.4 * HZ] == 1)
+    (unstable,) = (np.flatnonzero(branch.stability == 0),)
+    assert np.all(np.diff(unstable) == 1)  # one stretch, from one fold of the tongue to the other
+    for k in (unstable[0] - 10, unstable[len(unstable) // 2], unstable[-1] + 10):
+        motion = with_sines(branch.coefficients[k])
+        state = state_of(motion, branch.frequency[k])
+        truth = time_domain(model, 0.0, branch.frequency[k]).multipliers(state)
+        # The balance leaves up to 1e-3 of a motion on the tongue out, which parts the two that are
+        # one by its square root: the others stay.
+        nearest = np.abs(branch.multipliers[k][:, None] - truth).min(axis=1)
+        assert nearest.max() < 5e-3 * np.abs(truth).max(), k
+
+
+def test_two_masses_have_a_tongue_of_three_and_lose_stability_where_scipy_says():
+    """Kerschen et al. 2009: in phase, mode 2 in its third harmonic near √2 rad/s."""
+    spring = make_effect("cubic_stiffness", {"coefficient": 0.5}, at="x1")
+    stiffness = np.array([[2.0, -1.0], [-1.0, 2.0]])
+    model = from_matrices(np.eye(2), 0.1 * stiffness, stiffness, force="x1", effects=spring)
+    wide = StepControl(first=1e-3, largest=0.2, angle=0.1, max_points=1500)
+    branch = nonlinear_normal_mode(model, 1.41, largest_amplitude=300.0, steps=wide)
+    assert branch.tongues[0].name == "1:3 with mode 2"
+    # Published: there mode 2's third harmonic has it all, at ω 1.4072 and log E 2.455.
+    tip = np.argmin(np.abs(branch.coefficients[:, 1]).max(axis=1) + (branch.energy < 200) * 1e3)
+    assert branch.frequency[tip] == pytest.approx(1.4072, abs=5e-4)
+    assert np.log10(branch.energy[tip]) == pytest.approx(2.45, abs=0.02)
+
+    def map_of(k):
+        def rate(t, y):
+            x, v, map_ = y[:2], y[2:4], y[4:].reshape(4, 4)
+            tangent = stiffness + 1.5 * x[0] ** 2 * np.diag([1.0, 0.0])
+            swing = np.concatenate([map_[2:], -tangent @ map_[:2]])
+            return np.concatenate([v, -stiffness @ x - [0.5 * x[0] ** 3, 0.0], swing.ravel()])
+
+        start = np.asarray(model.modes.mode_shape) @ branch.coefficients[k].sum(axis=0)
+        begin = np.concatenate([start, np.zeros(2), np.eye(4).ravel()])
+        period = (0.0, 2 * np.pi / branch.frequency[k])
+        end = solve_ivp(rate, period, begin, method="DOP853", rtol=1e-11, atol=1e-11).y[4:, -1]
+        return np.linalg.eigvals(end.reshape(4, 4))
+
+    first = int(np.argmin(branch.stability))  # from here on unstable
+    assert branch.energy[first] == pytest.approx(41.0, rel=0.1)
+    for k, stable in ((first - 4, True), (first + 4, False)):
+        largest = np.abs(map_of(k)).max()
+        assert np.abs(branch.multipliers[k]).max() == pytest.approx(largest, abs=1e-4)
+        assert (largest < 1 + 1e-4) == stable == bool(branch.stability[k])
+
+
 # -------------------------------------------------------------------------------- failing well
 
 
@@ -242,6 +297,10 @@ def test_the_tongue_is_reported_and_can_be_skipped(flat_branch):
     assert tongue.from_frequency / HZ == pytest.approx(87.5, abs=0.1)
     assert tongue.to_frequency / HZ == pytest.approx(90.2, abs=0.1)
     assert tongue.energy_share > 0.99
+    assert tongue.name == "1:5 with mode 2"
+    assert branch.resonance[tongue.first] == tongue.name
+    assert branch.resonance[tongue.first - 1] == ""
+    np.testing.assert_allclose(branch.mode_share.sum(axis=1), 1.0, rtol=1e-13)
     # Where five times the frequency is about that of the second mode, stiffened as it is.
     assert 5 * tongue.from_frequency > float(model.modes.natural_frequency[1])
     skipped = nonlinear_normal_mode(
