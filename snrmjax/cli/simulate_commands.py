@@ -43,6 +43,14 @@ def simulate(
             "(takes longer).",
         ),
     ] = False,
+    quasi_periodic: Annotated[
+        bool,
+        typer.Option(
+            "--quasi-periodic",
+            help="Also follow the motions with a second frequency from every Neimark-Sacker "
+            "bifurcation of the responses (quasi_periodic.csv and quasi_periodic.png).",
+        ),
+    ] = False,
     follow: Annotated[
         EventKind | None,
         typer.Option(
@@ -98,6 +106,7 @@ def simulate(
             follow=[] if follow is None else [follow],
             parameter=parameter,
             to=to,
+            quasi_periodic=quasi_periodic,
             progress=lambda load: say(f"{load:g} {structure.modes.force_unit}"),
         )
         simulation.write(folder, found)

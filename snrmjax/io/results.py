@@ -17,6 +17,7 @@ from snrmjax.simulate.continuation.response_curve import (
 from snrmjax.simulate.continuation.stability import Stability
 from snrmjax.simulate.solutions.event_curves import EventCurve
 from snrmjax.simulate.solutions.normal_modes import NormalModeBranch
+from snrmjax.simulate.solutions.quasi_periodic import QuasiPeriodicBranch
 
 if TYPE_CHECKING:  # a simulation does not wait for the imports of an identification
     from snrmjax.identify.inference.identification import Identification
@@ -100,6 +101,42 @@ def write_event_curves(
         "event": [event for c in curves for event in c.event],
     }
     write_table(path, load_named(columns, curves[0].force_unit))
+
+
+def write_quasi_periodic(
+    path: FilePath, branches: Sequence[QuasiPeriodicBranch], *, sensor: str | None = None
+) -> None:
+    """Write branches of quasi-periodic motions: both frequencies, velocity at one sensor.
+
+    The amplitude of the fundamental goes from `velocity_h1_least_m_s` to `velocity_h1_largest_m_s`
+    and back in every `slow_period_s`.
+
+    Arguments: `sensor` is the name of one, by default the first.
+    Raises `ValueError` without a branch, when there is no such sensor or the file cannot be
+    written.
+    """
+    if not branches:
+        raise ValueError("there is no branch of quasi-periodic motions to write.")
+    r = _place(branches[0].sensors, sensor)
+
+    def joined(values: str) -> np.ndarray:
+        return np.concatenate([getattr(b, values) for b in branches])
+
+    sizes, velocity = [len(b.frequency) for b in branches], joined("velocity")[:, r]
+    columns = {
+        "branch": np.repeat(np.arange(len(branches)), sizes),
+        "force_n": np.repeat([b.force for b in branches], sizes),
+        "frequency_hz": joined("frequency") / HERTZ,
+        "slow_frequency_hz": joined("slow_frequency") / HERTZ,
+        "slow_period_s": joined("slow_period"),
+        "velocity_h1_re_m_s": velocity.real,
+        "velocity_h1_im_m_s": velocity.imag,
+        "velocity_h1_least_m_s": joined("least_amplitude")[:, r],
+        "velocity_h1_largest_m_s": joined("largest_amplitude")[:, r],
+        "velocity_peak_m_s": joined("largest_velocity")[:, r],
+        "modulation": joined("modulation"),
+    }
+    write_table(path, load_named(columns, branches[0].force_unit))
 
 
 def _events(curve: ResponseCurve) -> list[str]:

@@ -8,7 +8,7 @@ import numpy as np
 from snrmjax.identify.pointwise.snrm import reference_sensor
 from snrmjax.io.units import HERTZ
 from snrmjax.model.parameters import checked_names, parameter_values
-from snrmjax.model.structures import Structure, equilibria
+from snrmjax.model.structures import Structure, equilibria, simulated_structure
 from snrmjax.numerics.facts import Fact
 from snrmjax.simulate.continuation.continuation import CurveStatus
 from snrmjax.simulate.continuation.event_equations import FORCE, EventKind
@@ -18,6 +18,11 @@ from snrmjax.simulate.solutions.event_curves import EventCurve, follow_event
 from snrmjax.simulate.solutions.forced_response import ResponseSettings, forced_response
 from snrmjax.simulate.solutions.isolated_responses import isolated_responses
 from snrmjax.simulate.solutions.normal_modes import NormalModeBranch, nonlinear_normal_mode
+from snrmjax.simulate.solutions.quasi_periodic import (
+    QuasiPeriodicBranch,
+    check_quasi_periodic,
+    quasi_periodic_branch,
+)
 
 _TRUNCATED = 0.02  # share of the velocity that harmonics left out may have, without a note
 _SAME_EVENT = 1e-6  # of the frequency, between an event of a response and a curve of events
@@ -31,6 +36,7 @@ class SimulatedResponses(NamedTuple):
     sensor: str  # that figures and tables show
     notes: tuple[Fact, ...]
     events: tuple[EventCurve, ...] = ()  # followed over a parameter
+    quasi_periodic: tuple[QuasiPeriodicBranch, ...] = ()
 
 
 class SimulatedMode(NamedTuple):
@@ -52,6 +58,7 @@ def simulate_responses(
     follow: Sequence[EventKind] = (),
     parameter: str = FORCE,
     to: float | None = None,
+    quasi_periodic: bool = False,
     progress: Callable[[float], None] = lambda force: None,
 ) -> SimulatedResponses:
     """Responses to harmonic forces, around folds and with unstable parts.
@@ -59,14 +66,17 @@ def simulate_responses(
     Arguments: `forces` in N; `harmonics` that are balanced; `isolated` also searches for curves
     that are not connected to the one from rest; `follow` kinds of events that are followed as the
     `parameter` goes from its value to `to`, and back where it turns (see `follow_event`);
+    `quasi_periodic` follows the motions with two frequencies from every Neimark-Sacker point;
     `progress` is told each force when it begins.
-    Raises `ValueError` as `forced_response` and `follow_event` do, where no curve has a point, and
-    for events to follow without `to`, or the other way round.
+    Raises `ValueError` as `forced_response` and `follow_event` do, where no curve has a point,
+    for events to follow without `to`, or the other way round, and as `check_quasi_periodic` does.
     """
     if follow and to is None:
         raise ValueError("`to` must be given with `follow`: the value that the parameter goes to.")
     if not follow and (to is not None or parameter != FORCE):
         raise ValueError("`parameter` and `to` must be given with `follow`, the kinds of events.")
+    if quasi_periodic:
+        check_quasi_periodic(simulated_structure(model))
     if follow and parameter != FORCE:
         checked_names(model, [parameter], "parameter")
     ends, settings = (from_hz * HERTZ, to_hz * HERTZ), ResponseSettings(harmonic_order=harmonics)
@@ -101,7 +111,38 @@ def simulate_responses(
             found = _followed(model, curves, kind, parameter, to)
             notes += [] if found else [Fact("no_event_to_follow", event=kind)]
             events += found
-    return SimulatedResponses(tuple(curves), _sensor(model), tuple(notes), tuple(events))
+    tori: list[QuasiPeriodicBranch] = []
+    if quasi_periodic:
+        tori, told = _tori(model, curves, ends)
+        notes += told
+    return SimulatedResponses(
+        *(tuple(curves), _sensor(model), tuple(notes), tuple(events), tuple(tori))
+    )
+
+
+def _tori(
+    model: Structure, curves: Sequence[ResponseCurve], ends: tuple[float, float]
+) -> tuple[list[QuasiPeriodicBranch], list[Fact]]:
+    """Quasi-periodic motions from every Neimark-Sacker point, each once, and what went wrong."""
+    found: list[QuasiPeriodicBranch] = []
+    notes: list[Fact] = []
+    places = [(curve, k) for curve in curves for k in curve.at_events("neimark_sacker")]
+    for curve, k in places:
+        frequency = float(curve.frequency[k])
+        if any(b.force == curve.force and b.ends_at(frequency) for b in found):
+            continue
+        where = {"force": curve.force, "frequency_hz": frequency / HERTZ}
+        try:
+            branch = quasi_periodic_branch(model, curve, int(k), within=ends)
+        except ValueError as error:  # of this point alone
+            notes.append(Fact("torus_not_followed", **where, why=str(error)))
+            continue
+        if len(branch.frequency) < 2:
+            why = f"the branch ended {branch.status.message}."
+            notes.append(Fact("torus_not_followed", **where, why=why))
+            continue
+        found.append(branch)
+    return found, notes if places else [Fact("no_event_to_follow", event="Neimark-Sacker point")]
 
 
 def _followed(

@@ -136,6 +136,9 @@ _FIGURES: dict[str, Callable[..., Figure]] = {
     "PeriodicMotion": _motions,
     "PredictedResponse": _predicted,
     "Propagation": uncertainty_figures.propagation_figure,
+    "QuasiPeriodicBranch": lambda one, **settings: simulation_figures.quasi_periodic_figure(
+        [one], **settings
+    ),
     "ResponseBatch": simulation_figures.batch_figure,
     "ResponseCurve": lambda one, **settings: simulated_response_figure([one], **settings),
     "SobolIndices": uncertainty_figures.sensitivity_figure,

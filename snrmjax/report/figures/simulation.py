@@ -11,12 +11,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from snrmjax.io.units import DEGREE, HERTZ
-from snrmjax.report.sampling import BAND, velocity_of
+from snrmjax.report.sampling import BAND, sensor_index, velocity_of
 from snrmjax.report.style import (
     BACKGROUND,
     COLUMN,
     CURVE,
     DOT,
+    FILL,
     HOLLOW,
     IDENTIFIED,
     LINE,
@@ -46,6 +47,7 @@ from snrmjax.simulate.solutions.controlled import DampedModeBranch
 from snrmjax.simulate.solutions.event_curves import EventCurve
 from snrmjax.simulate.solutions.forced_response import ResponseBatch, ResponseCurve
 from snrmjax.simulate.solutions.normal_modes import NormalModeBranch
+from snrmjax.simulate.solutions.quasi_periodic import QuasiPeriodicBranch
 
 _SEEN_SHARE = 1e-3  # of the energy: the width of a line in its panel
 
@@ -130,6 +132,51 @@ def event_curve_figure(curves: Sequence[EventCurve], *, sensor: str | None = Non
     return figure
 
 
+def quasi_periodic_figure(
+    branches: Sequence[QuasiPeriodicBranch],
+    curves: Sequence[ResponseCurve] = (),
+    *,
+    sensor: str | None = None,
+) -> Figure:
+    """Quasi-periodic motions: the range of their amplitude, and the period of the modulation.
+
+    The amplitude of the velocity fundamental goes up and down within the shaded range; behind it
+    are the responses with one frequency, unstable ones dashed.
+
+    Arguments: `branches`, and the `curves` that they leave; `sensor` by default the first.
+    Returns the figure. Raises `ValueError` without a branch or when the sensor is missing.
+    """
+    if not branches:
+        raise ValueError("there is no quasi-periodic motion to show: no branch was found.")
+    name = sensor or branches[0].sensors[0]
+    r = sensor_index(branches[0].sensors, name)
+    unit = unit_for(np.concatenate([b.largest_amplitude[:, r] for b in branches]), "m/s")
+    figure, ((speeds, periods),) = panels(PAGE, 3.4, 1, 2)
+    forces = sorted({b.force for b in branches})
+    for curve in (c for c in curves if c.force in forces and len(c.frequency)):
+        v, x = np.abs(velocity_of(curve, name)) / unit.size, curve.frequency / HERTZ
+        response_line(speeds, x, v, curve.stability, "one frequency", SIMULATED, LINE)
+    for branch, colour in zip(branches, cycle(SERIES), strict=False):
+        x = branch.frequency / HERTZ
+        least, most = (
+            part[:, r] / unit.size for part in (branch.least_amplitude, branch.largest_amplitude)
+        )
+        begin = with_unit(branch.force, branch.force_unit)
+        label = f"two frequencies, {begin}, from {x[0]:.5g} Hz"
+        # A branch may turn in frequency: a polygon, not a band over an axis.
+        speeds.fill([*x, *x[::-1]], [*least, *most[::-1]], color=colour, **FILL)
+        for edge in (least, most):
+            speeds.plot(x, edge, color=colour, **CURVE)
+        periods.plot(x, branch.slow_period, color=colour, **CURVE, label=label)
+    speeds.set_ylim(bottom=0.0)
+    title, level = f"(a) amplitude at {plain(name)}", f"Velocity amplitude ({unit.name})"
+    name_axes(speeds, title, "Frequency (Hz)", level)
+    name_axes(periods, "(b) modulation", "Frequency (Hz)", "Period of the modulation (s)")
+    explain_lines(figure)
+    legend(figure)
+    return figure
+
+
 def normal_mode_figure(branch: NormalModeBranch, *, sensor: str | None = None) -> Figure:
     """A nonlinear normal mode: velocity, frequency, and how its shape changes with the energy.
 
@@ -169,7 +216,8 @@ def normal_mode_figure(branch: NormalModeBranch, *, sensor: str | None = None) -
     name_axes(speeds, title, "Frequency (Hz)", level)
     name_axes(energies, "(b) frequency and energy", "Energy (J)", "Frequency (Hz)")
     if several:
-        _draw_shapes(branch, *grid[1], branch.sensors.index(name))
+        shares, shapes = grid[1]
+        _draw_shapes(branch, shares, shapes, branch.sensors.index(name))
     explain_lines(figure)
     legend(figure)
     return figure

@@ -10,6 +10,7 @@ from snrmjax.pipelines.simulate import SimulatedMode, SimulatedResponses
 from snrmjax.report.figures.simulation import (
     event_curve_figure,
     normal_mode_figure,
+    quasi_periodic_figure,
     simulated_response_figure,
 )
 from snrmjax.report.style import save_figure
@@ -17,7 +18,10 @@ from snrmjax.simulate.continuation.response_curve import Branch, ResponseCurve, 
 
 
 def write(folder: Path, found: SimulatedResponses | SimulatedMode) -> None:
-    """Write response.csv and response.png, or nnm.csv and nnm.png; events.csv and events.png."""
+    """Write response.csv and response.png, or nnm.csv and nnm.png.
+
+    Also events.csv and events.png, quasi_periodic.csv and quasi_periodic.png, where there are any.
+    """
     sensor = found.sensor
     if isinstance(found, SimulatedMode):
         results.write_normal_mode(folder / "nnm.csv", found.branch, sensor=sensor)
@@ -29,6 +33,11 @@ def write(folder: Path, found: SimulatedResponses | SimulatedMode) -> None:
     if any(len(curve.frequency) for curve in found.events):
         results.write_event_curves(folder / "events.csv", found.events, sensor=sensor)
         save_figure(folder / "events.png", event_curve_figure(found.events, sensor=sensor))
+    if found.quasi_periodic:
+        path = folder / "quasi_periodic.csv"
+        results.write_quasi_periodic(path, found.quasi_periodic, sensor=sensor)
+        figure = quasi_periodic_figure(found.quasi_periodic, found.curves, sensor=sensor)
+        save_figure(folder / "quasi_periodic.png", figure)
 
 
 def headline(found: SimulatedResponses | SimulatedMode) -> list[str]:
@@ -39,7 +48,8 @@ def headline(found: SimulatedResponses | SimulatedMode) -> list[str]:
         place = f"{branch.frequency[-1] / HERTZ:.5g} Hz, {speed:.3g} m/s at {found.sensor}"
         return [f"the mode ends at {place}"]
     events = ["; ".join(curve.summary()) for curve in found.events]
-    return [*(_largest(curve, found.sensor) for curve in found.curves), *events]
+    tori = ["; ".join(branch.summary()) for branch in found.quasi_periodic]
+    return [*(_largest(curve, found.sensor) for curve in found.curves), *events, *tori]
 
 
 def _largest(curve: ResponseCurve, sensor: str) -> str:

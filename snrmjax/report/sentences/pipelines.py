@@ -75,6 +75,10 @@ SENTENCES: dict[str, Wording] = {
     "isolated_searched": (
         "{n} further branches found at {force:g} N, of {n_starts} starts ({n_failed} failed)"
     ),
+    "torus_not_followed": (
+        "no quasi-periodic motions were followed from {frequency_hz:.5g} Hz at force {force:g}: "
+        "{why}"
+    ),
     "no_event_to_follow": "no response has a {event} to follow.",
     "harmonics_left_out": (
         "the harmonics above {harmonics} would change the velocity by up to about {share:%.2g} "

@@ -2,10 +2,12 @@
 
 from typing import ClassVar
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
+from snrmjax.model.base_motion import BaseMotion
 from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.result import AbstractResult, quantity, setting
@@ -29,6 +31,7 @@ from snrmjax.simulate.continuation.response_curve import ResponseCurve
 DEFAULT_STEPS = StepControl(first=0.02, smallest=1e-6, largest=0.1, angle=0.2, max_points=300)
 _MOST_MODES = 20
 _FIRST_SIZE = 1e-3  # of the modulation, in scaled unknowns, at the first point
+_SLOW_SAMPLES = 64  # over a slow period, among which amplitudes are compared
 _ON_CIRCLE = 0.02  # distance from the unit circle of the multipliers that cross it, at most
 
 
@@ -47,7 +50,8 @@ class TorusEnd(Status):
 class QuasiPeriodicBranch(AbstractResult):
     """Motions with two base frequencies in order along a branch, stable or not.
 
-    The first point is the Neimark-Sacker bifurcation itself.
+    The first point is the Neimark-Sacker bifurcation itself. Velocities are those that the sensors
+    record, with the base's own where they see it.
     """
 
     coordinates: ClassVar[tuple[str, ...]] = ("sensor",)
@@ -62,6 +66,12 @@ class QuasiPeriodicBranch(AbstractResult):
     largest_velocity: Float[np.ndarray, "point sensor"] = quantity(
         "point sensor", "m/s", "largest velocity over the whole motion"
     )
+    least_amplitude: Float[np.ndarray, "point sensor"] = quantity(
+        "point sensor", "m/s", "least amplitude of the fundamental over the slow period"
+    )
+    largest_amplitude: Float[np.ndarray, "point sensor"] = quantity(
+        "point sensor", "m/s", "largest amplitude of the fundamental over the slow period"
+    )
     modulation: Float[np.ndarray, " point"] = quantity(
         "point", "1", "rms of the modulated part of the displacement, over the whole"
     )
@@ -70,6 +80,36 @@ class QuasiPeriodicBranch(AbstractResult):
     slow_order: int = setting()
     status: TorusEnd = setting()
     sensors: tuple[str, ...] = quantity("sensor", "", "sensor", name="sensor", static=True)
+    base: BaseMotion | None = eqx.field(static=True, default=None)
+
+    @property
+    def force_unit(self) -> str:
+        """Unit of what drives it: newtons, or m/s² of a base."""
+        return "N" if self.base is None else "m/s²"
+
+    @property
+    def slow_period(self) -> Float[np.ndarray, " point"]:
+        """Period of the modulation in s."""
+        return 2 * np.pi / self.slow_frequency
+
+    def ends_at(self, frequency: float) -> bool:
+        """Whether it ends at a Neimark-Sacker point of this frequency (rad/s), to its last step."""
+        if self.status != TorusEnd.PERIODIC:
+            return False
+        step = abs(float(self.frequency[-1] - self.frequency[-2]))
+        if len(self.frequency) > 2:  # the last one is between two whole steps
+            step = max(step, abs(float(self.frequency[-2] - self.frequency[-3])))
+        return abs(float(self.frequency[-1]) - frequency) <= step
+
+    def summary(self) -> tuple[str, ...]:
+        """Force, range, slow period, modulation and how it ended."""
+        hertz, period = self.frequency / (2 * np.pi), self.slow_period
+        return (
+            f"quasi-periodic motions at {self.force:.4g} {self.force_unit}: {len(hertz)} points",
+            f"frequency {hertz[0]:.5g} to {hertz[-1]:.5g} Hz",
+            f"period of the modulation {period.min():.4g} to {period.max():.4g} s",
+            f"ended {self.status.message}",
+        )
 
 
 def quasi_periodic_branch(
@@ -98,14 +138,7 @@ def quasi_periodic_branch(
     Schilder, Osinga & Vogt, SIAM J. Appl. Dyn. Syst. 4 (2005) 459, doi:10.1137/040611240.
     """
     model = simulated_structure(model)
-    if model.n_modes > _MOST_MODES:
-        raise ValueError(
-            f"quasi-periodic motions are followed in at most {_MOST_MODES} modes, not "
-            f"{model.n_modes}: leave modes out (`n_modes` of `from_matrices`)."
-        )
-    if model.hysteretic:
-        kinds = ", ".join(effect.kind for effect in model.hysteretic)
-        raise ValueError(f"quasi-periodic motions with a memory ({kinds}) cannot be followed.")
+    check_quasi_periodic(model)
     if slow_order < 1:
         raise ValueError(f"`slow_order` must be 1 or more, but is {slow_order}.")
     ns_points = response.at_events("neimark_sacker")
@@ -127,6 +160,21 @@ def quasi_periodic_branch(
     scale = float(balance.frequency_scale)
     points, status = _followed(torus, start, direction, (lower / scale, upper / scale), steps)
     return _as_result(torus, points, status)
+
+
+def check_quasi_periodic(model: Structure) -> None:
+    """Raise `ValueError` for a model whose quasi-periodic motions cannot be followed, and say why.
+
+    At most 20 modes, no friction with memory.
+    """
+    if model.n_modes > _MOST_MODES:
+        raise ValueError(
+            f"quasi-periodic motions are followed in at most {_MOST_MODES} modes, not "
+            f"{model.n_modes}: leave modes out (`n_modes` of `from_matrices`)."
+        )
+    if model.hysteretic:
+        kinds = ", ".join(effect.kind for effect in model.hysteretic)
+        raise ValueError(f"quasi-periodic motions with a memory ({kinds}) cannot be followed.")
 
 
 def _beginning(
@@ -218,21 +266,48 @@ def _as_result(torus: TorusBalance, points: np.ndarray, status: TorusEnd) -> Qua
     scale = float(balance.displacement_scale)
     x = scale * points[:, :-2].reshape(len(points), -1, n)
     fundamental = (x[:, 1] - 1j * x[:, 2]) @ shape.T
-    largest = []
-    for coefficients, one, two in zip(x, fast, slow, strict=True):
-        rate = one * basis.by_fast + two * basis.by_slow
-        largest.append(np.max(np.abs(basis.synthesis @ rate @ coefficients @ shape.T), axis=0))
+    force = float(balance.force)
+    own = np.zeros_like(fundamental)
+    if modes.base is not None:
+        own = modes.base.own_velocity(modes.sensors, fast, force)
+    phasors = 1j * fast[:, None] * fundamental + own
+    largest, amplitudes = [], []
+    for k, (coefficients, one, two) in enumerate(zip(x, fast, slow, strict=True)):
+        rate = (one * basis.by_fast + two * basis.by_slow) @ coefficients @ shape.T
+        rate[1:3] += [own[k].real, -own[k].imag]
+        largest.append(np.max(np.abs(basis.synthesis @ rate), axis=0))
+        amplitudes.append(_amplitudes(torus, rate))
+    least, most = (np.stack(part) for part in zip(*amplitudes, strict=True))
     moving = (x[:, 1:] ** 2).sum(axis=2)
     share = moving[:, basis.slow[1:] > 0].sum(axis=1) / moving.sum(axis=1)
     return QuasiPeriodicBranch(
         frequency=fast,
         slow_frequency=slow,
-        velocity=1j * fast[:, None] * fundamental,
+        velocity=phasors,
         largest_velocity=np.stack(largest),
+        least_amplitude=least,
+        largest_amplitude=most,
         modulation=np.sqrt(share),
         coefficients=x,
-        force=float(balance.force),
+        force=force,
         slow_order=torus.slow_order,
         status=status,
         sensors=modes.sensors,
+        base=modes.base,
     )
+
+
+def _amplitudes(
+    torus: TorusBalance, velocity: Float[np.ndarray, "coefficient sensor"]
+) -> tuple[np.ndarray, np.ndarray]:
+    """The least and the largest amplitude of what goes with τ₁ once, over τ₂."""
+    basis = torus.basis
+    fast, slow = basis.fast[1::2], basis.slow[1::2]
+    phasor = velocity[1::2] - 1j * velocity[2::2]
+    ahead, behind = fast == 1, fast == -1
+    tau = 2 * np.pi * np.arange(_SLOW_SAMPLES)[:, None] / _SLOW_SAMPLES
+    # cos(−τ₁ + k₂τ₂ + φ) is cos(τ₁ − k₂τ₂ − φ).
+    envelope = np.exp(1j * tau * slow[ahead]) @ phasor[ahead]
+    envelope = envelope + np.exp(-1j * tau * slow[behind]) @ phasor[behind].conj()
+    size = np.abs(envelope)
+    return size.min(axis=0), size.max(axis=0)

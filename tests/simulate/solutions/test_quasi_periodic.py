@@ -6,6 +6,7 @@ from scipy.integrate import solve_ivp
 
 import snrmjax as sj
 from snrmjax.model.places import between
+from snrmjax.pipelines.simulate import simulate_responses
 from snrmjax.simulate.solutions.quasi_periodic import TorusEnd
 
 # NLvib's second example: two masses with two cubic springs.
@@ -62,6 +63,34 @@ def test_a_motion_is_the_one_that_scipy_finds(pair):
     turn = np.exp(-1j * omega * times) * np.hanning(len(times))
     mean = 2 * np.abs(motion @ turn) / np.sum(np.hanning(len(times)))
     np.testing.assert_allclose(mean, np.abs(branch.velocity[place]), rtol=5e-3)
+    # The amplitude goes up and down: of the part of the spectrum about Ω, ends of the record cut.
+    spectrum = np.fft.fft(motion, axis=1)
+    order = np.fft.fftfreq(len(times), times[1]) * period
+    around = np.where(np.abs(order - 1) < 0.5, 2 * spectrum, 0.0)
+    size = np.abs(np.fft.ifft(around, axis=1))[:, 1000:-1000]
+    np.testing.assert_allclose(size.max(axis=1), branch.largest_amplitude[place], rtol=0.02)
+    np.testing.assert_allclose(size.min(axis=1), branch.least_amplitude[place], rtol=0.03)
+
+
+def test_responses_are_simulated_with_their_quasi_periodic_motions(pair, tmp_path):
+    """Both ends of the window are Neimark-Sacker points: one branch, in a table and a figure."""
+    model, _, branch = pair
+    ends = 1.05 / (2 * np.pi), 1.25 / (2 * np.pi)
+    found = simulate_responses(model, [0.11], *ends, harmonics=7, quasi_periodic=True)
+    (only,) = found.quasi_periodic
+    np.testing.assert_allclose(only.frequency, branch.frequency, rtol=1e-12)
+    sj.write_results(found, tmp_path)
+    rows = np.genfromtxt(tmp_path / "quasi_periodic.csv", delimiter=",", names=True)
+    np.testing.assert_allclose(rows["slow_period_s"], 2 * np.pi / branch.slow_frequency, rtol=1e-9)
+    r = branch.sensors.index(found.sensor)
+    np.testing.assert_allclose(rows["velocity_h1_least_m_s"], branch.least_amplitude[:, r])
+    assert (tmp_path / "quasi_periodic.png").read_bytes()[:4] == b"\x89PNG"
+    speeds, periods = only.plot().axes
+    assert speeds.patches  # the range
+    np.testing.assert_allclose(periods.lines[0].get_ydata(), only.slow_period)
+    none = simulate_responses(model, [0.01], *ends, harmonics=3, quasi_periodic=True)
+    assert none.quasi_periodic == ()
+    assert "no_event_to_follow" in [note.kind for note in none.notes]
 
 
 def test_what_cannot_be_followed_is_refused(pair):
@@ -75,3 +104,5 @@ def test_what_cannot_be_followed_is_refused(pair):
     rubbing = sj.model.from_matrices(np.diag(MASS), DAMPING, STIFFNESS, force="x1", effects=stuck)
     with pytest.raises(ValueError, match="with a memory"):
         sj.simulate.quasi_periodic_branch(rubbing, response)
+    with pytest.raises(ValueError, match="with a memory"):
+        simulate_responses(rubbing, [0.1], 0.1, 0.2, quasi_periodic=True)
