@@ -139,7 +139,8 @@ def report(
     data = open_study(store)
     with staged(out) as folder:
         found = write_study_report(folder, data)
-    _say_summary(members_ended(found), found.summaries)
+    say(members_ended(found))
+    _say_summary(found.summaries)
     say(f"written to {out}")
 
 
@@ -166,40 +167,32 @@ def _say_done(done: "StudyRun", out: Path) -> None:
     if not done.complete:
         say(f"this shard is done; {done.missing_chunks} chunks are left to other shards.")
     elif done.computed:
-        from snrmjax.study.analysis.outputs import scalars, summarized
+        from snrmjax.report.study.study_report import members_ended
+        from snrmjax.study.analysis.digest import digest
 
-        data = done.open()
-        _say_failures(data)
-        _say_summary(f"{done.members} members", list(map(summarized, scalars(data))))
+        found = digest(done.open())
+        (warn if found.failures.n_failed else say)(members_ended(found))
+        for fact in found.failures.facts:
+            say(str(fact))
+        _say_summary(found.summaries)
         say(f"{done.computed} members in {_duration(done.seconds)}; written to {out}")
         say(f"figures and tables of it: snrmjax study report {out} --out report")
     else:
         say(f"nothing was left to compute; {done.members} members are in {out}")
 
 
-def _say_failures(data: "xarray.Dataset") -> None:
-    """How many members have no whole result, by status, and what to do about it."""
-    from snrmjax.study.analysis.failures import failures_of
-
-    found = failures_of(data)
-    if found.n_failed:
-        each = ", ".join(f"{count} {status}" for status, count in found.failed_counts.items())
-        warn(f"{found.n_failed} of {len(found.failed)} members have no whole result: {each}.")
-    for fact in found.facts:
-        say(str(fact))
-
-
-def _say_summary(title: str, summaries: "Sequence[ScalarSummary]") -> None:
+def _say_summary(summaries: "Sequence[ScalarSummary]") -> None:
     """The outputs that vary, as a table."""
     from rich.table import Table
     from rich.text import Text
 
     from snrmjax.report.study.study_report import summary_table
 
-    rows = [row for row in summaries if row.varies and not row.scalar.is_count]
+    rows = [row for row in summaries if (row.varies or row.outside) and not row.scalar.is_count]
     shown = summary_table(rows[:_ROWS_SAID], "")
-    table = Table(title=title, title_justify="left", title_style="", box=None)
-    said = [shown.header.index(name) for name in ("output", "unit", "median", "95 % range")]
+    table = Table(box=None)
+    columns = ("output", "unit", "members", "median", "95 % range")
+    said = [shown.header.index(name) for name in columns]
     for k in said:
         table.add_column(shown.header[k], no_wrap=k > 0)
     for row in shown.rows:

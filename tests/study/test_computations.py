@@ -145,9 +145,14 @@ def test_a_range_without_the_resonance_has_a_status_of_its_own(linear_model, tmp
     assert data.status.values.tolist() == ["upper_end", *2 * [MemberStatus.NO_PEAK]]
     np.testing.assert_array_equal(np.isnan(data.peak_frequency_hz), [False, True, True])
     found = digest(data)
-    assert found.failures.n_outside == found.failures.n_failed == 2
-    assert members_ended(found) == "3 members, none failed; 2 have no peak in the range."
-    assert Fact("no_peak_in_range", n_members=2) in found.facts
+    assert data.peak_side.values.tolist() == [0, -1, 1]
+    assert found.failures.n_failed == 2
+    ended = "3 members, of which 2 have no whole result: 2 no_peak_in_range."
+    assert members_ended(found) == ended
+    assert Fact("no_peak_in_range", n_members=2, below=1, above=1) in found.facts
+    row = next(s for s in found.summaries if s.scalar.name == "peak_frequency_hz")
+    assert (row.members, row.missing, row.below, row.above) == (3, 0, 1, 1)
+    assert row.quantiles[[0, 2, 4]].tolist() == [-np.inf, data.peak_frequency_hz[0], np.inf]
 
 
 def test_a_peak_below_the_response_at_the_end_of_the_range_is_not_the_highest(tmp_path):

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from snrmjax.report.sentences import Wording, number_of
+from snrmjax.report.sentences import Wording, enumerated, number_of
 
 _MOST = 4  # outputs that a sentence lists
 
@@ -32,9 +32,36 @@ def _outputs(outputs: Sequence[tuple[str, float | None]]) -> str:
     return _some([readable(*output) for output in outputs])
 
 
+def _outside(
+    output: tuple[str, float | None],
+    ends: tuple[float, float],
+    below: int,
+    above: int,
+    members: int,
+) -> str:
+    sides = ((below, f"below {ends[0]:.4g} Hz"), (above, f"above {ends[1]:.4g} Hz"))
+    where = enumerated([f"{side} in {n}" for n, side in sides if n])
+    return (
+        f"{readable(*output)} lies {where} of {members} members: medians and ranges count them "
+        "there, shares of variance are of the others alone"
+    )
+
+
+def _without_peak(n_members: int, below: int, above: int) -> str:
+    sides = (
+        (above, f"above the range in {above}: raise `to_hz`"),
+        (below, f"below the range in {below}: lower `from_hz`"),
+    )
+    where = [text for n, text in sides if n] or ["widen the range"]
+    return (
+        f"{number_of(n_members, 'member')} without a peak between `from_hz` and `to_hz` (status "
+        f"no_peak_in_range); {'the peak lies ' if below or above else ''}{', '.join(where)}"
+    )
+
+
 def _missing(outputs: Sequence[tuple[str, float | None, int, int]]) -> str:
     each = [f"{readable(name, force)} ({k} of {n})" for name, force, k, n in outputs]
-    return f"members without a value are left out: {_some(each)}"
+    return f"what is said is of the members with a value; without one are: {_some(each)}"
 
 
 def _together(pairs: Sequence[tuple[str, str]]) -> str:
@@ -63,16 +90,16 @@ SENTENCES: dict[str, Wording] = {
         "in some responses a fold, peak or resonance is there but was not located: see "
         "n_not_located"
     ),
-    "no_peak_in_range": (
-        "{n_members:#member} without a peak between `from_hz` and `to_hz` (status "
-        "no_peak_in_range): widen the range"
-    ),
+    "values_outside": _outside,
+    "no_peak_in_range": _without_peak,
     "highest_at_range_end": (
         "{n_members:#member} with a response that is higher at an end of the range than at its "
         "highest peak (status highest_at_range_end): widen the range, or narrow it to leave the "
         "other resonance out"
     ),
-    "rows_without_value": "{output} has no value in {share:%.2g} of the rows: they are left out",
+    "rows_without_value": (
+        "{output} has no value in {share:%.2g} of the rows: its indices are of the others alone"
+    ),
     "first_order_wrong": (
         "first order is wrong for {quantity} by {error:%.0f}: its 95 % range is {first[0]:.6g} to "
         "{first[1]:.6g}, by second order {second[0]:.6g} to {second[1]:.6g}; it errs by 10 % from "

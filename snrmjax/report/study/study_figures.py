@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from snrmjax.report.sentences.study import readable
-from snrmjax.report.study.words import Display, display_on_axis
+from snrmjax.report.study.words import Display, display_on_axis, of_members
 from snrmjax.report.style import (
     COLUMN,
     IDENTIFIED,
@@ -26,13 +26,14 @@ from snrmjax.report.style import (
 from snrmjax.study.analysis.bands import Band, CurveBands
 from snrmjax.study.analysis.digest import OutputEffects
 from snrmjax.study.analysis.failures import Failures, failure_share
-from snrmjax.study.analysis.outputs import Scalar
+from snrmjax.study.analysis.outputs import Scalar, summarized
 from snrmjax.study.uncertainty.sensitivity import FEWEST
 
 _BINS = 40
 _ROW = 2.3  # inches: the height of a row of panels
 _ACROSS = 3  # panels beside one another
 _DOTS = 400  # of a scatter: more hide one another
+_LINES = 3  # of a title: of the largest forces
 _PALE, _CLOUD = 0.13, 0.35
 
 
@@ -74,17 +75,32 @@ def _histogram(axes: Axes, output: Sequence[Scalar]) -> None:
         if not values.size:
             continue
         name = _force(one.force) or "members"
-        low, median, high = np.percentile(values, [2.5, 50.0, 97.5])
+        low, _, median, _, high = summarized(one).quantiles / shown.size
         drawn: Style = {"color": colour, "alpha": 0.45, "label": name}
         axes.hist(np.clip(values, edges[0], edges[-1]), edges.tolist(), **drawn)
         if not one.is_count:
-            axes.axvline(median, color=colour, linewidth=LINE)
-            for end in (low, high):
-                axes.axvline(end, color=colour, linewidth=0.9, linestyle=":")
+            for at, style in ((median, "-"), (low, ":"), (high, ":")):
+                width = LINE if style == "-" else 0.9
+                if np.isfinite(at):
+                    axes.axvline(at, color=colour, linewidth=width, linestyle=style)
     if not output[0].is_count:
         axes.plot([], [], color="0.3", linewidth=LINE, label="median")
         axes.plot([], [], ":", color="0.3", linewidth=0.9, label="95 % range")
-    name_axes(axes, plain(readable(output[0].name)), plain(shown.unit), "Members")
+    title = plain(f"{readable(output[0].name)}{_part(output)}")
+    name_axes(axes, title, plain(shown.unit), "Members")
+
+
+def _part(output: Sequence[Scalar]) -> str:
+    """How many members have a number and how many lie outside the range, a line where not all."""
+    lines = []
+    for row in map(summarized, output):
+        known = row.described - row.outside
+        if known < row.members:
+            sides = ((row.below, "below"), (row.above, "above"))
+            beyond = [f"{n} {where}" for n, where in sides if n]
+            force = [_force(row.scalar.force)] if row.scalar.force is not None else []
+            lines.append(", ".join([*force, of_members(known, row.members), *beyond]))
+    return "".join(f"\n{line}" for line in lines[-_LINES:])
 
 
 def main_effects_figure(
@@ -158,6 +174,9 @@ def _share(axes: Axes, shown: OutputEffects, name: str) -> None:
         return
     low, high = (f"{value:.0f}" for value in (min(shares), max(shares)))
     text = f"{low} %" if low == high else f"{low} to {high} %"
+    least = min(output.n_known for output in shown.outputs)
+    if least < len(shown.outputs[0].values):
+        text += f" (of {least} of {len(shown.outputs[0].values)})"
     axes.set_title(text, loc="left", fontsize=SMALL, color="0.25")
 
 

@@ -19,7 +19,7 @@ from snrmjax.report.study.study_figures import (
     main_effects_figure,
     short_name,
 )
-from snrmjax.report.study.words import display
+from snrmjax.report.study.words import display, in_words, of_members
 from snrmjax.report.style import printed
 from snrmjax.study.analysis.bands import SAMPLED, curve_bands
 from snrmjax.study.analysis.digest import StudyDigest, digest, effects_frame, ranked_effects
@@ -41,20 +41,22 @@ _ANSWERS, _MOST_ANSWERS = ("verdict", "effects"), 12
 _TELLING = 5  # quantities along which failures are drawn
 
 DISTRIBUTIONS = (
-    "How the outputs are distributed over the members. Lines are the median and, dotted, the ends "
-    "of the 95 % range; what lies beyond the outermost thousandth on either side is counted in the "
+    "How the outputs are distributed over the members that have them, whose number stands above "
+    "each panel where it is not all. Lines are the median and, dotted, the ends "
+    "of the 95 % range, members beyond the range of frequencies included; what lies beyond the outermost thousandth on either side is counted in the "
     "last bars."
 )
 EFFECTS = (
     "Each output (rows) over each varied quantity (columns). Dots are some of the members, lines "
-    "the mean of all members with that value, with its 95 % band. Above a panel: the share of the "
+    "the mean of all members with that value, with its 95 % band; members without a number are in "
+    "neither. Above a panel: the share of the "
     "output's variance that the quantity makes alone. Dots far from the line that one panel shows "
     "are the work of the other quantities."
 )
 BANDS = (
-    "Curves of all members: median, 95 % and all of them at each place. Where a response folds, it "
+    "Curves of the members: median, 95 % and all of those that have a curve at each place. Where a response folds, it "
     "has several values at a frequency; the highest and the lowest are drawn apart. Bands end "
-    "where fewer than nine tenths of the members have a curve: the rest would tell of itself only."
+    "where fewer than nine tenths of all members have a curve: the rest would tell of itself only."
 )
 FAILED = (
     "Where members have no whole result: over the two quantities in which they differ most from "
@@ -98,13 +100,12 @@ def write_study_report(folder: Path, data: "xarray.Dataset") -> StudyDigest:
 
 
 def members_ended(study: StudyDigest) -> str:
-    """How many members failed, or have no peak in the range, in one sentence."""
-    outside = study.failures.n_outside
-    failed = study.failures.n_failed - outside
-    text = f"{study.n_members} members, " + (
-        f"of which {failed} failed" if failed else "none failed"
-    )
-    return text + (f"; {outside} have no peak in the range." if outside else ".")
+    """How many members have no whole result, and of each kind of failure, in one sentence."""
+    failures = study.failures
+    if not failures.n_failed:
+        return f"{study.n_members} members, all with a whole result."
+    each = ", ".join(f"{count} {name}" for name, count in failures.failed_kinds)
+    return f"{study.n_members} members, of which {failures.n_failed} have no whole result: {each}."
 
 
 def study_sentence(study: StudyDigest) -> str:
@@ -115,21 +116,25 @@ def study_sentence(study: StudyDigest) -> str:
     (row,) = (
         s for s in study.summaries if (s.scalar.name, s.scalar.force) == (last.name, last.force)
     )
-    shown = display(row.quantiles, last.unit)
-    low, _, median, _, high = (number(v) for v in row.quantiles / shown.size)
-    unit = f" {shown.unit}" if shown.unit else ""
-    title = readable(last.name, last.force)
-    text = f"{title}: median {median}{unit}, 95 % of the members {low} to {high}{unit}"
+    shown = display(np.array([row.least, row.most]), last.unit)
+    title, unit = readable(last.name, last.force), f" {shown.unit}" if shown.unit else ""
+    median, wide = _median_and_range(row)
+    whose = "the members"
+    if row.missing:
+        title, whose = f"{title} of {of_members(row.described, row.members)}", "these"
+    text = f"{title}: median {median}{unit}, 95 % of {whose} {wide}{unit}"
     order = ranked_effects(effects)
     if order:
         name, one = order[0]
         text += f"; {name} alone makes {100 * max(one.share, 0.0):.0f} % of its variance"
+        if last.n_known < row.members:
+            text += f" over the {last.n_known} members with a value"
     return f"{members_ended(study)} {text}."
 
 
 def summary_table(rows: Sequence[ScalarSummary], caption: str) -> ReportTable:
     """Of each output: mean, deviation, median, 95 % range, extremes."""
-    header = ("output", "unit", "mean ± 1σ", "median", "95 % range", "min to max", "without value")
+    header = ("output", "unit", "members", "mean ± 1σ", "median", "95 % range", "min to max")
     return ReportTable(header, [_cells(row) for row in rows], caption)
 
 
@@ -137,16 +142,25 @@ def _cells(row: ScalarSummary) -> tuple[str, ...]:
     ends = np.array([row.least, row.most])
     shown = display(ends, row.scalar.unit)
     title = readable(row.scalar.name, row.scalar.force)
-    if row.missing == row.members:
-        return (title, shown.unit, "", "", "", "", f"all {row.members}")
-    low, _, median, _, high = (number(v) for v in row.quantiles / shown.size)
-    least, most = (number(v) for v in ends / shown.size)
+    members = str(row.members) if not row.missing else f"{row.described} of {row.members}"
+    if not row.described:
+        return (title, shown.unit, members, "", "", "", "")
+    sides = ((row.below, -np.inf), (row.above, np.inf))
+    beyond = [f"{n} {in_words(end, ends=row.scalar.ends)}" for n, end in sides if n]
+    mean = f"{number(row.mean / shown.size)} ± {number(row.std / shown.size, 2)}"
+    extremes = in_words(row.least, row.most, ends=row.scalar.ends, shown=shown)
     return (
-        *(title, shown.unit),
-        f"{number(row.mean / shown.size)} ± {number(row.std / shown.size, 2)}",
-        *(median, f"{low} to {high}", f"{least} to {most}"),
-        str(row.missing) if row.missing else "",
+        *(title, shown.unit, ", ".join([members, *beyond])),
+        *("" if row.outside else mean, *_median_and_range(row), extremes),
     )
+
+
+def _median_and_range(row: ScalarSummary) -> tuple[str, str]:
+    """Median and 95 % range of an output, in the unit in which its table shows it."""
+    shown = display(np.array([row.least, row.most]), row.scalar.unit)
+    low, _, median, _, high = row.quantiles.tolist()
+    given = {"ends": row.scalar.ends, "shown": shown}
+    return in_words(median, **given), in_words(low, high, **given)
 
 
 def _effects_table(study: StudyDigest) -> ReportTable:
@@ -163,13 +177,20 @@ def _effects_table(study: StudyDigest) -> ReportTable:
             cells = [cell(*pair) for pair in order[:_RANKS]]
             cells += [""] * (_RANKS - len(cells))
             title = readable(output.name, output.force)
-            rows.append((title, *cells, f"{100 * max(rest, 0.0):.0f} %"))
+            rows.append(
+                (
+                    title,
+                    of_members(output.n_known, study.n_members),
+                    *cells,
+                    f"{100 * max(rest, 0.0):.0f} %",
+                )
+            )
     return ReportTable(
-        ("output", *(f"{k + 1}." for k in range(_RANKS)), "not by one alone"),
+        ("output", "of", *(f"{k + 1}." for k in range(_RANKS)), "not by one alone"),
         rows,
         "Share of the output's variance that each quantity makes alone (first-order index, ± 95 %),"
         " the strongest first. The last column is left to interactions and, in tests, to noise. "
-        "All shares are in main_effects.csv.",
+        "Shares are of the members that have a number; all shares are in main_effects.csv.",
     )
 
 
@@ -211,7 +232,11 @@ def _distributions(folder: Path, study: StudyDigest) -> Section:
         name = "distributions" if len(shown) <= _PANELS else f"distributions_{k // _PANELS + 1}"
         figure = distributions_figure(shown[k : k + _PANELS])
         figures.append(_saved(folder, name, figure, DISTRIBUTIONS))
-    caption = "All outputs over the members; further quantiles are in summary.csv."
+    caption = (
+        "The outputs over the members that have them, as the column of members says; where a value "
+        "is known to lie outside the computed range, the member counts there. Further quantiles "
+        "are in summary.csv."
+    )
     rows = [
         row
         for row in study.summaries
@@ -256,21 +281,23 @@ def _answers(folder: Path, data: "xarray.Dataset") -> Section | None:
     names = [name for name in _ANSWERS if name in data]
     if not names:
         return None
+    answered = np.isin(data["status"].values.astype(str), COMPLETE)
     counts = [
-        (name.capitalize(), dict(Counter(data[name].values.astype(str).tolist()).most_common()))
-        for name in names
+        (name.capitalize(), dict(Counter(given.tolist()).most_common()))
+        for name, given in ((name, data[name].values.astype(str)[answered]) for name in names)
     ]
     drawn = [(name, dict(list(answers.items())[:_MOST_ANSWERS])) for name, answers in counts]
-    n = data.sizes[MEMBER]
+    n, whose = int(answered.sum()), of_members(int(answered.sum()), data.sizes[MEMBER])
     tables = [
         ReportTable(
             (name.lower(), "members", "share"),
             [(text or "none", str(k), f"{100 * k / n:.3g} %") for text, k in answers.items()],
+            f"Of {whose}: those with an answer." if n < data.sizes[MEMBER] else "",
             folded=f"All answers: {name.lower()}",
         )
         for name, answers in counts
     ]
-    caption = "How often each answer was given over the members."
+    caption = f"How often each answer was given: {whose}."
     figures = [_saved(folder, "answers", counts_figure(drawn), caption)]
     return Section("Answers", (), figures, tables)
 

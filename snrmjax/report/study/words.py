@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from snrmjax.report.html import ten_to
+from snrmjax.report.html import number, ten_to
 from snrmjax.report.style import unit_for
 
 _FEWEST_DIGITS, _MOST_DIGITS = -2, 4  # powers of ten that axes are written with
@@ -21,6 +21,28 @@ class Display(NamedTuple):
     def labelled(self, text: str) -> str:
         """A label with the unit."""
         return f"{text} ({self.unit})" if self.unit else text
+
+
+def in_words(
+    *values: float, ends: tuple[float, float] = (-np.inf, np.inf), shown: Display = Display(1.0, "")
+) -> str:
+    """A value, or from one to another; -inf and inf are below and above the ends of the range.
+
+    >>> in_words(84.0, np.inf, ends=(70.0, 110.0)), in_words(np.inf, np.inf, ends=(70.0, 110.0))
+    ('84 to above 110', 'above 110')
+    """
+    beyond = {-np.inf: f"below {number(ends[0])}", np.inf: f"above {number(ends[1])}"}
+    each = [beyond.get(value) or number(value / shown.size) for value in values]
+    return " to ".join(dict.fromkeys(each) if values[0] in beyond else each)
+
+
+def of_members(known: int, members: int) -> str:
+    """How many of the members something is said of.
+
+    >>> of_members(27, 100), of_members(100, 100)
+    ('27 of 100 members', '100 members')
+    """
+    return f"{members} members" if known == members else f"{known} of {members} members"
 
 
 def display(values: Float[np.ndarray, "..."], unit: str) -> Display:

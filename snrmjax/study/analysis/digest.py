@@ -72,6 +72,11 @@ class StudyDigest(NamedTuple):
         if self.quantities and self.effects:
             facts += self._on_shares()
         missing = [s for s in self.summaries if s.missing]
+        for s in (s for s in self.summaries if s.outside):
+            sides = {"below": s.below, "above": s.above, "members": s.described}
+            facts.append(
+                Fact("values_outside", output=_named(s.scalar), ends=s.scalar.ends, **sides)
+            )
         if missing:
             counts = tuple((*_named(s.scalar), s.missing, s.members) for s in missing)
             facts.append(Fact("values_missing", outputs=counts))
@@ -127,11 +132,12 @@ def ranked_effects(effects: Effects) -> list[tuple[str, MainEffect]]:
 
 
 def effects_frame(study: StudyDigest) -> pd.DataFrame:
-    """The table that is main_effects.csv: all shares of variance."""
+    """The table that is main_effects.csv: all shares of variance, of members with a number."""
     return pd.DataFrame(
         {
             "variable": output.name,
             **({} if output.force is None else {"force_n": output.force}),
+            "members": output.n_known,
             "varied": name,
             "first_order_share": one.share,
             "half_width_95": one.half_width,

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from snrmjax.numerics.facts import Fact
-from snrmjax.study.computations.base import COMPLETE, MemberStatus
+from snrmjax.study.computations.base import COMPLETE, PEAK_SIDE, MemberStatus
 
 if TYPE_CHECKING:
     import xarray
@@ -21,6 +21,8 @@ class Failures(NamedTuple):
     counts: dict[str, int]  # by status, of all members and forces
     failed: Bool[np.ndarray, " member"]
     status: np.ndarray  # of each member: the first that is no success, or its own
+    below: int  # members with a peak that is known to lie below the range of frequencies only
+    above: int
 
     @property
     def n_failed(self) -> int:
@@ -33,17 +35,19 @@ class Failures(NamedTuple):
         return dict(Counter(self.status[self.failed].tolist()).most_common())
 
     @property
-    def n_outside(self) -> int:
-        """How many members were computed but have their resonance outside the range."""
-        outside = MemberStatus.NO_PEAK, MemberStatus.HIGHEST_AT_END
-        return sum(self.failed_counts.get(name, 0) for name in outside)
+    def failed_kinds(self) -> tuple[tuple[str, int], ...]:
+        """The same by the names of the statuses alone, without reasons."""
+        kinds = (name.partition(":")[0] for name in self.status[self.failed].tolist())
+        return tuple(Counter(kinds).most_common())
 
     @property
     def facts(self) -> tuple[Fact, ...]:
         """What to do about members whose resonance is not in the range of a study of peaks."""
         facts, counts = [], self.failed_counts
         if MemberStatus.NO_PEAK in counts:
-            facts.append(Fact("no_peak_in_range", n_members=counts[MemberStatus.NO_PEAK]))
+            n_members = counts[MemberStatus.NO_PEAK]
+            sides = {"below": self.below, "above": self.above}
+            facts.append(Fact("no_peak_in_range", n_members=n_members, **sides))
         if MemberStatus.HIGHEST_AT_END in counts:
             n_members = counts[MemberStatus.HIGHEST_AT_END]
             facts.append(Fact("highest_at_range_end", n_members=n_members))
@@ -66,7 +70,9 @@ def failures_of(data: "xarray.Dataset") -> Failures:
     bad = np.asarray(~np.isin(rows, COMPLETE))
     worst = rows[np.arange(len(rows)), np.argmax(bad, axis=1)]
     counts = Counter(status.ravel().tolist())
-    return Failures(dict(counts.most_common()), np.any(bad, axis=1), worst)
+    side = data[PEAK_SIDE].values if PEAK_SIDE in data else np.zeros(status.shape)
+    below, above = (int(np.sum((s * side > 0).reshape(len(rows), -1).any(axis=1))) for s in (-1, 1))
+    return Failures(dict(counts.most_common()), np.any(bad, axis=1), worst, below, above)
 
 
 def failure_share(

@@ -1,5 +1,6 @@
 """What a study's data set has one number of for every member, and how it is distributed."""
 
+import json
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -7,7 +8,8 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
-from snrmjax.study.computations.base import FORCE, MEMBER
+from snrmjax.numerics.units import HERTZ
+from snrmjax.study.computations.base import FORCE, MEMBER, PEAK_SIDE
 from snrmjax.study.computations.tests import SHARE
 
 if TYPE_CHECKING:
@@ -15,17 +17,27 @@ if TYPE_CHECKING:
 
 QUANTILES = (2.5, 25.0, 50.0, 75.0, 97.5)  # per cent
 _ENDS = ((0, "smallest"), (-1, "largest"))
+_OF_THE_PEAK = ("peak_frequency_hz", "resonance_frequency_hz")
 _ROUNDING = 1e-12  # relative differences that are none
 
 
 class Scalar(NamedTuple):
-    """One number of every member, NaN where a member has none."""
+    """One number of every member, NaN where a member has none.
+
+    A frequency that is known to lie beyond an end of the computed range is -inf or inf.
+    """
 
     name: str  # of the variable
     unit: str
     meaning: str
     values: Float[np.ndarray, " member"]
     force: float | None = None  # N, where members are computed for several forces
+    ends: tuple[float, float] = (-np.inf, np.inf)  # of the range, in the same unit
+
+    @property
+    def n_known(self) -> int:
+        """How many members have a number."""
+        return int(np.isfinite(self.values).sum())
 
     @property
     def is_count(self) -> bool:
@@ -40,38 +52,76 @@ class Scalar(NamedTuple):
 
 
 class ScalarSummary(NamedTuple):
-    """How one output is distributed over the members; NaN where no member has a value."""
+    """How one output is distributed over the members that have it.
+
+    Members of which it is known that their value lies below or above the computed range count with
+    the others: quantiles and extremes are -inf or inf where they lie there, and no mean is known.
+    NaN where no member has a value.
+    """
 
     scalar: Scalar  # without its values
     varies: bool
     members: int
-    missing: int  # members without a value
+    missing: int  # members of which nothing is known: all the rest is of the others
+    below: int  # members below the range, of the others
+    above: int
     mean: float
     std: float  # of a sample: n - 1
     least: float
     quantiles: Float[np.ndarray, " quantile"]
     most: float
 
+    @property
+    def described(self) -> int:
+        """Members whose distribution this is."""
+        return self.members - self.missing
+
+    @property
+    def outside(self) -> int:
+        """Members whose value lies beyond the computed range."""
+        return self.below + self.above
+
 
 def summarized(scalar: Scalar) -> ScalarSummary:
     """The distribution of one output."""
-    n, known = len(scalar.values), scalar.values[np.isfinite(scalar.values)]
+    n, known = len(scalar.values), scalar.values[~np.isnan(scalar.values)]
+    below, above = int(np.sum(known == -np.inf)), int(np.sum(known == np.inf))
     whole = known if known.size else np.array([np.nan])
+    whole_range = not (below or above)
     return ScalarSummary(
         scalar=scalar._replace(values=np.zeros(0)),
         varies=scalar.varies,
         members=n,
         missing=n - known.size,
-        mean=float(whole.mean()),
-        std=float(np.std(known, ddof=1)) if known.size > 1 else np.nan,
+        below=below,
+        above=above,
+        mean=float(whole.mean()) if whole_range else np.nan,
+        std=float(np.std(known, ddof=1)) if whole_range and known.size > 1 else np.nan,
         least=float(whole.min()),
-        quantiles=np.percentile(whole, QUANTILES),
+        quantiles=_quantiles(whole),
         most=float(whole.max()),
     )
 
 
+def _quantiles(values: Float[np.ndarray, " member"]) -> Float[np.ndarray, " quantile"]:
+    """Between two members on a straight line, or the nearest one where one of them is infinite."""
+    finite = values[np.isfinite(values)]
+    if finite.size == values.size:
+        return np.percentile(values, QUANTILES)
+    nearest = np.percentile(values, QUANTILES, method="nearest")
+    if not finite.size:
+        return nearest
+    between = np.percentile(np.clip(values, finite.min(), finite.max()), QUANTILES)
+    around = [np.percentile(values, QUANTILES, method=m) for m in ("lower", "higher")]
+    return np.where(np.isfinite(around).all(axis=0), between, nearest)
+
+
 def summary_frame(rows: Iterable[ScalarSummary]) -> pd.DataFrame:
-    """The table that is summary.csv, in the units of the data set."""
+    """The table that is summary.csv, in the units of the data set.
+
+    Statistics are of the `members` but those `without_value`; -inf and inf are below and above the
+    computed range.
+    """
     return pd.DataFrame(
         {
             "variable": row.scalar.name,
@@ -79,6 +129,8 @@ def summary_frame(rows: Iterable[ScalarSummary]) -> pd.DataFrame:
             "unit": row.scalar.unit,
             "members": row.members,
             "without_value": row.missing,
+            "below_range": row.below,
+            "above_range": row.above,
             "mean": row.mean,
             "std": row.std,
             "min": row.least,
@@ -107,10 +159,15 @@ def scalars(data: "xarray.Dataset") -> Iterator[Scalar]:
     """
     for key, variable in data.data_vars.items():
         name = str(key)
-        if variable.dtype.kind not in "fi" or name.startswith("first_"):
+        if variable.dtype.kind not in "fi" or name.startswith("first_") or name == PEAK_SIDE:
             continue
         meaning, unit = variable.attrs.get("long_name", ""), variable.attrs.get("units", "")
-        if variable.dims in ((MEMBER,), (MEMBER, FORCE)):
+        if name in _OF_THE_PEAK and PEAK_SIDE in data:
+            side = data[PEAK_SIDE].values
+            values = variable.values
+            values = np.where(np.isnan(values) & (side != 0), np.copysign(np.inf, side), values)
+            yield from _by_force(data, name, unit, meaning, values, range_of(data))
+        elif variable.dims in ((MEMBER,), (MEMBER, FORCE)):
             yield from _by_force(data, name, unit, meaning, variable.values)
         elif variable.dims == (MEMBER, SHARE):
             for k, which in _ENDS:
@@ -120,20 +177,35 @@ def scalars(data: "xarray.Dataset") -> Iterator[Scalar]:
     if "fold_frequency_hz" in data:
         folds = data["fold_frequency_hz"].values
         has, first = data["n_folds"].values > 0, data["first_fold"].values
-        for which, reduce in (("lowest", np.fmin), ("highest", np.fmax)):
+        for which, reduce, end in (("lowest", np.fmin, -1), ("highest", np.fmax, 1)):
             values = np.full(has.shape, np.nan)
             if has.any():  # rows are in the order of members: one's end is the next one's beginning
                 values[has] = reduce.reduceat(folds, first[has])
-            text = f"{which} frequency at which the response folds"
-            yield from _by_force(data, f"{which}_fold_frequency_hz", "Hz", text, values)
+            text, ends = f"{which} frequency at which the response folds", {}
+            if PEAK_SIDE in data:
+                # A curve that leaves the range between its folds has one of them beyond it.
+                beyond = (data["n_folds"].values % 2 == 1) & (data[PEAK_SIDE].values == end)
+                values, ends = np.where(beyond, end * np.inf, values), {"ends": range_of(data)}
+            yield from _by_force(data, f"{which}_fold_frequency_hz", "Hz", text, values, **ends)
+
+
+def range_of(data: "xarray.Dataset") -> tuple[float, float]:
+    """The ends of the frequency range of a study of responses, in Hz."""
+    within = json.loads(data.attrs["study"])["study"]["computation"]["within"]
+    return within["from_frequency"] / HERTZ, within["to_frequency"] / HERTZ
 
 
 def _by_force(
-    data: "xarray.Dataset", name: str, unit: str, meaning: str, values: np.ndarray
+    data: "xarray.Dataset",
+    name: str,
+    unit: str,
+    meaning: str,
+    values: np.ndarray,
+    ends: tuple[float, float] = (-np.inf, np.inf),
 ) -> Iterator[Scalar]:
     numbers = np.asarray(values, dtype=np.float64)
     if numbers.ndim == 1:
-        yield Scalar(name, unit, meaning, numbers)
+        yield Scalar(name, unit, meaning, numbers, ends=ends)
         return
     for force, column in zip(data[FORCE].values.tolist(), numbers.T, strict=True):
-        yield Scalar(name, unit, meaning, column, force)
+        yield Scalar(name, unit, meaning, column, force, ends)

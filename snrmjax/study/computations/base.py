@@ -15,6 +15,7 @@ from snrmjax.model.structures import Structure
 MEMBER = "member"
 FORCE = "force_n"
 TEXT = "text"
+PEAK_SIDE = "peak_side"
 
 
 class MemberStatus(StrEnum):

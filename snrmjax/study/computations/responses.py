@@ -13,6 +13,7 @@ from snrmjax.simulate.continuation.response_curve import ResponseCurve
 from snrmjax.simulate.solutions.forced_response import ResponseSettings, forced_response_batch
 from snrmjax.study.computations.base import (
     COMPLETE,
+    PEAK_SIDE,
     TEXT,
     AbstractComputation,
     Axis,
@@ -61,6 +62,9 @@ class AbstractResponses(AbstractComputation):
             "peak_velocity_m_s": Output(at, "f8", "m/s", "velocity at the highest peak"),
             "resonance_frequency_hz": Output(at, "f8", "Hz", "strongest phase resonance"),
             "resonance_velocity_m_s": Output(at, "f8", "m/s", "velocity at phase resonance"),
+            PEAK_SIDE: Output(
+                at, "i1", "1", "1: peaks above the range only, -1: below it, 0: else"
+            ),
             "n_folds": Output(at, "i4", "1", "folds of the curve"),
             "n_not_located": Output(at, "i4", "1", "events that are there but were not located"),
             "fold_frequency_hz": Output(("fold",), "f8", "Hz", "frequency of a fold"),
@@ -83,6 +87,8 @@ class AbstractResponses(AbstractComputation):
             for name, one in batch.variables().items()
         }
         folds = np.concatenate([_at_folds(parts) for parts in batch.curves], axis=1)
+        ends = zip(batch.curves, rows["status"].ravel().tolist(), strict=True)
+        rows[PEAK_SIDE] = self.forces.shaped(np.array([peak_side(*e) for e in ends], dtype="i1"))
         return batch.curves, {**rows, "fold_frequency_hz": folds[0], "fold_velocity_m_s": folds[1]}
 
 
@@ -195,6 +201,25 @@ def peak_status(curves: Sequence[ResponseCurve], status: str) -> str:
     open_ended = [v for v, c in zip(speed, curves, strict=True) if c.status != CurveStatus.CLOSED]
     at_ends = max((max(v[0], v[-1]) for v in open_ended), default=0.0)
     return MemberStatus.HIGHEST_AT_END if at_ends > highest else status
+
+
+def peak_side(curves: Sequence[ResponseCurve], status: str) -> int:
+    """Beyond which end of the range a response without a peak in it has its peak.
+
+    The velocity of a structure under a bounded force falls to zero far from its resonances: where
+    the highest branch still rises at an end of the range, a peak lies beyond that end. Returns 1
+    for above, -1 for below; 0 where there is a peak in the range, where the curve stopped early,
+    and where the response rises at both ends or at none.
+    """
+    if peak_status(curves, status) != MemberStatus.NO_PEAK:
+        return 0
+    highest = {-1: (-np.inf, False), 1: (-np.inf, False)}
+    for curve in (one for one in curves if one.status != CurveStatus.CLOSED):
+        speed = np.abs(curve.velocity[:, 1, 0])
+        for end, inside in ((0, 1), (-1, -2)):
+            side = 1 if curve.frequency[end] > curve.frequency[inside] else -1
+            highest[side] = max(highest[side], (speed[end], bool(speed[end] > speed[inside])))
+    return int(highest[1][1]) - int(highest[-1][1])
 
 
 def velocity_bounds(

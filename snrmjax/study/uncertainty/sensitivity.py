@@ -27,7 +27,6 @@ _GROUPS = 20  # of the jackknife
 _SHOWN = 101
 _RESAMPLES = 200
 _FEWEST_ROWS = 16
-_FEW = 0.05  # share of the rows beyond which what is left out is worth a note
 _NORMAL_95 = 1.959964  # half width of the 95 % interval, in 1σ
 
 
@@ -62,6 +61,7 @@ class SobolIndices(AbstractResult):
     )
     variance: Float[np.ndarray, " quantity"] = quantity("quantity", "SI", "variance")
     rows: np.ndarray = quantity("quantity", "1", "rows of Saltelli's scheme used")
+    n_rows: int = setting()  # of the scheme
     names: tuple[str, ...] = quantity("quantity", "", "output", name="quantity", static=True)
     input_names: tuple[str, ...] = quantity(
         "input", "", "varied quantity", name="input", static=True
@@ -72,7 +72,9 @@ class SobolIndices(AbstractResult):
         """Inputs of every quantity by their total index."""
         lines = [f"Sobol' indices of {len(self.names)} quantities"]
         for q, name in enumerate(self.names):
-            lines.append(f"{name}: {np.sqrt(self.variance[q]):.3g} {self.units[q]} (1σ)")
+            spread = f"{name}: {np.sqrt(self.variance[q]):.3g} {self.units[q]} (1σ)"
+            part = f", of {self.rows[q]} of {self.n_rows} rows"
+            lines.append(spread + (part if self.rows[q] < self.n_rows else ""))
             for k in np.argsort(-self.total[q]).tolist():
                 lines.append(
                     f"  {self.input_names[k]}: first {self.first[q, k]:.3f} ±"
@@ -171,13 +173,14 @@ def sobol_indices(data: "xarray.Dataset", *, seed: int = 0) -> SobolIndices:
         total_half_width=total_half_width,
         variance=np.array(variance),
         rows=np.array(rows),
+        n_rows=data.sizes["member"] // a_row,
         names=tuple(columns),
         input_names=tuple(inputs),
         units=units,
         notes=tuple(
             Fact("rows_without_value", output=name, share=share)
             for name, share in zip(columns, missing.tolist(), strict=True)
-            if share > _FEW
+            if share > 0
         ),
     )
 

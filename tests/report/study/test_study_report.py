@@ -12,7 +12,11 @@ from typer.testing import CliRunner
 from snrmjax.cli import app
 from snrmjax.numerics.facts import Fact
 from snrmjax.report.study.study_figures import main_effects_figure
-from snrmjax.report.study.study_report import study_sentence, write_study_report
+from snrmjax.report.study.study_report import (
+    study_sentence,
+    summary_table,
+    write_study_report,
+)
 from snrmjax.report.study.words import display_on_axis
 from snrmjax.study.analysis.digest import digest
 from snrmjax.study.analysis.failures import failure_share, failures_of, most_telling
@@ -72,6 +76,19 @@ def test_summary_without_any_value():
     assert found.missing == 3
     assert np.isnan([found.mean, found.std, found.least, *found.quantiles]).all()
     assert not found.varies
+
+
+def test_members_beyond_the_range_count_on_their_side():
+    """Of 0…99 all above 39 are known to lie beyond 39: the quantiles are those of all hundred."""
+    values = np.where(np.arange(100.0) > 39, np.inf, np.arange(100.0))
+    found = summarized(Scalar("peak_frequency_hz", "Hz", "", values, ends=(0.0, 39.0)))
+    assert (found.described, found.above, found.below, found.missing) == (100, 60, 0, 0)
+    np.testing.assert_allclose(found.quantiles, [2.475, 24.75, np.inf, np.inf, np.inf])
+    assert np.isnan([found.mean, found.std]).all()
+    cells = summary_table([found], "").rows[0]
+    assert cells[2:] == ("100, 60 above 39", "", "above 39", "2.475 to above 39", "0 to above 39")
+    part = summarized(Scalar("peak_frequency_hz", "Hz", "", np.where(values > 39, np.nan, values)))
+    assert summary_table([part], "").rows[0][2] == "40 of 100"
 
 
 def test_summary_csv_has_every_output_and_force(written):
@@ -140,9 +157,13 @@ def test_the_page_is_whole_and_escaped(written):
     assert figures == {"distributions.png", "main_effects.png", "failures.png"}
     assert page.count("data:image/png;base64,") == len(figures)
     sentence = study_sentence(found)
-    assert sentence.startswith(f"{N} members, of which {found.failures.n_failed} failed.")
-    assert "Peak velocity at 0.002 N: median 0.6" in sentence
-    assert "a.b alone makes 100 % of its variance" in sentence
+    n_failed = found.failures.n_failed
+    ended = f"{N} members, of which {n_failed} have no whole result: {n_failed} step_too_small."
+    assert sentence.startswith(ended)
+    part = f"Peak velocity at 0.002 N of {N - n_failed} of {N} members: median 0.6"
+    assert part in sentence
+    assert "95 % of these " in sentence
+    assert f"100 % of its variance over the {N - n_failed} members with a value" in sentence
     assert sentence.replace("<", "&lt;") in page
 
 
