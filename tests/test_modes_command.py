@@ -122,6 +122,38 @@ def test_a_decay_gives_frequency_and_damping(folder, tmp_path):
     assert "not mass-normalised" in said
 
 
+@pytest.mark.parametrize("base", [False, True], ids=["force", "base"])
+def test_shape_times_participation_is_the_residue_without_a_scale(base, tmp_path):
+    """Two modes at two sensors, residues of either sign: the model has the response itself."""
+    omega, ratio = np.array([20.0, 24.0]) * HERTZ, np.array([0.004, 0.003])
+    residue = np.array([[-0.8, 0.5], [0.3, 0.2]])  # 1/kg, sensor by mode; 1 over a base
+    at = np.linspace(18, 26, 161) * HERTZ
+    poles = omega**2 - at[:, None] ** 2 + 2j * ratio * omega * at[:, None]
+    relative = 1j * at[:, None] * ((1 / poles) @ residue.T)
+    known = {"sensors": ("tip", "root"), "phase_std": np.full((len(at), 2), 1e-4)}
+    one, level = np.ones(len(at)), np.ones(len(at), dtype=int)
+    if base:
+        recorded = relative + 1 / (1j * at[:, None])
+        std = 1e-4 * np.abs(recorded)
+        data = sj.measure.base_excited_states(level, at, one, recorded, velocity_std=std, **known)
+    else:
+        std = 1e-4 * np.abs(relative)
+        data = sj.measure.steady_states(level, at, one, relative, velocity_std=std, **known)
+    sj.io.write_steady_states(tmp_path / "s.csv", data)
+    out = tmp_path / "model.toml"
+    words = ("--base", "absolute") if base else ()
+    code, said = run(tmp_path / "s.csv", "--unscaled", *words, "--out", out)
+    assert code == 0, said
+    modes = sj.read_model(out).modes
+    assert np.allclose(modes.mode_shape * modes.participation, residue, rtol=1e-3)
+    assert np.all(modes.participation < 0 if base else modes.participation > 0)
+    again = sj.io.read_steady_states(tmp_path / "s.csv", modes)
+    points = sj.identify_backbone(again, sj.read_model(out)).points
+    solved = np.asarray(points.natural_frequency)[np.asarray(points.status) == 0]
+    assert solved.size > 0
+    assert np.allclose(solved, omega[0], rtol=1e-3)
+
+
 BAD = [
     (("elsewhere.uff",), "no sensor is at the force"),
     (("conjugated.uff",), "negative damping"),

@@ -16,8 +16,6 @@ from snrmjax.pipelines.options import option
 from snrmjax.report.writing import staged
 
 if TYPE_CHECKING:
-    import xarray
-
     from snrmjax.study.analysis.outputs import ScalarSummary
     from snrmjax.study.run import Progress, ProgressReport, StudyRun
     from snrmjax.study.study import Study

@@ -45,13 +45,13 @@ def find_modes(
     if not isinstance(source, SteadyStates):
         of_decays = {name: settings[name] for name in _OF_DECAYS if name in settings}
         return fit_free_decay(source, **of_decays), ()
-    if source.base is not None and base is None:
-        if source.base.motion != "absolute":
-            raise ValueError(
-                "these states are of a moving base: say what the sensors record, `--base absolute` "
-                "or `--base relative`."
-            )
+    if source.base is not None and source.base.motion == "absolute":
         base = "relative"  # the base's motion is taken away already
+    elif source.base is not None and base is None:
+        raise ValueError(
+            "these states are of a moving base: say what the sensors record, `--base absolute` "
+            "or `--base relative`."
+        )
     levels = levels_by_velocity(source)
     chosen = levels[0] if level is None else level
     lowest = responses_of_states(source, chosen)

@@ -233,9 +233,10 @@ def scale_modes(
     m_f that is forced: p² = −Σ m A/m_f. A known shape: p = A/φ.
     Signs: a participation is positive, over a base's acceleration negative (the force is −Γa).
 
-    Arguments: `by` None gives relative shapes, one at the largest sensor, which is all that free
-    decays tell; `calibration` newtons per volt where the reference is a voltage; `free` adds the
-    rigid-body mode that the low residuals show, or that of a stated mass.
+    Arguments: `by` None gives relative shapes, ±1 at the largest sensor; p then has the size of the
+    residue there, so that φp = A at every sensor. Free decays tell no residue: their p is one.
+    `calibration` has newtons per volt where the reference is a voltage; `free` adds the rigid-body
+    mode that the low residuals show, or that of a stated mass.
     Returns `ScaledModes`; modes that hardly move the drive point are left out, with a note.
     Raises `ValueError` in a sentence where a scale cannot be had: no sensor at the force, a
     voltage without newtons per volt, a free decay, a negative residue at the drive point (a sensor
@@ -250,28 +251,31 @@ def scale_modes(
                 "the shapes cannot be mass-normalised: a free decay has no force; take "
                 "frequencies and damping alone (unscaled), or measure frequency responses."
             )
-        return _unscaled(fit, fit.shape, fit.shape_std, np.ones(fit.n_modes), "N")
+        unknown = np.full(fit.n_modes, np.nan)
+        return _unscaled(fit, (fit.shape, fit.shape_std), (np.ones(fit.n_modes), unknown), "N")
     gain, gain_std = _newtons(fit, by, calibration)
     residue, covariance = fit.residue / gain, fit.mode_covariance[:, 2:, 2:] / gain**2
     top, at = np.argmax(np.abs(residue), axis=0), np.arange(fit.n_modes)
     largest = residue[top, at]
     per = _PER.get(fit.reference.quantity, fit.reference.quantity)
+    chain = np.hypot(gain_std, calibration.relative_std)
+    of_largest = np.sqrt(covariance[at, top, top]) / np.abs(largest)
+    per = "N" if gain != 1.0 else per
     if by is None:
         slopes = np.eye(len(residue))[top] / largest[:, None]
-        shape, spread = _shapes(residue, covariance, largest, slopes)
-        return _unscaled(fit, shape, spread, np.sign(largest), per)
-    scaled, chain = by.scaled(fit, residue), np.hypot(gain_std, calibration.relative_std)
+        p = -np.abs(largest) if fit.reference.quantity == "acceleration" else np.abs(largest)
+        size = p, np.hypot(of_largest, chain)
+        return _unscaled(fit, _shapes(residue, covariance, p, slopes), size, per)
+    scaled = by.scaled(fit, residue)
     p, slopes, keep = scaled.participation, scaled.by_residues, scaled.keep
     shape, spread = _shapes(residue, covariance, p, slopes)
     shared = np.hypot(scaled.relative_std, chain * scaled.exponent)
     of_participation = np.einsum("ki,kij,kj->k", slopes, covariance, slopes)
     relative = of_participation + scaled.relative_std**2 + (chain * (1 - scaled.exponent)) ** 2
-    of_largest = np.sqrt(covariance[at, top, top]) / np.abs(largest)
     rigid = rigid_body_mode(
         *(fit, gain, None if free is None else free.mass or 0.0),
         *(_drive_point_of(fit), scaled.by),
     )
-    per = "N" if gain != 1.0 else per
     volts = (Fact("participations_per_volt"),) if per == "V" else ()
     return ScaledModes(
         natural_frequency=fit.natural_frequency[keep],
@@ -312,13 +316,16 @@ def _shapes(
 
 def _unscaled(
     modes: LinearModalFit | DecayModes,
-    shape: np.ndarray,
-    shape_std: np.ndarray,
-    participation: np.ndarray,
+    shapes: tuple[np.ndarray, np.ndarray],
+    participations: tuple[np.ndarray, np.ndarray],
     per: str,
 ) -> ScaledModes:
-    """Modes with relative shapes: nothing gives their scale."""
-    unknown = np.full(modes.n_modes, np.nan)
+    """Modes with relative shapes: nothing gives their scale.
+
+    Arguments: shapes with their 1σ; participations with the relative 1σ of the residues.
+    """
+    (shape, shape_std), (participation, relative) = shapes, participations
+    residues_known = bool(np.all(np.isfinite(relative)))
     return ScaledModes(
         natural_frequency=modes.natural_frequency,
         natural_frequency_std=modes.natural_frequency_std,
@@ -327,15 +334,15 @@ def _unscaled(
         shape=shape,
         shape_std=shape_std,
         participation=participation,
-        participation_std=unknown,
-        modal_mass_std=unknown,
+        participation_std=np.abs(participation) * relative,
+        modal_mass_std=relative,
         rigid_shape=None,
         rigid_participation=0.0,
         sensors=modes.sensor_names,
         scaled_by=Fact("not_scaled"),
         per=per,
         mass_normalised=False,
-        notes=(*modes.notes, Fact("shapes_not_scaled")),
+        notes=(*modes.notes, Fact("shapes_not_scaled", residues_known=residues_known)),
     )
 
 

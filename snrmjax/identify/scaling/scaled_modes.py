@@ -19,8 +19,9 @@ class ScaledModes(AbstractResult):
     """Linear modes with shapes and participations; see `scale_modes`.
 
     `per` is the unit of what drives them: a participation is Φᵀb per newton, or per m/s² of a base,
-    or per volt. `mass_normalised` is False where nothing gave the scale: then each shape is one at
-    its largest sensor.
+    or per volt. `mass_normalised` is False where nothing gave the scale: then each shape is ±1 at
+    its largest sensor, and shape times participation is the fitted residue all the same, but for
+    free decays, which have none.
     """
 
     coordinates: ClassVar[tuple[str, ...]] = ("mode", "sensor")
@@ -64,7 +65,7 @@ class ScaledModes(AbstractResult):
             rigid = RigidBodyModes(
                 np.asarray(self.rigid_shape)[:, None], np.array([self.rigid_participation])
             )
-        known = self.mass_normalised and np.all(np.isfinite(self.modal_mass_std))
+        known = np.all(np.isfinite(self.modal_mass_std))
         return linear_modes(
             self.natural_frequency,
             self.damping_ratio,

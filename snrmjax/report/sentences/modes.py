@@ -80,9 +80,15 @@ SENTENCES: dict[str, Wording] = {
     "scaled_by_sensor_masses": "scaled by the masses at the sensors",
     "scaled_by_known_shape": "scaled by the shape stated at {sensor}",
     "not_scaled": "not scaled",
-    "shapes_not_scaled": (
-        "shapes and participations are not mass-normalised: only frequencies, damping ratios and "
-        "ratios of a shape hold; the gain of the force must be free in what follows"
+    "shapes_not_scaled": lambda residues_known: (
+        "shapes and participations are not mass-normalised: "
+        + (
+            "frequencies, damping ratios, ratios of a shape and the product of shape and "
+            "participation hold, but no modal mass or coefficient of a potential by itself"
+            if residues_known
+            else "only frequencies, damping ratios and ratios of a shape hold; the gain of the "
+            "force must be free in what follows"
+        )
     ),
     "participations_per_volt": (
         "participations are per volt: states with `drive_v` and the gain of the force in newtons "

@@ -19,7 +19,7 @@ from snrmjax.report.study.study_figures import (
     main_effects_figure,
     short_name,
 )
-from snrmjax.report.study.words import display, in_words, of_members
+from snrmjax.report.study.words import display, of_members, span_in_words
 from snrmjax.report.style import printed
 from snrmjax.study.analysis.bands import SAMPLED, curve_bands
 from snrmjax.study.analysis.digest import StudyDigest, digest, effects_frame, ranked_effects
@@ -43,7 +43,8 @@ _TELLING = 5  # quantities along which failures are drawn
 DISTRIBUTIONS = (
     "How the outputs are distributed over the members that have them, whose number stands above "
     "each panel where it is not all. Lines are the median and, dotted, the ends "
-    "of the 95 % range, members beyond the range of frequencies included; what lies beyond the outermost thousandth on either side is counted in the "
+    "of the 95 % range, members beyond the range of frequencies "
+    "included; what lies beyond the outermost thousandth on either side is counted in the "
     "last bars."
 )
 EFFECTS = (
@@ -54,8 +55,9 @@ EFFECTS = (
     "are the work of the other quantities."
 )
 BANDS = (
-    "Curves of the members: median, 95 % and all of those that have a curve at each place. Where a response folds, it "
-    "has several values at a frequency; the highest and the lowest are drawn apart. Bands end "
+    "Curves of the members: median, 95 % and all of those that have a curve at each place. "
+    "Where a response folds, it has several values at a frequency; the highest and the lowest are "
+    "drawn apart. Bands end "
     "where fewer than nine tenths of all members have a curve: the rest would tell of itself only."
 )
 FAILED = (
@@ -146,9 +148,9 @@ def _cells(row: ScalarSummary) -> tuple[str, ...]:
     if not row.described:
         return (title, shown.unit, members, "", "", "", "")
     sides = ((row.below, -np.inf), (row.above, np.inf))
-    beyond = [f"{n} {in_words(end, ends=row.scalar.ends)}" for n, end in sides if n]
+    beyond = [f"{n} {span_in_words(end, ends=row.scalar.ends)}" for n, end in sides if n]
     mean = f"{number(row.mean / shown.size)} ± {number(row.std / shown.size, 2)}"
-    extremes = in_words(row.least, row.most, ends=row.scalar.ends, shown=shown)
+    extremes = span_in_words(row.least, row.most, ends=row.scalar.ends, shown=shown)
     return (
         *(title, shown.unit, ", ".join([members, *beyond])),
         *("" if row.outside else mean, *_median_and_range(row), extremes),
@@ -159,8 +161,11 @@ def _median_and_range(row: ScalarSummary) -> tuple[str, str]:
     """Median and 95 % range of an output, in the unit in which its table shows it."""
     shown = display(np.array([row.least, row.most]), row.scalar.unit)
     low, _, median, _, high = row.quantiles.tolist()
-    given = {"ends": row.scalar.ends, "shown": shown}
-    return in_words(median, **given), in_words(low, high, **given)
+    spans = [
+        span_in_words(*values, ends=row.scalar.ends, shown=shown)
+        for values in ((median,), (low, high))
+    ]
+    return spans[0], spans[1]
 
 
 def _effects_table(study: StudyDigest) -> ReportTable:

@@ -23,13 +23,16 @@ class Display(NamedTuple):
         return f"{text} ({self.unit})" if self.unit else text
 
 
-def in_words(
-    *values: float, ends: tuple[float, float] = (-np.inf, np.inf), shown: Display = Display(1.0, "")
+_PLAIN = Display(1.0, "")
+
+
+def span_in_words(
+    *values: float, ends: tuple[float, float] = (-np.inf, np.inf), shown: Display = _PLAIN
 ) -> str:
     """A value, or from one to another; -inf and inf are below and above the ends of the range.
 
-    >>> in_words(84.0, np.inf, ends=(70.0, 110.0)), in_words(np.inf, np.inf, ends=(70.0, 110.0))
-    ('84 to above 110', 'above 110')
+    >>> span_in_words(84.0, np.inf, ends=(70.0, 110.0))
+    '84 to above 110'
     """
     beyond = {-np.inf: f"below {number(ends[0])}", np.inf: f"above {number(ends[1])}"}
     each = [beyond.get(value) or number(value / shown.size) for value in values]

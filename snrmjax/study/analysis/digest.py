@@ -73,7 +73,9 @@ class StudyDigest(NamedTuple):
             facts += self._on_shares()
         missing = [s for s in self.summaries if s.missing]
         for s in (s for s in self.summaries if s.outside):
-            sides = {"below": s.below, "above": s.above, "members": s.described}
+            counts = {"below": s.below, "above": s.above, "members": s.described}
+            one = Fact("values_outside", output=_named(s.scalar), ends=s.scalar.ends, **counts)
+            facts.append(one)
             facts.append(
                 Fact("values_outside", output=_named(s.scalar), ends=s.scalar.ends, **sides)
             )

@@ -62,9 +62,7 @@ class AbstractResponses(AbstractComputation):
             "peak_velocity_m_s": Output(at, "f8", "m/s", "velocity at the highest peak"),
             "resonance_frequency_hz": Output(at, "f8", "Hz", "strongest phase resonance"),
             "resonance_velocity_m_s": Output(at, "f8", "m/s", "velocity at phase resonance"),
-            PEAK_SIDE: Output(
-                at, "i1", "1", "1: peaks above the range only, -1: below it, 0: else"
-            ),
+            PEAK_SIDE: Output(at, "i1", "1", "peak above (1) or below (-1) the range"),
             "n_folds": Output(at, "i4", "1", "folds of the curve"),
             "n_not_located": Output(at, "i4", "1", "events that are there but were not located"),
             "fold_frequency_hz": Output(("fold",), "f8", "Hz", "frequency of a fold"),
