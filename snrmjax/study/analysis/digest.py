@@ -73,12 +73,9 @@ class StudyDigest(NamedTuple):
             facts += self._on_shares()
         missing = [s for s in self.summaries if s.missing]
         for s in (s for s in self.summaries if s.outside):
-            counts = {"below": s.below, "above": s.above, "members": s.described}
-            one = Fact("values_outside", output=_named(s.scalar), ends=s.scalar.ends, **counts)
-            facts.append(one)
-            facts.append(
-                Fact("values_outside", output=_named(s.scalar), ends=s.scalar.ends, **sides)
-            )
+            sides = {"ends": s.scalar.ends, "below": s.below, "above": s.above}
+            named = {"output": _named(s.scalar), "members": s.described}
+            facts.append(Fact("values_outside", **named, **sides))
         if missing:
             counts = tuple((*_named(s.scalar), s.missing, s.members) for s in missing)
             facts.append(Fact("values_missing", outputs=counts))
