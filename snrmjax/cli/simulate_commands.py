@@ -81,7 +81,8 @@ def simulate(
 ) -> None:
     """Simulate responses to a harmonic force, around their folds and with unstable parts.
 
-    Harmonic balance with arclength continuation. Writes response.csv and response.png.
+    Harmonic balance with arclength continuation. Writes response.csv, response.png, summary.json
+    and report.html.
     """
     from snrmjax.io.models import read_model
     from snrmjax.pipelines.simulate import simulate_responses
@@ -111,7 +112,7 @@ def simulate(
         )
         simulation.write(folder, found)
     tell(found)
-    written(out, "")
+    written(out)
 
 
 def nnm(

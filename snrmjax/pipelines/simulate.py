@@ -14,6 +14,8 @@ from snrmjax.simulate.continuation.continuation import CurveStatus
 from snrmjax.simulate.continuation.event_equations import FORCE, EventKind
 from snrmjax.simulate.continuation.response_curve import Branch, ResponseCurve
 from snrmjax.simulate.continuation.stability import Stability
+from snrmjax.simulate.solutions.branches_beyond import hidden_branches
+from snrmjax.simulate.solutions.elements_at_work import Hold, friction_hold, idle_elements
 from snrmjax.simulate.solutions.event_curves import EventCurve, follow_event
 from snrmjax.simulate.solutions.forced_response import ResponseSettings, forced_response
 from snrmjax.simulate.solutions.isolated_responses import isolated_responses
@@ -80,15 +82,16 @@ def simulate_responses(
     if follow and parameter != FORCE:
         checked_names(model, [parameter], "parameter")
     ends, settings = (from_hz * HERTZ, to_hz * HERTZ), ResponseSettings(harmonic_order=harmonics)
+    hold = friction_hold(model, *ends)
     curves: list[ResponseCurve] = []
     notes = list(_notes_on_equilibria(model))
     for force in forces:
         progress(force)
         main = forced_response(model, [force], *ends, harmonic_order=harmonics)
-        curves += main
+        mine = [*main]
         if isolated:
             further = isolated_responses(model, force, *ends, known=main, settings=settings)
-            curves += further
+            mine += further
             notes.append(
                 Fact(
                     "isolated_searched",
@@ -98,9 +101,13 @@ def simulate_responses(
                     n_failed=further.n_failed,
                 )
             )
+        notes += list(dict.fromkeys(n for curve in mine for n in _notes_on_curve(curve, hold)))
+        notes += _notes_on_force(model, mine, ends, settings)
+        curves += mine
     if not any(len(curve.frequency) for curve in curves):
-        raise ValueError("no response was found in this range; start farther from resonance.")
-    notes += [note for curve in curves for note in _notes_on_curve(curve)]
+        held = [str(note) for note in notes if note.kind == "held_by_friction"]
+        why = f": {held[0]}" if held else "; start farther from resonance."
+        raise ValueError(f"no response was found in this range{why}")
     estimates = [np.max(c.truncation, initial=0.0) for c in curves if c.truncation is not None]
     share = float(max(estimates, default=0.0))
     if share > _TRUNCATED:
@@ -214,8 +221,38 @@ def _sensor(model: Structure) -> str:
     return model.modes.sensors[reference_sensor(model.modes)]
 
 
-def _notes_on_curve(curve: ResponseCurve) -> Iterator[Fact]:
-    if curve.branch == Branch.MAIN and curve.status != CurveStatus.UPPER_END:
+def _notes_on_force(
+    model: Structure,
+    curves: Sequence[ResponseCurve],
+    ends: tuple[float, float],
+    settings: ResponseSettings,
+) -> Iterator[Fact]:
+    """What the responses to one force do not show: hidden branches, and elements without effect."""
+    shown, unit = [c for c in curves if len(c.frequency)], model.modes.force_unit
+    if not shown:
+        return
+    at = {"force": curves[0].force, "unit": unit}
+    sensor = model.modes.sensors.index(_sensor(model))
+    for one in hidden_branches(model, curves, *ends, settings=settings):
+        yield Fact(
+            "hidden_branch",
+            **at,
+            begins=bool(one.found_from < ends[0]),
+            at_hz=one.at_frequency / HERTZ,
+            to_hz=one.to_frequency / HERTZ,
+            velocity=float(one.amplitude[sensor]),
+            sensor=model.modes.sensors[sensor],
+            from_hz=one.found_from / HERTZ,
+        )
+    for idle in idle_elements(model, shown):
+        yield Fact("element_idle", **at, **idle._asdict())
+
+
+def _notes_on_curve(curve: ResponseCurve, hold: Hold | None) -> Iterator[Fact]:
+    no_start = curve.status == CurveStatus.NO_START
+    if hold is not None and no_start:
+        yield Fact("held_by_friction", force=curve.force, unit=curve.force_unit, **hold._asdict())
+    elif curve.branch == Branch.MAIN and curve.status != CurveStatus.UPPER_END:
         yield Fact("curve_ended", force=curve.force, status=curve.status)
     if curve.not_located:
         yield Fact("curve_events_not_located", force=curve.force, kinds=curve.not_located)

@@ -54,7 +54,8 @@ def test_check_and_import(files, tmp_path):
 def test_simulation(files, tmp_path):
     given = sj.read_model(files / "model.toml")
     found = sj.pipelines.simulate_responses(given, [1.0], 55, 65)
-    assert written(found, tmp_path / "out") == {"response.csv", "response.png"}
+    page = {"response.csv", "response.png", "summary.json", "report.html"}
+    assert written(found, tmp_path / "out") == page
     # A linear structure's largest response: Φ² F / (2ζω).
     (curve,) = found.curves
     modes = given.modes
@@ -69,7 +70,7 @@ def test_simulation(files, tmp_path):
     # The second force is on the curve from the first.
     np.testing.assert_allclose([events.force.min() for events in found.events], 1.0)
     assert written(found, tmp_path / "events") == {
-        *("response.csv", "response.png", "events.csv", "events.png"),
+        *(*page, "events.csv", "events.png"),
     }
     damped = sj.pipelines.simulate_responses(
         *(given, [1.0, 2.0], 55, 65),

@@ -1,10 +1,11 @@
-"""Simulated responses and normal modes: a table and a figure of each."""
+"""Simulated responses and normal modes: tables, figures and a page."""
 
 from pathlib import Path
 
 import numpy as np
 
 from snrmjax.io import results
+from snrmjax.io.files import write_summary
 from snrmjax.io.units import HERTZ
 from snrmjax.pipelines.simulate import SimulatedMode, SimulatedResponses
 from snrmjax.report.figures.simulation import (
@@ -13,12 +14,20 @@ from snrmjax.report.figures.simulation import (
     quasi_periodic_figure,
     simulated_response_figure,
 )
-from snrmjax.report.style import save_figure
+from snrmjax.report.html import Report, ReportFigure, Section, write_report
+from snrmjax.report.sentences import sentences
+from snrmjax.report.style import save_figure, save_figures
 from snrmjax.simulate.continuation.response_curve import Branch, ResponseCurve, velocity_at_sensors
+
+_CAPTIONS = {
+    "response": "Velocity over the frequency of the force; dashed where the response is unstable.",
+    "events": "Events of the responses over the parameter.",
+    "quasi_periodic": "Motions with two frequencies beside the responses that they leave.",
+}
 
 
 def write(folder: Path, found: SimulatedResponses | SimulatedMode) -> None:
-    """Write response.csv and response.png, or nnm.csv and nnm.png.
+    """Write response.csv, response.png, summary.json and report.html, or nnm.csv and nnm.png.
 
     Also events.csv and events.png, quasi_periodic.csv and quasi_periodic.png, where there are any.
     """
@@ -28,16 +37,27 @@ def write(folder: Path, found: SimulatedResponses | SimulatedMode) -> None:
         save_figure(folder / "nnm.png", normal_mode_figure(found.branch, sensor=sensor))
         return
     results.write_response(folder / "response.csv", found.curves, sensor=sensor)
-    figure = simulated_response_figure(found.curves, sensor=sensor)
-    save_figure(folder / "response.png", figure)
+    figures = {"response": simulated_response_figure(found.curves, sensor=sensor)}
     if any(len(curve.frequency) for curve in found.events):
         results.write_event_curves(folder / "events.csv", found.events, sensor=sensor)
-        save_figure(folder / "events.png", event_curve_figure(found.events, sensor=sensor))
+        figures["events"] = event_curve_figure(found.events, sensor=sensor)
     if found.quasi_periodic:
         path = folder / "quasi_periodic.csv"
         results.write_quasi_periodic(path, found.quasi_periodic, sensor=sensor)
-        figure = quasi_periodic_figure(found.quasi_periodic, found.curves, sensor=sensor)
-        save_figure(folder / "quasi_periodic.png", figure)
+        figures["quasi_periodic"] = quasi_periodic_figure(
+            found.quasi_periodic, found.curves, sensor=sensor
+        )
+    drawn = save_figures(folder, figures)
+    result, notes = headline(found), sentences(found.notes)
+    write_summary(folder / "summary.json", {"result": result, "notes": notes})
+    shown = [ReportFigure(one, _CAPTIONS[name]) for name, one in drawn.items()]
+    report = Report(
+        "Simulated responses",
+        result=". ".join(result),
+        notes=notes,
+        sections=[Section("Curves", (), shown)],
+    )
+    write_report(folder / "report.html", report)
 
 
 def headline(found: SimulatedResponses | SimulatedMode) -> list[str]:

@@ -28,6 +28,47 @@ def _load(force: float, drive: float | None, at: str | None = None, unit: str = 
     return newtons if at is None else f"{newtons} at {at}"
 
 
+def _hidden_branch(
+    force: float,
+    unit: str,
+    begins: bool,
+    at_hz: float,
+    to_hz: float,
+    velocity: float,
+    sensor: str,
+    from_hz: float,
+) -> str:
+    end, option = ("begins", "--from-hz") if begins else ("ends", "--to-hz")
+    return (
+        f"force {force:g} {unit}: the range {end} inside a hysteresis: another stable response, of "
+        f"{velocity:.4g} m/s at {sensor} at {at_hz:.5g} Hz and on to {to_hz:.5g} Hz, is not shown; "
+        f"`{option} {from_hz:.4g}` shows both (traced from there)."
+    )
+
+
+def _element_idle(force: float, unit: str, element: str, slides: bool, share: float) -> str:
+    state, more = ("sticks", "slip") if slides else ("is not reached", "reach it")
+    whole = "slip displacement" if slides else "gap"
+    makes = f"more force makes it {more}" if slides else f"more force would {more}"
+    return (
+        f"force {force:g} {unit}: {element} {state} throughout this range (the motion takes "
+        f"{100 * share:.3g} % of its {whole}): {makes}."
+    )
+
+
+def _held(force: float, unit: str, element: str, slides_from: float) -> str:
+    if force < slides_from:
+        return (
+            f"force {force:g} {unit}: {element} holds the structure: in this range it slides from "
+            f"about {slides_from:.3g} {unit} on; raise the force."
+        )
+    return (
+        f"force {force:g} {unit}: no motion was found where the range starts, though {element} "
+        f"slides from about {slides_from:.3g} {unit} on: it may stick for a part of the period; "
+        "raise the force, or use more --harmonics."
+    )
+
+
 def _load_scale(stated: float, coefficient: str, change: float, chosen: float) -> str:
     return (
         f"with `load_scale` = {stated:g} thicknesses the coefficient {coefficient} differs by "
@@ -93,6 +134,9 @@ SENTENCES: dict[str, Wording] = {
         "leave it there"
     ),
     "mode_not_followed": _not_followed,
+    "hidden_branch": _hidden_branch,
+    "element_idle": _element_idle,
+    "held_by_friction": _held,
     "curve_ended": _ended,
     "curve_events_not_located": "force {force:g} N: not located: {kinds}.",
     "stability_not_computed": (

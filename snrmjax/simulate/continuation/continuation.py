@@ -27,7 +27,11 @@ class CurveStatus(Status):
         3,
         "stopped early: Newton's method fails at the smallest step; use more harmonics or samples",
     )
-    NO_START = 4, "no solution at the start; start farther from resonance or lower the force"
+    NO_START = (
+        4,
+        "no solution at the start; start farther from resonance, or change the force: less of it "
+        "where the structure is strongly nonlinear, more where friction holds it",
+    )
     AMPLITUDE_LIMIT = 5, "stopped at the largest amplitude asked for"
     CLOSED = 6, "came back to where it started: an isolated loop"
     INVALID = (

@@ -1,0 +1,95 @@
+"""Elements that a force does not set to work: stops that are not reached, friction that holds."""
+
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from snrmjax.model.effect_base import AbstractForce, AbstractKinked
+from snrmjax.model.elements import elements_of
+from snrmjax.model.library.friction import CoulombFriction, JenkinsSlider
+from snrmjax.model.places import row_text
+from snrmjax.model.structures import Structure, simulated_structure
+from snrmjax.simulate.balance.harmonics import harmonic_basis
+from snrmjax.simulate.continuation.response_curve import ResponseCurve
+
+_SAMPLES, _FREQUENCIES = 128, 201
+
+
+class IdleElement(NamedTuple):
+    """An element whose threshold no motion of some curves reaches."""
+
+    element: str
+    slides: bool  # friction that sticks; else a contact that stays as it is
+    share: float  # of the threshold that the largest motion reaches
+
+
+class Hold(NamedTuple):
+    """Friction that holds its place still while the force is below a threshold."""
+
+    element: str
+    slides_from: float  # N, the smallest over a range of frequencies
+
+
+def idle_elements(model: Structure, curves: Sequence[ResponseCurve]) -> Iterator[IdleElement]:
+    """Sliders that never slip and contacts that never open or close on any of some curves."""
+    model = simulated_structure(model)
+    motions = [np.asarray(curve.coefficients) for curve in curves if len(curve.frequency)]
+    if not motions:
+        return
+    for slider, row in _forces(model, JenkinsSlider):
+        x = np.concatenate([_over_a_period(motion @ row) for motion in motions])
+        reach = float(np.max(0.5 * np.ptp(x, axis=1)))
+        share = reach / float(slider.slip_displacement)
+        if share < 1:
+            yield IdleElement(_name(slider), True, share)
+    for contact, row in _forces(model, AbstractKinked):
+        x = np.concatenate([_over_a_period(motion @ row) for motion in motions])
+        kinks = np.atleast_1d(np.asarray(contact.kinks().displacement))
+        if np.any(kinks == 0):  # passed by every motion
+            continue
+        share = float(np.max(np.where(kinks > 0, x.max(), x.min()) / kinks))
+        if share < 1:
+            yield IdleElement(_name(contact), False, share)
+
+
+def friction_hold(model: Structure, from_frequency: float, to_frequency: float) -> Hold | None:
+    """The friction that holds up to the smallest force, and that force.
+
+    While friction at a place with the row r over the modes holds it still, the rest moves linearly
+    and the friction force is (Σ r φᵀb F/d)/(Σ r²/d), d being the modal dynamic stiffnesses. It
+    slides where that exceeds the friction force.
+
+    Arguments: frequencies in rad/s. Returns None for a model without dry friction.
+    """
+    model = simulated_structure(model)
+    terms = model.linear_terms()
+    omega = np.linspace(from_frequency, to_frequency, _FREQUENCIES)[:, None]
+    dynamic = np.asarray(terms.stiffness) - omega**2 * np.asarray(terms.mass)
+    dynamic = dynamic + 1j * omega * np.asarray(terms.damping)
+    holds = []
+    for friction, row in _forces(model, CoulombFriction):
+        free = (1 / dynamic) @ (row * np.asarray(model.modes.participation))
+        held = np.abs(free / ((1 / dynamic) @ row**2))
+        if held.max() > 0:
+            holds.append(Hold(_name(friction), float(friction.force) / float(held.max())))
+    return min(holds, key=lambda one: one.slides_from, default=None)
+
+
+def _forces(model: Structure, kind: Any) -> Iterator[tuple[Any, Float[np.ndarray, " mode"]]]:
+    """The forces of a kind that act on one displacement x = row·q, and these rows."""
+    for effect in model.effects:
+        if isinstance(effect, kind) and len(effect.rows) == 1:
+            elements = elements_of([effect], model.modes)
+            own = elements.own is not None
+            yield effect, model.own_mode if own else np.asarray(elements.rows)[0]
+
+
+def _over_a_period(x: Float[np.ndarray, "point coefficient"]) -> Float[np.ndarray, "point time"]:
+    return x @ harmonic_basis((x.shape[1] - 1) // 2, _SAMPLES).synthesis.T
+
+
+def _name(effect: AbstractForce) -> str:
+    (row,) = effect.rows
+    return effect.kind.replace("_", " ") + ("" if row is None else f" at {row_text(row)}")
