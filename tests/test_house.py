@@ -54,6 +54,8 @@ SUB_ROOMS = {
         ),
     },
     "measure.recordings": {"measure.signals", "measure.states"},
+    # One mode of a free decay apart from its company.
+    "measure.decays": {"measure.recordings", "measure.signals", "measure.states"},
     "measure.sweeps": {"measure.recordings", "measure.signals", "measure.states"},
     "simulate.balance": set(),
     "simulate.continuation": {"simulate.balance"},

@@ -10,9 +10,12 @@ from snrmjax.measure.recordings.stepped_sine import stepped_sine_states
 from snrmjax.measure.states import SteadyStates
 from snrmjax.measure.sweeps.slow_sweep import sweep_states
 from snrmjax.methods.records.pnlss import pnlss
+from snrmjax.methods.records.recorded_decays import read_decays, recorded_decays
 from snrmjax.methods.records.recorded_test import RecordedTest, RecordKind
 from snrmjax.methods.records.recorded_velocity import recorded_velocity
-from snrmjax.methods.records.resonant_decay import even_record, resonant_decay
+from snrmjax.measure.decays.decay_record import even_record
+from snrmjax.measure.decays.isolated_decay import IsolatedDecay
+from snrmjax.methods.records.resonant_decay import decay_of_mode
 from snrmjax.methods.records.restoring_force import restoring_force
 from snrmjax.methods.records.ssm import ssm
 from snrmjax.methods.result import MethodResult, method_result
@@ -54,15 +57,10 @@ def states_of(test: RecordedTest) -> tuple[SteadyStates, Fact]:
 
 
 def _of_decays(
-    method: Callable[..., MethodResult],
+    method: Callable[[IsolatedDecay], MethodResult],
 ) -> Callable[[RecordedTest, LinearModes], list[MethodResult]]:
     def run(test: RecordedTest, modes: LinearModes) -> list[MethodResult]:
-        found = []
-        for part in test.free:
-            seen = recorded_velocity(test.recording, test.channels.reference, test.frequency, part)
-            result = method(seen.time, seen.velocity, least_amplitude=seen.floor)
-            found.append(_noted(result, seen.notes))
-        return found
+        return read_decays(method, recorded_decays(test, modes))
 
     return run
 
@@ -73,11 +71,9 @@ def _noted(result: MethodResult, notes: Sequence[Fact]) -> MethodResult:
 
 def _restoring_force(test: RecordedTest, modes: LinearModes) -> list[MethodResult]:
     if test.kind is RecordKind.FREE_DECAY:
-        return _of_decays(restoring_force)(test, modes)
+        return _of_decays(lambda decay: restoring_force(decay.time, decay.velocity))(test, modes)
     channel, whole = _force_channel(test), (0, test.recording.n_samples)
-    seen = recorded_velocity(
-        test.recording, test.channels.reference, test.frequency, whole, forced=True
-    )
+    seen = recorded_velocity(test.recording, test.channels.reference, test.frequency, whole)
     force = test.recording.values([channel], seen.start, seen.start + len(seen.time))[0]
     found = restoring_force(seen.time, seen.velocity, even_record(seen.time, force)[1], modes)
     return [_noted(found, seen.notes)]
@@ -113,11 +109,13 @@ class RecordMethod(NamedTuple):
 
 
 RECORD_METHODS: dict[str, RecordMethod] = {
-    "resonant_decay": RecordMethod(_of_decays(resonant_decay), (RecordKind.FREE_DECAY,)),
+    "resonant_decay": RecordMethod(_of_decays(decay_of_mode), (RecordKind.FREE_DECAY,)),
     "restoring_force": RecordMethod(
         _restoring_force, (RecordKind.FREE_DECAY, RecordKind.BROADBAND)
     ),
-    "ssm": RecordMethod(_of_decays(ssm), (RecordKind.FREE_DECAY,)),
+    "ssm": RecordMethod(
+        _of_decays(lambda decay: ssm(decay.time, decay.velocity)), (RecordKind.FREE_DECAY,)
+    ),
     "pnlss": RecordMethod(
         lambda test, modes: [_pnlss_of([test], modes)], (RecordKind.BROADBAND,), _pnlss_of
     ),

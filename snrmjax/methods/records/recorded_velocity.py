@@ -1,4 +1,4 @@
-"""The velocity of a record's motion, whatever was measured, down to the record's noise."""
+"""The velocity of a record's motion, whatever was measured."""
 
 from typing import NamedTuple
 
@@ -7,11 +7,10 @@ from jaxtyping import Float
 
 from snrmjax.measure.recordings.channels import channel_number
 from snrmjax.measure.recordings.time_recording import TimeRecording
-from snrmjax.methods.records.resonant_decay import even_record
+from snrmjax.measure.decays.decay_record import even_record
 from snrmjax.numerics.facts import Fact
 
 _HERTZ = 2 * np.pi
-_ABOVE_NOISE = 4.0  # standard deviations of noise down to which a motion is read
 _CORNER = 0.25  # of the motion's frequency: what is slower is drift of an integrated signal
 _ORDER = 4  # at the motion's frequency the filter is then 1 within 2e-5
 _ENDS = 8.0  # cycles at both ends in which it has not settled
@@ -24,7 +23,6 @@ class RecordedVelocity(NamedTuple):
     time: Float[np.ndarray, " sample"]  # s
     velocity: Float[np.ndarray, " sample"]  # m/s
     start: int  # sample of the record at which it begins
-    floor: float  # m/s: smaller amplitudes are noise
     notes: tuple[Fact, ...] = ()
 
 
@@ -33,14 +31,11 @@ def recorded_velocity(
     name: str,
     frequency: float,
     part: tuple[int, int],
-    *,
-    forced: bool = False,
 ) -> RecordedVelocity:
-    """The velocity of a motion over `part` of a record; of a decay until it is lost in noise.
+    """The velocity of a motion over `part` of a record.
 
     Arguments: `name` of a channel of velocity, acceleration or displacement; `frequency` of the
-    motion (rad/s); `part` in samples; a `forced` motion is kept to its end. Accelerations are
-    integrated and displacements derived by a spline of degree 5; of an integral what is slower
+    motion (rad/s); `part` in samples. Accelerations are integrated and displacements derived by a spline of degree 5; of an integral what is slower
     than a quarter of the frequency is drift and is filtered out forwards and backwards, and the
     filter's ends, eight cycles, are left out.
     Returns a `RecordedVelocity`. Raises `ValueError` as `even_record` does (a clipped record, one
@@ -74,24 +69,4 @@ def recorded_velocity(
         )  # fmt: skip
         signal = sosfiltfilt(sections, signal)[ends:-ends]
         time, start = time[ends:-ends], start + ends
-    floor = _ABOVE_NOISE * _white_noise(signal)
-    kept = signal if forced else _above(signal, floor, cycle)
-    return RecordedVelocity(time[: len(kept)], kept, start, floor, notes)
-
-
-def _white_noise(signal: Float[np.ndarray, " sample"]) -> float:
-    """1σ of white noise by the median of the spectrum."""
-    from scipy.signal import welch
-
-    density = welch(signal, nperseg=min(len(signal), 4096))[1]
-    return float(np.sqrt(np.median(density) / np.log(2) / 2))
-
-
-def _above(
-    signal: Float[np.ndarray, " sample"], least: float, cycle: int
-) -> Float[np.ndarray, " sample"]:
-    """A decay as long as the largest value of each cycle is above noise."""
-    count = len(signal) // cycle
-    sizes = np.abs(signal[: count * cycle]).reshape(count, cycle).max(axis=1)
-    quiet = np.flatnonzero(sizes < least)
-    return signal[: (int(quiet[0]) + 1) * cycle] if quiet.size else signal
+    return RecordedVelocity(time, signal, start, notes)

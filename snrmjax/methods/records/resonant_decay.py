@@ -20,18 +20,19 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 from jaxtyping import Float
 
+from snrmjax.measure.decays.decay_record import (
+    QUARTER,
+    even_record,
+    require_cycles,
+    require_samples,
+)
+from snrmjax.measure.decays.isolated_decay import IsolatedDecay
 from snrmjax.methods.result import MethodPoint, MethodResult, method_result, points_of_curves
 from snrmjax.numerics.facts import Fact
 
 Reading = Literal["peaks", "zero_crossings", "hilbert"]
 
-_FEWEST_CYCLES = 12
-_FEWEST_FALLING = 5  # cycles, of a decay to a quarter
-_QUARTER = 1.4  # of the logarithm of an amplitude
 _WINDOW = (2.5, 8.0)  # cycles that a local line spans: those of a fall to a quarter, if so many
-_FEWEST_SAMPLES = 8  # a cycle: a parabola through an extreme is then within 2 % of a cosine
-_CLIPPED = 4  # neighbouring samples at the largest value that a free decay does not have
-_EVEN = 1e-3  # largest relative deviation of a sampling interval
 _HILBERT_ENDS = 4  # cycles at each end at which the analytic signal is wrong
 _MIRRORED = 3  # a part of the record, 1/3, is mirrored at each of its ends
 _FILTER_ENDS = 8.0  # times 1/width (s), after which the filter has settled to e^(−19)
@@ -105,6 +106,32 @@ def resonant_decay(
     return method_result("resonant_decay", _points(lines, bias, fundamental), 0, notes)
 
 
+def decay_of_mode(decay: IsolatedDecay) -> MethodResult:
+    """Natural frequency and damping against velocity along a mode's decay apart from its company.
+
+    Argument: what `isolate_decay` gives. Returns a `MethodResult` as `resonant_decay` does, of
+    points four cycles apart; the velocity is that of the fundamental. 1σ holds noise, company and
+    scatter inside the filter's band, and what the error of the amplitude makes of curves over it.
+    """
+    omega, slope, smooth = decay.rate.imag, decay.rate.real, decay.smooth_rate
+    moves = decay.smooth_bend.imag / smooth.imag
+    shrinks = moves - smooth.real
+    squared = shrinks**2 + np.gradient(shrinks, decay.at) - shrinks * moves
+    natural = np.sqrt(np.maximum(omega**2 + squared, 0.0))
+    ratio = (moves / 2 - slope) / natural
+    # What a relative error of the amplitude moves, along the smooth decay.
+    along_omega = decay.smooth_bend.imag / smooth.real
+    along_ratio = np.gradient((moves / 2 - smooth.real) / smooth.imag, decay.level.real)
+    points = points_of_curves(
+        np.exp(decay.level.real),
+        natural,
+        np.hypot(decay.rate_std.imag, along_omega * decay.level_std),
+        ratio,
+        np.hypot(decay.rate_std.real / natural, along_ratio * decay.level_std),
+    )
+    return method_result("resonant_decay", points, 0, decay.notes())
+
+
 def checked_record(
     time: Float[np.ndarray, " sample"], velocity: Float[np.ndarray, " sample"]
 ) -> tuple[Float[np.ndarray, " sample"], Float[np.ndarray, " sample"]]:
@@ -113,51 +140,7 @@ def checked_record(
     signal = signal - signal.mean()
     ups = np.count_nonzero((signal[:-1] < 0) & (signal[1:] >= 0))
     require_cycles(signal, float(ups))
-    if len(signal) / ups < _FEWEST_SAMPLES:
-        raise ValueError(
-            f"{_FEWEST_SAMPLES} samples a cycle are needed, but the record has "
-            f"{len(signal) / ups:.1f}: the sampling rate is too low, or noise crosses zero (state "
-            "`band`)."
-        )
-    return times, signal
-
-
-def require_cycles(signal: Float[np.ndarray, " sample"], cycles: float) -> None:
-    """Raise `ValueError` unless a record has twelve cycles, or five in which it falls enough."""
-    if cycles >= _FEWEST_CYCLES:
-        return
-    part = max(1, int(len(signal) / max(cycles, 1.0)))
-    first, last = np.abs(signal[:part]).max(), np.abs(signal[-part:]).max()
-    if cycles < _FEWEST_FALLING or last > first * np.exp(-_QUARTER):
-        raise ValueError(
-            f"{_FEWEST_CYCLES} cycles are needed, or {_FEWEST_FALLING} in which the motion falls "
-            f"to a quarter, but the record has {cycles:.3g}."
-        )
-
-
-def even_record(
-    time: Float[np.ndarray, " sample"], velocity: Float[np.ndarray, " sample"]
-) -> tuple[Float[np.ndarray, " sample"], Float[np.ndarray, " sample"]]:
-    """A finite, evenly spaced record that is not clipped; raises `ValueError` of others."""
-    times, signal = np.asarray(time, dtype=float), np.asarray(velocity, dtype=float)
-    if times.ndim != 1 or times.shape != signal.shape or len(times) < _FEWEST_SAMPLES:
-        raise ValueError(
-            f"`time` and `velocity` must be of one length, but have shapes {times.shape} and "
-            f"{signal.shape}."
-        )
-    if not (np.isfinite(times).all() and np.isfinite(signal).all()):
-        raise ValueError("the record must be of finite numbers, but has NaN or inf.")
-    steps = np.diff(times)
-    if steps.min() <= 0 or np.ptp(steps) > _EVEN * steps.mean():
-        raise ValueError("times must be evenly spaced and rise, but are not.")
-    largest = np.abs(signal).max()
-    flat = np.abs(signal) >= largest * (1 - 1e-9)
-    run = np.convolve(flat, np.ones(_CLIPPED), "valid").max()
-    if largest > 0 and run >= _CLIPPED:
-        raise ValueError(
-            f"the record stays at its largest value, {largest:.4g} m/s, for "
-            f"{_CLIPPED} samples or more: it is clipped."
-        )
+    require_samples(len(signal) / ups, ", or noise crosses zero (state `band`)")
     return times, signal
 
 
@@ -251,7 +234,7 @@ def _window(trace: _Trace, end: int) -> float:
     last = min(end, len(trace.time)) - 1
     fall = trace.log_amplitude[0] - trace.log_amplitude[last] if last > 0 else 0.0
     cycles = last / trace.per_cycle
-    of_fall = _QUARTER * cycles / fall if fall > 0 else np.inf
+    of_fall = QUARTER * cycles / fall if fall > 0 else np.inf
     return float(np.clip(min(of_fall, cycles), *_WINDOW))
 
 

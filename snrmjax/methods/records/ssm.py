@@ -22,7 +22,7 @@ from numpy.polynomial import chebyshev
 from scipy.signal import decimate
 
 from snrmjax.methods.records.normal_form import NormalForm, form_of, seen, unknowns_of
-from snrmjax.methods.records.resonant_decay import even_record, require_cycles
+from snrmjax.measure.decays.decay_record import even_record, require_cycles
 from snrmjax.methods.result import MethodResult, method_result, points_of_curves
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.levenberg_marquardt import Minimum, StepRule, minimise
