@@ -6,6 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from snrmjax.measure.decays.decay_record import even_record
+from snrmjax.measure.decays.isolated_decay import MOST_COMPANY, IsolatedDecay
 from snrmjax.measure.recordings.stepped_sine import stepped_sine_states
 from snrmjax.measure.states import SteadyStates
 from snrmjax.measure.sweeps.slow_sweep import sweep_states
@@ -13,8 +15,6 @@ from snrmjax.methods.records.pnlss import pnlss
 from snrmjax.methods.records.recorded_decays import read_decays, recorded_decays
 from snrmjax.methods.records.recorded_test import RecordedTest, RecordKind
 from snrmjax.methods.records.recorded_velocity import recorded_velocity
-from snrmjax.measure.decays.decay_record import even_record
-from snrmjax.measure.decays.isolated_decay import IsolatedDecay
 from snrmjax.methods.records.resonant_decay import decay_of_mode
 from snrmjax.methods.records.restoring_force import restoring_force
 from snrmjax.methods.records.ssm import ssm
@@ -69,9 +69,14 @@ def _noted(result: MethodResult, notes: Sequence[Fact]) -> MethodResult:
     return dataclasses.replace(result, notes=(*result.notes, *notes))
 
 
+def _restoring_force_of(decay: IsolatedDecay) -> MethodResult:
+    """Company was taken away: what the two forces leave says that they are not those of the mode."""
+    return restoring_force(decay.time, decay.velocity, most_left=MOST_COMPANY)
+
+
 def _restoring_force(test: RecordedTest, modes: LinearModes) -> list[MethodResult]:
     if test.kind is RecordKind.FREE_DECAY:
-        return _of_decays(lambda decay: restoring_force(decay.time, decay.velocity))(test, modes)
+        return _of_decays(_restoring_force_of)(test, modes)
     channel, whole = _force_channel(test), (0, test.recording.n_samples)
     seen = recorded_velocity(test.recording, test.channels.reference, test.frequency, whole)
     force = test.recording.values([channel], seen.start, seen.start + len(seen.time))[0]
@@ -114,7 +119,8 @@ RECORD_METHODS: dict[str, RecordMethod] = {
         _restoring_force, (RecordKind.FREE_DECAY, RecordKind.BROADBAND)
     ),
     "ssm": RecordMethod(
-        _of_decays(lambda decay: ssm(decay.time, decay.velocity)), (RecordKind.FREE_DECAY,)
+        _of_decays(lambda decay: ssm(decay.time, decay.velocity, noise_std=decay.noise_std)),
+        (RecordKind.FREE_DECAY,),
     ),
     "pnlss": RecordMethod(
         lambda test, modes: [_pnlss_of([test], modes)], (RecordKind.BROADBAND,), _pnlss_of

@@ -40,7 +40,7 @@ from snrmjax.numerics.units import HERTZ
 
 PER_CYCLE = 2  # instants
 POINTS = 4  # cycles from one reading to the next
-_COMPANY = 0.01  # largest share of the energy inside the band that is not the mode's
+MOST_COMPANY = 0.01  # largest share of the energy inside the band that is not the mode's
 _SIGMA = (1.0, 3.0)  # cycles of the filter's weights
 _CYCLES_A_SIGMA = 8 / 3  # of a fall to a quarter, in which one line would be drawn
 _BAND = 0.25  # of the mode's frequency: what the filter passes, one side
@@ -53,6 +53,7 @@ _APART = 2.0  # turns by which hum and mode must part to be told apart
 _SMOOTH_ERROR = 0.05  # of the mode's amplitude, that the smooth decay may be off
 _SCATTER = 4.0  # σ of the filter, over which scatter is averaged
 _HARMONICS = (2, 3, 4, 5)
+_COHERENT = 0.1  # of what lies near a harmonic, that may not turn with the mode
 _MEDIAN_OF_POWER = float(np.log(2))  # over the mean, of a spectrum's bins
 
 
@@ -78,6 +79,7 @@ class IsolatedDecay(NamedTuple):
     rate_std: Complex[np.ndarray, " k"]  # of both parts
     smooth_rate: Complex[np.ndarray, " k"]  # of the smooth decay
     smooth_bend: Complex[np.ndarray, " k"]  # its derivative, 1/s²
+    noise_std: float  # m/s, 1σ of white noise of the density that the record has beside the band
     bias: Complex[np.ndarray, " k"]  # of the rate, by the filter; it is taken away
     begin: float  # s from the record's first sample to where the mode dominates
     band: tuple[float, float]  # rad/s: beyond, the filter passes less than 1 %
@@ -203,11 +205,16 @@ def _read_from(
     left = signal - _wave(carrier, time)
     samples = HERTZ / np.abs(rate.imag) / (time[1] - time[0])  # a cycle
     noise = _white(left) / np.exp(carrier.value.real) / np.sqrt(np.sqrt(np.pi) * sigma * samples)
-    nu = np.linspace(0, 1 / sigma, 400)
-    independent = len(at) / PER_CYCLE * 2 * float(np.sum(passed(nu, sigma) ** 2)) * nu[1]
+    independent = _independent(carrier.value.imag, sigma)
     weight = 1 / np.hypot(noise, _SMOOTH_ERROR * 0.1)
     smooth = slow_flow(at, carrier.value, weight, independent)
     return _Reading(start, before, carrier, rate, smooth, noise, sigma)
+
+
+def _independent(phase: np.ndarray, sigma: float) -> float:
+    """How many independent readings a phase holds, by the width of the filter."""
+    nu = np.linspace(0, 1 / sigma, 400)
+    return float(np.ptp(phase)) / HERTZ * 2 * float(np.sum(passed(nu, sigma) ** 2)) * nu[1]
 
 
 def _wave(carrier: Carrier, time: np.ndarray) -> np.ndarray:
@@ -278,7 +285,7 @@ def _usable(reading: _Reading) -> slice:
     """The longest stretch of instants in which the mode dominates inside the filter's band."""
     company = np.abs(reading.smooth.off) ** 2
     around = gaussian_filter1d(company, reading.sigma * PER_CYCLE, mode="nearest")
-    good = np.concatenate([[False], around < _COMPANY, [False]])
+    good = np.concatenate([[False], around < MOST_COMPANY, [False]])
     edges = np.flatnonzero(np.diff(good.astype(int)))
     runs = [slice(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True)]
     longest = max(runs, key=lambda run: run.stop - run.start, default=slice(0, 0))
@@ -287,26 +294,26 @@ def _usable(reading: _Reading) -> slice:
         float(np.ptp(level.imag)) / HERTZ + 0.5, float(level[0].real - level[-1].real)
     ):
         return longest
-    raise ValueError(_refusal(reading, company))
+    raise ValueError(_refusal(reading, slice(None)))
 
 
-def _refusal(reading: _Reading, company: np.ndarray) -> str:
+def _refusal(reading: _Reading, part: slice) -> str:
     """Why the mode cannot be isolated."""
-    low, high = (edge / HERTZ for edge in _band(reading, slice(None)))
-    typical = float(np.median(company))
+    off = reading.smooth.off[part]
+    off = off * np.minimum(1.0, 1 / np.maximum(np.abs(off), 1e-300))
+    low, high = (edge / HERTZ for edge in _band(reading, part))
+    share = float(np.median(np.abs(off) ** 2))
     where = f"inside its band of {low:.4g} to {high:.4g} Hz"
-    if typical < 2 * float(np.median(2 * reading.noise**2)):
-        return (
-            f"the mode cannot be isolated: {where} noise has {100 * typical:.2g} % of its energy, "
-            f"and more than {100 * _COMPANY:g} % is too much."
-        )
-    off = reading.smooth.off * np.minimum(1.0, 1 / np.abs(reading.smooth.off))
-    order = np.fft.fftfreq(len(off), 1 / PER_CYCLE)
-    nu = float(order[np.argmax(np.abs(np.fft.fft((off - off.mean()) * np.hanning(len(off)))))])
-    other = float(np.median(reading.rate.imag)) / HERTZ * (1 + nu)
+    what = "noise"
+    if share > 2 * float(np.median(2 * reading.noise[part] ** 2)):
+        order = np.fft.fftfreq(len(off), 1 / PER_CYCLE)
+        line = np.abs(np.fft.fft((off - off.mean()) * np.hanning(len(off))))
+        away = 1 + float(order[np.argmax(line)])
+        other = float(np.median(reading.rate.imag[part])) / HERTZ * away
+        what = f"another motion near {other:.3g} Hz"
     return (
-        f"the mode cannot be isolated: {where} another motion, near {other:.3g} Hz, has "
-        f"{100 * typical:.2g} % of its energy, and more than {100 * _COMPANY:g} % is too much."
+        f"the mode cannot be isolated: {where} {what} has about {100 * share:.2g} % of its energy, "
+        "which hides how it decays."
     )
 
 
@@ -338,15 +345,20 @@ def _isolated(
         refound = local_fit(time, alone, again, reading.carrier.time, sigma)
         again = Carrier(reading.carrier.time, refound.level)
     bias = (refound.rate - reading.carrier.curve()(reading.carrier.time, 1))[rows]
-    mode = alone + _harmonics(time, signal - alone, reading.carrier, part)
+    mode = alone + _harmonics(time, signal - alone, reading, part)
     left = signal - mode
-    noise = _noise_of(left, read, sigma, time[1] - time[0])
+    noise, white = _noise_of(left, read, sigma, time[1] - time[0])
     off, wide = reading.rate - reading.smooth.rate, _SCATTER * sigma * PER_CYCLE
     scatter = []
     for one in (off.real, off.imag):
         swings = one - gaussian_filter1d(one, wide, mode="nearest")
         scatter.append(np.sqrt(gaussian_filter1d(swings**2, wide, mode="nearest"))[rows])
-    inside = slice(*np.searchsorted(time, reading.carrier.time[[part.start, part.stop - 1]]))
+    # Ends of the record, at which the filter sees one side alone, are left out of it.
+    one_sided = round(sigma * PER_CYCLE)
+    ends = part.start + one_sided, part.stop - 1 - one_sided
+    if np.median(np.abs(scatter[0] / reading.smooth.rate.real[rows])) > 1:
+        raise ValueError(_refusal(reading, part))
+    inside = slice(*np.searchsorted(time, reading.carrier.time[list(ends)]))
     return IsolatedDecay(
         time[inside],
         mode[inside],
@@ -358,6 +370,7 @@ def _isolated(
         + 1j * np.hypot(np.maximum(noise[2], scatter[1]), bias.imag),
         reading.smooth.rate[rows],
         reading.smooth.bend[rows],
+        white,
         bias,
         float(at[0] - time[0]),
         _band(reading, part),
@@ -366,34 +379,39 @@ def _isolated(
 
 
 def _harmonics(
-    time: np.ndarray, left: np.ndarray, carrier: Carrier, part: slice
+    time: np.ndarray, left: np.ndarray, reading: _Reading, part: slice
 ) -> Float[np.ndarray, " sample"]:
-    """Harmonics that turn with the mode, of sizes (c + d A²) A^h, and its middle, in A².
+    """Harmonics that turn with the mode, of sizes (c + d A²) A^h.
 
-    Company turns otherwise: over the decay it averages out of them.
+    Each is read by a filter as long as the mode's own, and left out where company or noise has a
+    tenth of what is found there.
     """
-    ends = carrier.time[[part.start, part.stop - 1]]
-    near = (time >= carrier.time[0]) & (time <= carrier.time[-1])
+    carrier = reading.carrier
+    at, phase = carrier.time, carrier.value.imag
+    size = np.exp(carrier.value.real - carrier.value.real[part].max())
+    near = (time >= at[0]) & (time <= at[-1])
     level = carrier.curve()(time[near])
-    fitted = (time[near] >= ends[0]) & (time[near] <= ends[1])
-    size = np.exp(level.real - level.real[fitted].max())
-    fastest = float(np.max(np.diff(level.imag)))
-    columns = [np.ones_like(size), size**2]
-    for order in _HARMONICS:
-        if order * fastest < np.pi:
-            turn = size**order * np.exp(1j * order * level.imag)
-            columns += [turn.real, turn.imag, turn.real * size**2, turn.imag * size**2]
-    design = np.stack(columns, axis=1)
-    solved, *_ = np.linalg.lstsq(design[fitted], left[near][fitted], rcond=1e-9)
+    of_time = np.exp(level.real - carrier.value.real[part].max())
     waves = np.zeros_like(time)
-    waves[near] = design[:, 1:] @ solved[1:] * (size <= 1)
+    for order in _HARMONICS:
+        if order * float(np.max(np.diff(level.imag))) > np.pi:
+            break
+        turning = Carrier(at, 1j * order * phase)
+        read = local_fit(time, left, turning, at, order * reading.sigma).level
+        seen = np.exp(read - turning.value)[part]
+        design = np.stack([size**order, size ** (order + 2)], axis=1)[part]
+        solved = np.linalg.lstsq(design, seen, rcond=None)[0]
+        without, rest = (float(np.sum(np.abs(one) ** 2)) for one in (seen, seen - design @ solved))
+        if rest < _COHERENT * without:
+            wave = (solved[0] + solved[1] * of_time**2) * np.exp(1j * order * level.imag)
+            waves[near] += (wave * of_time**order).real * (of_time <= 1)
     return waves
 
 
 def _noise_of(
     left: np.ndarray, read: LocalFit, sigma: float, step: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """1σ of ln A, of its rate and of the phase's that the residual's spectrum makes."""
+) -> tuple[list[np.ndarray], float]:
+    """1σ of ln A, of its rate and of the phase's that the residual's spectrum makes; 1σ a sample."""
     width = read.level_rows.shape[1]
     index = read.first[:, None] + np.arange(width)
     taper = np.hanning(width + 2)[1:-1]
@@ -416,7 +434,7 @@ def _noise_of(
         within = density * np.sum(response * inside, axis=1) * gains[k] / once[k]
         beyond = np.sum(response * ~inside * power, axis=1) * ROUNDS**2
         found.append(np.sqrt(within + beyond))
-    return found[0], found[1], found[2]
+    return found, float(np.sqrt(np.median(density)))
 
 
 def _company(

@@ -37,7 +37,7 @@ class Ridge(NamedTuple):
         if len(self.time) < 4:
             return float(last)
         square = (self.amplitude / self.amplitude.max()) ** 2
-        slope, rest = np.polyfit(square, self.frequency, 1, w=self.amplitude)
+        rest = np.polyfit(square, self.frequency, 1, w=self.amplitude)[1]
         return float(np.clip(rest, last / _RANGE, last * _RANGE))
 
 

@@ -39,6 +39,7 @@ _STEP_CYCLES = 10
 _STEPS_COVER = 0.3
 _MOVES = 0.5
 _FAR = 2.0  # times the mode's frequency, or one over it: another mode, or wrong times
+_AUDIBLE = 0.01  # of a decay's power near the mode's frequency
 _BAND = (0.01, 0.99)  # of the force's power: what a broadband test excites
 _LOOKED_AT = 2**20  # samples whose spectrum is taken
 
@@ -98,7 +99,7 @@ def recorded_test(recording: TimeRecording, modes: LinearModes) -> RecordedTest:
     fall = _fall(motion)
     if guide is None or not acting:
         if fall.decays:
-            frequency = _of_fall(motion, fall, recording.sampling_rate)
+            frequency = _of_fall(motion, fall, recording.sampling_rate, rest)
         return _undriven(recording, channels, frequency, rest, fall, len(motion))
     free = _free_stretches(recording, guide, channels.reference)
     if sum(stop - start for start, stop in free) >= _FREE * recording.n_samples:
@@ -114,7 +115,7 @@ def recorded_test(recording: TimeRecording, modes: LinearModes) -> RecordedTest:
     if fall.decays:
         why = Fact("motion_decays_under_noise", channel=guide)
         parts = ((fall.start, len(motion)),)
-        frequency = _of_fall(motion, fall, recording.sampling_rate)
+        frequency = _of_fall(motion, fall, recording.sampling_rate, rest)
         return RecordedTest(recording, channels, RecordKind.FREE_DECAY, why, parts, frequency)
     low, high = _band(recording.values([guide], 0, _LOOKED_AT)[0], recording.sampling_rate)
     _near_the_mode(recording, low, high, rest)
@@ -257,12 +258,21 @@ def _strongest(motion: Float[np.ndarray, " sample"], rate: float) -> float:
     return float(omega[1 + int(np.argmax(power[1:]))])
 
 
-def _of_fall(motion: Float[np.ndarray, " sample"], fall: _Fall, rate: float) -> float:
-    """Strongest frequency of a decay, in rad/s: its beginning, where it is largest, counts most."""
+def _of_fall(
+    motion: Float[np.ndarray, " sample"], fall: _Fall, rate: float, rest: float
+) -> float:
+    """Strongest frequency of a decay, in rad/s: its beginning, where it is largest, counts most.
+
+    Near the mode's where 1 % of the power is: another mode may be louder.
+    """
     falling = motion[fall.start :] - motion.mean()
     window = np.hanning(2 * len(falling))[len(falling) :]
-    power = np.abs(np.fft.rfft(falling * window))
-    return float(_HERTZ * np.fft.rfftfreq(len(falling), 1 / rate)[1 + int(np.argmax(power[1:]))])
+    power = np.abs(np.fft.rfft(falling * window)) ** 2
+    omega = _HERTZ * np.fft.rfftfreq(len(falling), 1 / rate)
+    near = (omega > rest / _FAR) & (omega < rest * _FAR)
+    if power[near].sum() > _AUDIBLE * power[1:].sum():
+        power = np.where(near, power, 0.0)
+    return float(omega[1 + int(np.argmax(power[1:]))])
 
 
 def _band(force: Float[np.ndarray, " sample"], rate: float) -> tuple[float, float]:

@@ -5,9 +5,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from snrmjax.measure.decays.decay_record import even_record
 from snrmjax.measure.recordings.channels import channel_number
 from snrmjax.measure.recordings.time_recording import TimeRecording
-from snrmjax.measure.decays.decay_record import even_record
 from snrmjax.numerics.facts import Fact
 
 _HERTZ = 2 * np.pi
@@ -35,9 +35,9 @@ def recorded_velocity(
     """The velocity of a motion over `part` of a record.
 
     Arguments: `name` of a channel of velocity, acceleration or displacement; `frequency` of the
-    motion (rad/s); `part` in samples. Accelerations are integrated and displacements derived by a spline of degree 5; of an integral what is slower
-    than a quarter of the frequency is drift and is filtered out forwards and backwards, and the
-    filter's ends, eight cycles, are left out.
+    motion (rad/s); `part` in samples. Accelerations are integrated and displacements derived by a
+    spline of degree 5; of an integral what is slower than a quarter of the frequency is drift and
+    is filtered out forwards and backwards, and the filter's ends, eight cycles, are left out.
     Returns a `RecordedVelocity`. Raises `ValueError` as `even_record` does (a clipped record, one
     that is not finite).
     """

@@ -55,14 +55,16 @@ def fit_restoring_force(
     *,
     degree: int = 5,
     least_amplitude: float = 0.0,
+    most_left: float = 0.5,
 ) -> RestoringForce:
     """Fit elastic and damping force to a record of one mode, free or forced.
 
     Arguments: `time` in s, evenly spaced; `velocity` in m/s; `force` in N, where one acts, with the
     `modes` that say what it does to the mode of interest (|Φ_r Φᵀb|); `degree` of the elastic
-    force. A free decay is read down to `least_amplitude` (m/s).
+    force. A free decay is read down to `least_amplitude` (m/s); `most_left` is the share of the
+    acceleration's power that the forces may leave.
     Returns a `RestoringForce`. Raises `ValueError` for a record as in `resonant_decay`, for a force
-    without modes and for a degree outside 1 to 9.
+    without modes, for a degree outside 1 to 9, and for forces that leave more than `most_left`.
     Validity: one mode in the record (filter others out before), an elastic force of displacement
     alone and a damping force of velocity alone. Where the integrated displacement has its zero,
     and what an offset of the velocity makes of it, is fitted: the elastic force is zero at rest.
@@ -99,6 +101,11 @@ def fit_restoring_force(
         moved = moved + (found[-2] + found[-1] * away) / found[0]
     left = design / scale @ solved + acceleration[inside]
     misfit = float(np.sqrt(np.mean(left**2) / np.mean(acceleration[inside] ** 2)))
+    if misfit**2 > most_left:
+        raise ValueError(
+            f"the two forces leave {100 * misfit**2:.2g} % of the acceleration's power: they are "
+            "not those of one mode (isolate it before, `isolate_decay`), or of another form."
+        )
     return RestoringForce(
         found[:degree], found[degree : degree + 3], float(used.min()), float(used.max()), misfit
     )
@@ -112,6 +119,7 @@ def restoring_force(
     *,
     degree: int = 5,
     least_amplitude: float = 0.0,
+    most_left: float = 0.5,
 ) -> MethodResult:
     """Natural frequency and damping that the fitted forces imply, over the record's amplitudes.
 
@@ -122,7 +130,10 @@ def restoring_force(
     without 1σ, which the method does not give; its note has the misfit.
     """
     fitted = fit_restoring_force(
-        time, velocity, force, modes, degree=degree, least_amplitude=least_amplitude
+        *(time, velocity, force, modes),
+        degree=degree,
+        least_amplitude=least_amplitude,
+        most_left=most_left,
     )
     notes = (Fact("left_by_two_forces", misfit=fitted.misfit),)
     return method_result("restoring_force", _points(fitted), 0, notes)

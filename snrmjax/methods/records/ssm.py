@@ -21,8 +21,8 @@ from jaxtyping import Complex, Float
 from numpy.polynomial import chebyshev
 from scipy.signal import decimate
 
-from snrmjax.methods.records.normal_form import NormalForm, form_of, seen, unknowns_of
 from snrmjax.measure.decays.decay_record import even_record, require_cycles
+from snrmjax.methods.records.normal_form import NormalForm, form_of, seen, unknowns_of
 from snrmjax.methods.result import MethodResult, method_result, points_of_curves
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.levenberg_marquardt import Minimum, StepRule, minimise
@@ -38,7 +38,8 @@ _SAME = 0.7  # of the misfit before: a round that lowers it less is the last
 _RULE = StepRule(steps=25, settled=0.1)
 _POINTS = 25
 _MANIFOLD_DEGREE = 5
-_NEAR = 0.25  # of the mode's frequency: where the residual's density counts for the bands
+_BESIDE = 4  # lines a term, each side of the mode, whose residual counts for the bands
+_MOST_LEFT = 0.25  # of a record's power, which one mode does not leave
 _STEP = 1e-4  # of an unknown's own 1σ and size, for derivatives of the curves
 
 
@@ -75,6 +76,7 @@ def ssm(
     *,
     terms: int | None = None,
     least_amplitude: float = 0.0,
+    noise_std: float = 0.0,
 ) -> MethodResult:
     """Natural frequency and damping against amplitude from the normal form on a decay's manifold.
 
@@ -85,7 +87,9 @@ def ssm(
     velocity is the fundamental's; 1σ from the fit's residual near the mode's frequency. An
     amplitude at which the mode gains energy is `NOT_A_MODE`.
     """
-    found = fit_submanifold(time, velocity, terms=terms, least_amplitude=least_amplitude)
+    found = fit_submanifold(
+        time, velocity, terms=terms, least_amplitude=least_amplitude, noise_std=noise_std
+    )
     amplitude = np.linspace(found.smallest, found.largest, _POINTS)
     values = _curves(found.form, amplitude)
     spread = _curve_std(found, amplitude)
@@ -104,16 +108,18 @@ def fit_submanifold(
     *,
     terms: int | None = None,
     least_amplitude: float = 0.0,
+    noise_std: float = 0.0,
 ) -> SpectralSubmanifold:
     """The spectral submanifold and its normal form from one velocity in free decay.
 
     Arguments: `time` in s, evenly spaced; `velocity` in m/s, from the moment on at which the
     force was gone; `terms` of the polynomials α and ω in ρ² (1 for a linear mode), from 1 to 7,
     by default one more than Schwarz' criterion asks for; the record is read down to
-    `least_amplitude` (m/s).
-    Returns a `SpectralSubmanifold`. Raises `ValueError` for a record as in `resonant_decay` and
-    where the record holds no decaying oscillation.
-    Validity: one mode (others fainter than the wanted accuracy), smooth forces: dry friction is
+    `least_amplitude` (m/s); `noise_std` (m/s) of white noise as dense as that near the mode, where
+    a filter took the rest of it away.
+    Returns a `SpectralSubmanifold`. Raises `ValueError` for a record as in `resonant_decay`, where
+    the record holds no decaying oscillation, and where the form leaves a quarter of its power.
+    Validity: one mode (isolate it before, `isolate_decay`), smooth forces: dry friction is
     no polynomial, and 1σ does not know of it.
     """
     if terms is not None and not 1 <= terms <= _MOST_TERMS:
@@ -139,10 +145,16 @@ def fit_submanifold(
     times, signal, coordinate = times[:end], signal[:end], coordinate[:end]
     per_cycle = 1 / (hertz * step)
     orders = tuple(order for order in _ORDERS if order < per_cycle / 2)
-    best = _selected(times, signal, coordinate, orders, terms)
+    best = _selected(times, signal, coordinate, orders, terms, noise_std)
     if best is None:
         raise ValueError("the record holds no oscillation that decays smoothly.")
-    return _submanifold(best, times, signal, misfit, hertz)
+    left = best.mean_square / float(np.var(signal))
+    if left > _MOST_LEFT:
+        raise ValueError(
+            f"one decaying mode leaves {100 * left:.2g} % of the record's power: other motion lies "
+            "beside it; isolate the mode before (`isolate_decay`)."
+        )
+    return _submanifold(best, times, signal, misfit, noise_std)
 
 
 def _main_frequency(signal: np.ndarray, step: float) -> float:
@@ -187,6 +199,7 @@ def _selected(
     coordinate: np.ndarray,
     orders: tuple[int, ...],
     wanted: int | None,
+    noise_std: float,
 ) -> _Fit | None:
     """The fit of as many terms as wanted, or one term more than Schwarz' criterion asks for.
 
@@ -202,7 +215,8 @@ def _selected(
         if fit is None:
             return best
         best = fit._replace(form=_with_terms(fit.form, terms + 1))
-        score = n * np.log(fit.mean_square) + len(fit.minimum.point) * np.log(n)
+        misfit = n * (fit.mean_square / noise_std**2 if noise_std else np.log(fit.mean_square))
+        score = misfit + len(fit.minimum.point) * np.log(n)
         if wanted is None and score > least:
             return fit
         least = score
@@ -279,25 +293,25 @@ def _submanifold(
     times: np.ndarray,
     signal: np.ndarray,
     misfit: float,
-    hertz: float,
+    noise_std: float,
 ) -> SpectralSubmanifold:
     form = best.form
     found = seen(form, times)
     left = signal - found.signal
     free = len(times) - len(best.minimum.point)
     variance = float(left @ left) / free
-    # Of coloured residuals only what lies near the mode's frequency moves its curves.
-    density = np.abs(np.fft.rfft(left)) ** 2
-    hertz_of = np.fft.rfftfreq(len(left), float(times[1] - times[0]))
-    near = np.abs(hertz_of / hertz - 1) < _NEAR
-    coloured = max(1.0, float(density[near].mean() / density[1:].mean()))
+    # Of coloured residuals only what turns with the mode, or slowly beside it, moves its curves.
+    slow = _BESIDE * len(form.decay)
+    density = np.abs(np.fft.fft(left * np.exp(-1j * found.phase))) ** 2 / len(left)
+    near = np.concatenate([density[: slow + 1], density[-slow:]])
+    coloured = float(near.sum()) / (len(near) - 1 - len(form.decay))
     size = np.linalg.norm(found.jacobian, axis=0)
     inverse = np.linalg.pinv((found.jacobian / size).T @ (found.jacobian / size), hermitian=True)
     noise = float(np.sqrt(variance))
-    first = round(1 / (hertz * float(times[1] - times[0])))  # a cycle says no more of its own fall
+    first = int(np.searchsorted(found.phase - found.phase[0], 2 * np.pi))  # a cycle says no more of its own fall
     return SpectralSubmanifold(
         form,
-        variance * coloured * inverse / np.outer(size, size),
+        max(variance, coloured, noise_std**2) * inverse / np.outer(size, size),
         float(max(found.amplitude.min(), min(noise, 0.1 * found.amplitude.max()))),
         float(found.amplitude[min(first, len(times) - 1) :].max()),
         noise,
