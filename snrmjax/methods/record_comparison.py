@@ -70,8 +70,24 @@ def _noted(result: MethodResult, notes: Sequence[Fact]) -> MethodResult:
 
 
 def _restoring_force_of(decay: IsolatedDecay) -> MethodResult:
-    """Company was taken away: what the two forces leave says that they are not those of the mode."""
+    """Company was taken away: what the forces leave says that they are not those of the mode."""
     return restoring_force(decay.time, decay.velocity, most_left=MOST_COMPANY)
+
+
+def _ssm_of(decay: IsolatedDecay) -> MethodResult:
+    """Its 1σ knows white noise: where readings scatter more, it errs more."""
+    found = ssm(decay.time, decay.velocity, noise_std=decay.noise_std)
+    rows = np.argsort(decay.level.real)
+    at = np.log(np.asarray(found.velocity))
+    damping, omega = (
+        np.maximum(1.0, np.interp(at, decay.level.real[rows], one[rows]))
+        for one in (decay.excess.real, decay.excess.imag)
+    )
+    return dataclasses.replace(
+        found,
+        natural_frequency_std=found.natural_frequency_std * omega,
+        damping_ratio_std=found.damping_ratio_std * damping,
+    )
 
 
 def _restoring_force(test: RecordedTest, modes: LinearModes) -> list[MethodResult]:
@@ -118,10 +134,7 @@ RECORD_METHODS: dict[str, RecordMethod] = {
     "restoring_force": RecordMethod(
         _restoring_force, (RecordKind.FREE_DECAY, RecordKind.BROADBAND)
     ),
-    "ssm": RecordMethod(
-        _of_decays(lambda decay: ssm(decay.time, decay.velocity, noise_std=decay.noise_std)),
-        (RecordKind.FREE_DECAY,),
-    ),
+    "ssm": RecordMethod(_of_decays(_ssm_of), (RecordKind.FREE_DECAY,)),
     "pnlss": RecordMethod(
         lambda test, modes: [_pnlss_of([test], modes)], (RecordKind.BROADBAND,), _pnlss_of
     ),

@@ -77,6 +77,7 @@ class IsolatedDecay(NamedTuple):
     level_std: Float[np.ndarray, " k"]  # of ln amplitude
     rate: Complex[np.ndarray, " k"]  # its derivative, −decay + iω in 1/s
     rate_std: Complex[np.ndarray, " k"]  # of both parts
+    excess: Complex[np.ndarray, " k"]  # of both over what white noise of that density makes
     smooth_rate: Complex[np.ndarray, " k"]  # of the smooth decay
     smooth_bend: Complex[np.ndarray, " k"]  # its derivative, 1/s²
     noise_std: float  # m/s, 1σ of white noise of the density that the record has beside the band
@@ -347,12 +348,16 @@ def _isolated(
     bias = (refound.rate - reading.carrier.curve()(reading.carrier.time, 1))[rows]
     mode = alone + _harmonics(time, signal - alone, reading, part)
     left = signal - mode
-    noise, white = _noise_of(left, read, sigma, time[1] - time[0])
+    level_std, noise, white_only, white = _noise_of(left, read, sigma, time[1] - time[0])
     off, wide = reading.rate - reading.smooth.rate, _SCATTER * sigma * PER_CYCLE
     scatter = []
     for one in (off.real, off.imag):
         swings = one - gaussian_filter1d(one, wide, mode="nearest")
         scatter.append(np.sqrt(gaussian_filter1d(swings**2, wide, mode="nearest"))[rows])
+    std = [
+        np.hypot(np.maximum(one, other), part_of_bias)
+        for one, other, part_of_bias in zip(noise, scatter, (bias.real, bias.imag), strict=True)
+    ]
     # Ends of the record, at which the filter sees one side alone, are left out of it.
     one_sided = round(sigma * PER_CYCLE)
     ends = part.start + one_sided, part.stop - 1 - one_sided
@@ -364,10 +369,10 @@ def _isolated(
         mode[inside],
         at,
         read.level,
-        noise[0],
+        level_std,
         read.rate - bias,
-        np.hypot(np.maximum(noise[1], scatter[0]), bias.real)
-        + 1j * np.hypot(np.maximum(noise[2], scatter[1]), bias.imag),
+        std[0] + 1j * std[1],
+        std[0] / white_only[0] + 1j * std[1] / white_only[1],
         reading.smooth.rate[rows],
         reading.smooth.bend[rows],
         white,
@@ -410,8 +415,11 @@ def _harmonics(
 
 def _noise_of(
     left: np.ndarray, read: LocalFit, sigma: float, step: float
-) -> tuple[list[np.ndarray], float]:
-    """1σ of ln A, of its rate and of the phase's that the residual's spectrum makes; 1σ a sample."""
+) -> tuple[np.ndarray, list[np.ndarray], list[np.ndarray], float]:
+    """1σ that the residual's spectrum makes of ln A and of both parts of the rate.
+
+    Of these also what its white part makes, and that part's 1σ of a sample.
+    """
     width = read.level_rows.shape[1]
     index = read.first[:, None] + np.arange(width)
     taper = np.hanning(width + 2)[1:-1]
@@ -425,7 +433,7 @@ def _noise_of(
     nu = np.linspace(0, 1 / sigma, 400)
     gains = [np.sum((nu**k * passed(nu, sigma)) ** 2) for k in (0, 1)]
     once = [np.sum((nu**k * np.exp(-((2 * np.pi * sigma * nu) ** 2) / 2)) ** 2) for k in (0, 1)]
-    found = []
+    found, white = [], []
     for k, weights in (
         (0, read.level_rows.real), (1, read.rate_rows.real), (1, read.rate_rows.imag),
     ):  # fmt: skip
@@ -434,7 +442,8 @@ def _noise_of(
         within = density * np.sum(response * inside, axis=1) * gains[k] / once[k]
         beyond = np.sum(response * ~inside * power, axis=1) * ROUNDS**2
         found.append(np.sqrt(within + beyond))
-    return found, float(np.sqrt(np.median(density)))
+        white.append(np.sqrt(within + density * np.sum(response * ~inside, axis=1)))
+    return found[0], found[1:], white[1:], float(np.sqrt(np.median(density)))
 
 
 def _company(

@@ -258,9 +258,7 @@ def _strongest(motion: Float[np.ndarray, " sample"], rate: float) -> float:
     return float(omega[1 + int(np.argmax(power[1:]))])
 
 
-def _of_fall(
-    motion: Float[np.ndarray, " sample"], fall: _Fall, rate: float, rest: float
-) -> float:
+def _of_fall(motion: Float[np.ndarray, " sample"], fall: _Fall, rate: float, rest: float) -> float:
     """Strongest frequency of a decay, in rad/s: its beginning, where it is largest, counts most.
 
     Near the mode's where 1 % of the power is: another mode may be louder.

@@ -308,7 +308,8 @@ def _submanifold(
     size = np.linalg.norm(found.jacobian, axis=0)
     inverse = np.linalg.pinv((found.jacobian / size).T @ (found.jacobian / size), hermitian=True)
     noise = float(np.sqrt(variance))
-    first = int(np.searchsorted(found.phase - found.phase[0], 2 * np.pi))  # a cycle says no more of its own fall
+    # A cycle says no more of its own fall.
+    first = int(np.searchsorted(found.phase - found.phase[0], 2 * np.pi))
     return SpectralSubmanifold(
         form,
         max(variance, coloured, noise_std**2) * inverse / np.outer(size, size),
