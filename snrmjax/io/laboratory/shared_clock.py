@@ -1,11 +1,13 @@
 """Channels of one test on one clock: shifted by the starts that files state, joined over files."""
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Num
 
+from snrmjax.io.laboratory.names import role_of
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.time_recording import AbstractSamples, TimeRecording
 from snrmjax.numerics.facts import Fact
@@ -110,6 +112,31 @@ class _JoinedSamples(AbstractSamples):
         """A stretch of some channels."""
         rows = [self._places[k] for k in channels]
         return np.stack([samples.read([row], start, stop)[0] for samples, row in rows])
+
+
+def joined_structs(records: Sequence[TimeRecording]) -> list[TimeRecording]:
+    """Records of one channel each, of one clock, as one: those of structs called force and so on.
+
+    One of them at least must be called what drives a structure: structs called "run1" and "run2"
+    are two tests. Channels of one name get their struct's.
+    """
+    named = [one.name.rsplit(".", 1)[-1] for one in records]
+    single = len(records) > 1 and all(len(one.channels) == 1 for one in records)
+    roles = [role_of(name) for name in named]
+    if not single or not {"force", "drive"} & {*roles} or len({*named}) < len(named):
+        return list(records)
+    doubled = len({one.channels[0].name for one in records}) < len(records)
+    renamed = {
+        name: [
+            dataclasses.replace(
+                one,
+                channels=(one.channels[0]._replace(name=name),) if doubled else one.channels,
+            )
+        ]
+        for name, one in zip(named, records, strict=True)
+    }
+    joined = joined_by_clock(renamed)
+    return list(records) if joined is None else [joined[0]]
 
 
 def joined_by_clock(

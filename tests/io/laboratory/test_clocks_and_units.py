@@ -131,3 +131,22 @@ def test_the_command_that_is_proposed_runs_and_is_right(tmp_path, kind):
     states = read_steady_states(tmp_path / "out" / "measured.csv")
     np.testing.assert_allclose(np.asarray(states.velocity)[:, 0], wanted, rtol=1e-12)
     np.testing.assert_allclose(states.force, 0.7)
+
+
+def test_sibling_structs_are_one_record_or_one_table(tmp_path):
+    time = np.arange(200) / 500
+    one = {"t": time, "y": np.cos(time), "unit": "N"}
+    two = {"t": time, "y": np.sin(time), "unit": "g"}
+    scipy.io.savemat(tmp_path / "a.mat", {"force": one, "response": two})
+    (record,) = read_laboratory_file(tmp_path / "a.mat").recordings
+    assert record.channel_names == ("force", "response")
+    np.testing.assert_allclose(record.values(), [np.cos(time), G * np.sin(time)])
+    scipy.io.savemat(tmp_path / "b.mat", {"run1": one, "run2": two})
+    assert len(read_laboratory_file(tmp_path / "b.mat").recordings) == 2
+    levels = {
+        f"level_{k}": {"freq": F, "F": np.full(4, 0.1 * k), "v": k * F, "ph": PHASE} for k in (1, 2)
+    }
+    scipy.io.savemat(tmp_path / "c.mat", levels)
+    (table,) = read_laboratory_file(tmp_path / "c.mat").tables
+    assert table.columns["entry"].tolist() == [1.0] * 4 + [2.0] * 4
+    np.testing.assert_array_equal(table.columns["v"], np.concatenate([F, 2 * F]))

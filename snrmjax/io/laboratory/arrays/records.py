@@ -68,11 +68,12 @@ def recording_of(
         side = array.shape.index(long)
         others = 1 if array.length is not None else array.size // long
         labels = _labels(words, others)
-        said = _said_of(words, others) if labels else [{} for _ in range(others)]
+        alone = others == 1 and len(alike) == 1  # what a text says, it says of this one
+        said = _said_of(words, others) if labels or alone else [{} for _ in range(others)]
         for k in range(others):
-            alone = key if others == 1 else f"{key}_{k + 1}"
+            by_place = key if others == 1 else f"{key}_{k + 1}"
             places.append(ChannelPlace(array, side, k))
-            name_of = (labels[k] if labels else "") or alone
+            name_of = (labels[k] if labels else "") or by_place
             channels.append(_channel(name_of, {**array.attributes, **said[k]}))
     names = [channel.name for channel in channels]
     if not channels or len(channels) > _MOST_CHANNELS:

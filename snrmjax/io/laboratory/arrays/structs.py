@@ -1,5 +1,6 @@
 """What a struct of named arrays is: time records, frequency responses, tables of states."""
 
+import re
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -10,6 +11,7 @@ from snrmjax.io.laboratory.arrays.value_tree import Node, Numbers, held
 from snrmjax.io.laboratory.contents import Kind, LaboratoryFile, NumberTable
 from snrmjax.io.laboratory.names import role_of
 from snrmjax.io.laboratory.physical_units import channel_meaning, is_per_force
+from snrmjax.io.laboratory.shared_clock import joined_structs
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses, frequency_responses
 from snrmjax.measure.recordings.time_recording import TimeRecording
@@ -18,6 +20,7 @@ from snrmjax.numerics.facts import Fact
 _HERTZ = 2 * np.pi
 _MOST_ENTRIES = 10_000
 _MOST_NAMED = 6
+_NUMBER = re.compile(r"[0-9]+([.,p_][0-9]+)*")
 _WIDEST = 64  # columns of a matrix that become columns of a table
 
 
@@ -50,8 +53,10 @@ def file_of_tree(
     known = [*notes, *contents.notes]
     if not (known or contents.recordings or contents.responses or contents.tables):
         known = [Fact("nothing_measured", names=tuple(tree)[:_MOST_NAMED])]
+    contents = contents._replace(tables=_joined_siblings(contents.tables))
+    records = joined_structs(contents.recordings)
     return LaboratoryFile(
-        *(name, kind, tuple(contents.recordings), tuple(contents.responses), contents.numbered()),
+        *(name, kind, tuple(records), tuple(contents.responses), contents.numbered()),
         tuple(dict.fromkeys(known)),
         tuple(np.nan for _ in contents.responses),
     )
@@ -92,6 +97,23 @@ def read_struct(name: str, fields: Mapping[str, Node], *, entry: bool = False) -
         key = next(iter(group)) if len(group) == 1 else "entries"
         contents.add(key, _entries(f"{name}.{key}" if name else key, each))
     return contents
+
+
+def _joined_siblings(tables: Mapping[str, NumberTable]) -> dict[str, NumberTable]:
+    """Tables of structs whose names differ in a number alone, one a level, under one another."""
+    alike: dict[tuple[str, tuple[str, ...]], list[str]] = {}
+    for place, table in tables.items():
+        plain = _NUMBER.sub("", place).strip("_ ")
+        alike.setdefault((plain, tuple(table.columns)), []).append(place)
+    joined: dict[str, NumberTable] = {}
+    for (plain, columns), places in alike.items():
+        if len(places) == 1 or not any(role_of(name) == "frequency" for name in columns):
+            joined |= {place: tables[place] for place in places}
+            continue
+        one = _joined([(k, tables[place]) for k, place in enumerate(places, 1)])
+        named = tuple(place for place in places for _ in range(tables[place].n_rows))
+        joined[plain] = one._replace(words={**one.words, "entry name": named})
+    return joined
 
 
 def _entries(name: str, structs: Sequence[Mapping[str, Node]]) -> Struct:
