@@ -1,36 +1,23 @@
 """Linear modes from frequency responses over one reference, with their errors."""
 
-import dataclasses
 from collections.abc import Sequence
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, get_args
 
 import numpy as np
 from jaxtyping import Complex, Float
 
-from snrmjax.identify.modal.modal_bases import (
-    BasisSettings,
-    real_and_imaginary,
-    receptance_bases,
-    unpacked,
-)
-from snrmjax.identify.modal.modal_fit import LinearModalFit, ResponseCurves
-from snrmjax.identify.modal.modal_notes import (
-    complex_residues,
-    fit_notes,
-    lines_in_half_power,
-)
+from snrmjax.identify.modal.modal_bases import BasisSettings, unpacked
+from snrmjax.identify.modal.modal_fit import LinearModalFit
 from snrmjax.identify.modal.pole_orders import PoleOrders, clusters, poles_of_responses
-from snrmjax.identify.modal.response_data import (
-    ResponseData,
-    coherence_std,
-    response_data,
-    std_from_residuals,
-)
-from snrmjax.identify.modal.separable_fit import (
-    ChannelRows,
-    SeparableFit,
-    TermColumns,
-    fit_separable,
+from snrmjax.identify.modal.response_data import ResponseData, response_data
+from snrmjax.identify.modal.separable_fit import SeparableFit
+from snrmjax.identify.modal.weighted_fit import (
+    MOST_DAMPED,
+    FitSpread,
+    filled_receptance,
+    line_weights,
+    modal_result,
+    weighted_fit,
 )
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
 from snrmjax.numerics.units import HERTZ
@@ -39,14 +26,12 @@ ResidualTerms = Literal["auto", "both", "lower", "upper", "none"]
 
 _HIGHEST = 40  # order, where there are lines enough
 _LINES_PER_ORDER = 4
-_MOST_DAMPED = 0.9
 _USUAL = 0.01  # damping ratio where no pole of the orders is near
 _NEAR = 0.02  # of a frequency: how far from one given by hand a pole may lie
 _NARROW = 1.1  # ratio of a band's ends, below which one residual term is enough
 _SIGNIFICANT = 4.0  # standard errors of a mode's largest residue, without which it is none
 _TWINS = 0.1  # of a decay rate: poles nearer than that are one mode, split by the fit
 _CURVED = 12.0  # a sensor, in units of the noise, that a further residual term must explain
-_ROUNDS = 3  # of fits and weights
 _EVEN = 1e-3  # of the line spacing
 
 
@@ -101,19 +86,23 @@ def fit_linear_modes(
         to_frequency=to_frequency,
     )
     free = data.reference.quantity == "voltage" if instrument_phase is None else instrument_phase
-    settings = _settings(data, residual_terms, free, window)
+    settings = basis_settings(data, residual_terms, free, window)
     orders = _orders(data, highest_order)
     start = _start(data, orders, poles, order)
     fit, spread = _fitted(data, settings, start, keep_all=poles is not None)
     if residual_terms == "auto" and settings.lower:
         settings, fit, spread = _curved_too(data, settings, fit, spread)
     _check_found(fit, settings)
-    return _result(data, settings, fit, spread, orders)
+    return modal_result(data, settings, fit, spread, orders)
 
 
-def _settings(
+def basis_settings(
     data: ResponseData, terms: ResidualTerms, phase: bool, window: str | None
 ) -> BasisSettings:
+    """What the receptances of a band are made of beside modes, as `fit_linear_modes` is asked.
+
+    Raises `ValueError` for other words, and for leakage between lines that are not on a grid.
+    """
     if terms not in get_args(ResidualTerms):
         raise ValueError(
             f"`residual_terms` must be one of {', '.join(get_args(ResidualTerms))}, but is "
@@ -139,15 +128,6 @@ def _settings(
     )
 
 
-def _weights(data: ResponseData) -> Float[np.ndarray, "channel line"]:
-    """1/σ of receptances; of one size for all that a channel measured where σ is unknown."""
-    good = np.isfinite(data.receptance)
-    size = data.measured_size
-    rough = np.sqrt(np.nanmean(np.abs(data.receptance * size) ** 2, axis=1))[:, None] / size
-    std = np.where(np.isfinite(data.std), data.std, 1e-2 * rough)
-    return np.where(good, 1 / std, 0.0)
-
-
 def _orders(data: ResponseData, highest: int | None) -> PoleOrders:
     lines = len(data.omega)
     most = max(2, min(_HIGHEST, lines // _LINES_PER_ORDER))
@@ -156,17 +136,15 @@ def _orders(data: ResponseData, highest: int | None) -> PoleOrders:
             f"the highest order must be from 1 to half the number of lines, {lines // 2}, but is "
             f"{highest}."
         )
-    weights = _weights(data)
-    weights = weights / np.sqrt(np.mean(np.abs(_filled(data) * weights) ** 2, axis=1))[:, None]
+    weights = line_weights(data)
+    weights = (
+        weights / np.sqrt(np.mean(np.abs(filled_receptance(data) * weights) ** 2, axis=1))[:, None]
+    )
     size = data.measured_size
     turn = (1j ** np.array(data.powers))[:, None]
     return poles_of_responses(
-        data.omega, _filled(data) * size * turn, weights / size, highest or most
+        data.omega, filled_receptance(data) * size * turn, weights / size, highest or most
     )
-
-
-def _filled(data: ResponseData) -> Complex[np.ndarray, "channel line"]:
-    return np.where(np.isfinite(data.receptance), data.receptance, 0.0)
 
 
 def _start(
@@ -233,25 +211,20 @@ def _by_hand(
     return np.array(chosen)
 
 
-class _Spread(NamedTuple):
-    std: Float[np.ndarray, "channel line"]  # that weighted the last fit
-    misfit: Float[np.ndarray, " channel"]
-
-
 def _fitted(
     data: ResponseData,
     settings: BasisSettings,
     start: Complex[np.ndarray, " mode"],
     *,
     keep_all: bool,
-) -> tuple[SeparableFit, _Spread]:
+) -> tuple[SeparableFit, FitSpread]:
     """The fit with its weights settled and insignificant modes left out."""
     unknowns = np.concatenate(
         [np.abs(start), -start.real / np.abs(start), np.zeros(int(settings.phase))]
     )
-    std = 1 / np.maximum(_weights(data), 1e-300)
+    std = 1 / np.maximum(line_weights(data), 1e-300)
     while True:
-        fit, spread = _weighted(data, settings, unknowns, std)
+        fit, spread = weighted_fit(data, settings, unknowns, std)
         worst = None if keep_all else _least_certain(fit, settings, data)
         if worst is None:
             break
@@ -266,69 +239,16 @@ def _fitted(
 
 
 def _curved_too(
-    data: ResponseData, settings: BasisSettings, fit: SeparableFit, spread: _Spread
-) -> tuple[BasisSettings, SeparableFit, _Spread]:
+    data: ResponseData, settings: BasisSettings, fit: SeparableFit, spread: FitSpread
+) -> tuple[BasisSettings, SeparableFit, FitSpread]:
     """The fit with a residual term Ω² where it lowers the sum of squares by far."""
     wider = settings._replace(curved=True)
-    other, own = _weighted(data, wider, fit.unknowns, spread.std, rounds=1)
+    other, own = weighted_fit(data, wider, fit.unknowns, spread.std, rounds=1)
     before, after = np.sum(fit.residuals**2), np.sum(other.residuals**2)
     free = np.count_nonzero(np.isfinite(data.receptance)) * 2
     if (before - after) * free <= _CURVED * len(data.channels) * after:
         return settings, fit, spread
-    return wider, *_weighted(data, wider, other.unknowns, own.std)
-
-
-def _weighted(
-    data: ResponseData,
-    settings: BasisSettings,
-    unknowns: np.ndarray,
-    std: np.ndarray,
-    rounds: int = _ROUNDS,
-) -> tuple[SeparableFit, _Spread]:
-    good = np.isfinite(data.receptance)
-    values = real_and_imaginary(_filled(data))
-    powers, groups = data.bases(windowed=settings.window_time is not None)
-    n = (len(unknowns) - settings.phase) // 2
-    low = np.concatenate([np.full(n, 0.5 * data.omega[0]), np.full(n, -_MOST_DAMPED)])
-    high = np.concatenate([np.full(n, 2 * data.omega[-1]), np.full(n, _MOST_DAMPED)])
-    if settings.phase:
-        low, high = np.append(low, -np.pi), np.append(high, np.pi)
-
-    def basis_at(point: np.ndarray) -> list[TermColumns]:
-        return receptance_bases(data.omega, point, settings, powers)
-
-    coherence = data.coherence if data.source == "coherence" else None
-    scale = np.ones(len(values))
-    for turn in range(rounds):
-        weights = np.where(good, 1 / (std * scale[:, None]), 0.0)
-        measured = ChannelRows(values, np.tile(weights, (1, 2)), groups, 2)
-        fit = fit_separable(basis_at, measured, unknowns, (low, high))
-        unknowns = fit.unknowns
-        left = fit.residuals / np.maximum(np.tile(weights, (1, 2)), 1e-300)
-        lines = len(data.omega)
-        residuals = np.where(good, left[:, :lines] + 1j * left[:, lines:], np.nan)
-        fitted = _filled(data) - np.nan_to_num(residuals)
-        if turn == rounds - 1:
-            break
-        if data.source == "residuals":
-            std, scale = std_from_residuals(data, residuals, fitted), np.ones(len(values))
-        elif coherence is not None:
-            # Weights that use the measured size prefer lines that are too small by chance.
-            std = coherence_std(np.abs(fitted), coherence, data.averages)
-        # The size of each channel's errors is what its residuals show.
-        rms = _rms(residuals / std, fit, good)
-        scale = np.maximum(rms, 1e-12 * rms.max()) if rms.max() > 0 else np.ones(len(rms))
-    misfit = _rms(residuals / std, fit, good)
-    # Covariances for the mean size that the last residuals have, close to one.
-    last = _rms(residuals / (std * scale[:, None]), fit, good)
-    return fit.with_variance(float(np.mean(last**2))), _Spread(std * scale[:, None], misfit)
-
-
-def _rms(residuals: np.ndarray, fit: SeparableFit, good: np.ndarray) -> np.ndarray:
-    """Root mean square of real and imaginary parts by the degrees of freedom of each channel."""
-    shared = len(fit.unknowns) / len(residuals)
-    free = np.maximum(2 * good.sum(axis=1) - fit.coefficients.shape[1] - shared, 1.0)
-    return np.sqrt(np.nansum(np.abs(residuals) ** 2, axis=1) / free)
+    return wider, *weighted_fit(data, wider, other.unknowns, own.std)
 
 
 def _least_certain(fit: SeparableFit, settings: BasisSettings, data: ResponseData) -> int | None:
@@ -360,70 +280,9 @@ def _check_found(fit: SeparableFit, settings: BasisSettings) -> None:
             f"{natural[0] / HERTZ:.6g} Hz): the responses seem to be conjugated (time dependence "
             "e^(-iΩt)); change the sign of their imaginary parts."
         )
-    if np.any(ratio <= 0) or np.any(ratio >= _MOST_DAMPED):
-        k = int(np.argmax((ratio <= 0) | (ratio >= _MOST_DAMPED)))
+    if np.any(ratio <= 0) or np.any(ratio >= MOST_DAMPED):
+        k = int(np.argmax((ratio <= 0) | (ratio >= MOST_DAMPED)))
         raise ValueError(
             f"the mode at {natural[k] / HERTZ:.6g} Hz has the damping ratio {ratio[k]:.3g}: the "
             "responses do not show such a mode; give other poles or another band."
         )
-
-
-def _result(
-    data: ResponseData,
-    settings: BasisSettings,
-    fit: SeparableFit,
-    spread: _Spread,
-    orders: PoleOrders,
-) -> LinearModalFit:
-    natural, ratio, angle = unpacked(fit.unknowns, settings)
-    rank = np.argsort(natural)
-    n, sensors = len(natural), len(data.channels)
-    covariance = np.zeros((n, 2 + sensors, 2 + sensors))
-    for place, k in enumerate(rank):
-        pair = [k, n + k]
-        covariance[place, :2, :2] = fit.covariance[np.ix_(pair, pair)]
-        cross = fit.cross_covariance(k)[pair]
-        covariance[place, :2, 2:], covariance[place, 2:, :2] = cross, cross.T
-        covariance[place, 2:, 2:] = fit.term_covariance(k)
-    terms = [k for k, used in enumerate((settings.lower, settings.upper)) if used]
-    residual, residual_std = np.zeros((2, sensors)), np.zeros((2, sensors))
-    for place, k in enumerate(terms):
-        residual[k] = fit.coefficients[:, n + place]
-        residual_std[k] = np.sqrt(np.diag(fit.term_covariance(n + place)))
-    powers, groups = data.bases(windowed=settings.window_time is not None)
-    bases = receptance_bases(data.omega, fit.unknowns, settings, powers)
-    lines = len(data.omega)
-    columns = np.stack([bases[group].columns for group in groups])
-    fitted = np.einsum("srt,st->sr", columns, fit.coefficients)
-    curves = ResponseCurves(
-        data.omega, data.receptance, fitted[:, :lines] + 1j * fitted[:, lines:], spread.std
-    )
-    collinearity, mean_phase, mean_phase_std = complex_residues(
-        data, settings, fit, spread.std, rank
-    )
-    modes = LinearModalFit(
-        natural_frequency=natural[rank],
-        damping_ratio=ratio[rank],
-        mode_covariance=covariance,
-        collinearity=collinearity,
-        orders=orders,
-        sensors=data.channels,
-        status=fit.status,
-        notes=(),
-        residue=fit.coefficients[:, rank],
-        lower=residual[0],
-        lower_std=residual_std[0],
-        upper=residual[1],
-        upper_std=residual_std[1],
-        phase=angle,
-        phase_std=float(np.sqrt(fit.covariance[-1, -1])) if settings.phase else 0.0,
-        mean_phase=mean_phase,
-        mean_phase_std=mean_phase_std,
-        lines_in_band=lines_in_half_power(data.omega, natural[rank], ratio[rank]),
-        misfit=spread.misfit if data.source != "residuals" else np.full(sensors, np.nan),
-        curves=curves,
-        reference=data.reference,
-        source=data.source,
-    )
-    notes = (*data.notes, *fit_notes(modes, data, settings, fit, rank))
-    return dataclasses.replace(modes, notes=notes)

@@ -12,7 +12,31 @@ from jaxtyping import Complex, Float
 
 from snrmjax.identify.modal.separable_fit import TermColumns
 
+_NEWTON, _SETTLED = 40, 1e-9  # steps towards an amplitude, and the last one, relative
 _STEP = 1e-6  # relative, of the differences by poles of a windowed response
+
+
+class AmplitudeDependence(NamedTuple):
+    """A mode whose stiffness, and damping, change with a power p of its own amplitude.
+
+    D(q) q = F with D = ω² − Ω² + 2iζωΩ + u² (s + itΩ/u)(|q|/R)^p, q its response per unit of
+    residue: the unknown s is the relative change of the stiffness at the largest amplitude R, t/2ζ
+    that of the damping. q is the solution whose size is nearest `near`. With `apart` rows have a
+    frequency and a damping ratio of their own.
+    """
+
+    mode: int
+    power: int
+    damping: bool  # whether t is an unknown
+    unit: float  # u, rad/s
+    load: Float[np.ndarray, " line"]  # F
+    near: Float[np.ndarray, " line"]  # |q|, about
+    apart: Float[np.ndarray, " line"] | None = None  # 1 for rows with a mode of their own
+
+    @property
+    def n_terms(self) -> int:
+        """How many unknowns it adds: s, then t, then the changes of ω (over u) and of ζ."""
+        return 1 + self.damping + 2 * (self.apart is not None)
 
 
 class BasisSettings(NamedTuple):
@@ -26,13 +50,23 @@ class BasisSettings(NamedTuple):
     curved: bool = False  # a term Ω²: of modes not far above the band
     phase: bool = False  # an unknown phase of the instrument
     window_time: float | None = None
+    dependence: AmplitudeDependence | None = None
+
+    @property
+    def n_terms(self) -> int:
+        """Unknowns of the amplitude dependence."""
+        return 0 if self.dependence is None else self.dependence.n_terms
+
+    def modes_of(self, unknowns: Float[np.ndarray, " unknown"]) -> int:
+        """How many modes unknowns are of."""
+        return (len(unknowns) - self.phase - self.n_terms) // 2
 
 
 def unpacked(
     unknowns: Float[np.ndarray, " unknown"], settings: BasisSettings
 ) -> tuple[Float[np.ndarray, " mode"], Float[np.ndarray, " mode"], float]:
     """Natural frequencies, damping ratios and phase of the unknowns."""
-    n = (len(unknowns) - settings.phase) // 2
+    n = settings.modes_of(unknowns)
     return unknowns[:n], unknowns[n : 2 * n], float(unknowns[-1]) if settings.phase else 0.0
 
 
@@ -44,8 +78,9 @@ def receptance_bases(
 ) -> list[TermColumns]:
     """Bases of receptances, real parts above imaginary parts, terms: modes, 1/Ω², constant, Ω².
 
-    Arguments: `unknowns` natural frequencies (rad/s), damping ratios, then the phase if it is
-    unknown; `powers` of iΩ by which the receptance was measured, which matter under a window.
+    Arguments: `unknowns` natural frequencies (rad/s), damping ratios, those of the amplitude
+    dependence, then the phase if it is unknown; `powers` of iΩ by which the receptance was
+    measured, which matter under a window.
     """
     natural, ratio, angle = unpacked(unknowns, settings)
     turn = np.exp(1j * angle)
@@ -59,11 +94,20 @@ def receptance_bases(
             modes, by_frequency, by_ratio = _leaked(
                 omega, natural, ratio, power, settings.window_time
             )
+        terms = None
+        if settings.dependence is not None:
+            k, n = settings.dependence.mode, len(natural)
+            added = unknowns[2 * n : 2 * n + settings.n_terms]
+            modes[:, k], by_frequency[:, k], by_ratio[:, k], terms = _dependent(
+                omega, (natural[k], ratio[k]), added, settings.dependence
+            )
         columns = turn * np.column_stack([modes, *others])
         slopes = np.zeros((len(unknowns), *columns.shape), dtype=complex)
         at, n = np.arange(len(natural)), len(natural)
         slopes[at, :, at] = turn * by_frequency.T
         slopes[n + at, :, at] = turn * by_ratio.T
+        if terms is not None and settings.dependence is not None:
+            slopes[2 * n : 2 * n + len(terms), :, settings.dependence.mode] = turn * terms
         if settings.phase:
             slopes[-1] = 1j * columns
         bases.append(TermColumns(real_and_imaginary(columns, 0), real_and_imaginary(slopes, 1)))
@@ -84,6 +128,51 @@ def _plain(
     modes = 1 / (natural**2 - at**2 + 2j * ratio * natural * at)
     by_frequency = -(modes**2) * (2 * natural + 2j * ratio * at)
     return modes, by_frequency, -(modes**2) * 2j * natural * at
+
+
+def _dependent(
+    omega: np.ndarray,
+    mode: tuple[float, float],
+    added: np.ndarray,
+    of: AmplitudeDependence,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The column q/F of a mode that depends on its amplitude, and its derivatives.
+
+    By frequency, ratio and the unknowns of the dependence. q solves a real equation for |q|, by
+    Newton's method; the derivatives are those of D(q) q = F and of its conjugate.
+    """
+    apart = 0.0 if of.apart is None else of.apart
+    own = added[-2:] if of.apart is not None else np.zeros(2)
+    natural, ratio = mode[0] + own[0] * of.unit * apart, mode[1] + own[1] * apart
+    strength = of.unit**2 * (added[0] + 1j * (added[1] if of.damping else 0.0) * omega / of.unit)
+    linear = natural**2 - omega**2 + 2j * ratio * natural * omega
+    p, largest, size = of.power, float(of.near.max()), of.near.copy()
+    with np.errstate(all="ignore"):
+        for _ in range(_NEWTON):
+            dynamic = linear + strength * (size / largest) ** p
+            slope = p * np.real(np.conj(dynamic) * strength) * (size / largest) ** p
+            slope = np.abs(dynamic) ** 2 + slope
+            change = 0.5 * size * (np.abs(dynamic) ** 2 - (of.load / size) ** 2) / slope
+            size = np.clip(size - change, 0.5 * size, 2 * size)
+        settled = np.abs(change) < _SETTLED * size
+        share = (size / largest) ** p
+        q = of.load / (linear + strength * share)
+        q = np.where(settled, q, np.nan)
+        ahead = linear + strength * share * (1 + p / 2)
+        behind = strength * share * p / 2 * (q / np.abs(q)) ** 2
+
+        def slope_by(equation: np.ndarray) -> np.ndarray:
+            g = equation * q
+            found = behind * np.conj(g) - np.conj(ahead) * g
+            return found / (np.abs(ahead) ** 2 - np.abs(behind) ** 2) / of.load
+
+        by_frequency = slope_by(2 * natural + 2j * ratio * omega)
+        by_ratio = slope_by(2j * natural * omega)
+        terms = [slope_by(of.unit**2 * share)]
+        terms += [slope_by(1j * of.unit * omega * share)] * of.damping
+        if of.apart is not None:
+            terms += [of.unit * apart * by_frequency, apart * by_ratio]
+    return q / of.load, by_frequency, by_ratio, np.array(terms)
 
 
 def _leaked(

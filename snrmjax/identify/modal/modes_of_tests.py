@@ -7,6 +7,7 @@ from typing import Any, NamedTuple, get_args
 import numpy as np
 from jaxtyping import Float
 
+from snrmjax.identify.modal.amplitude_fit import amplitude_dependent_modes, rows_of_levels
 from snrmjax.identify.modal.free_decay import DecayModes, fit_free_decay
 from snrmjax.identify.modal.linear_fit import fit_linear_modes
 from snrmjax.identify.modal.modal_fit import LinearModalFit
@@ -33,7 +34,9 @@ def find_modes(
 ) -> tuple[LinearModalFit | DecayModes, tuple[Fact, ...]]:
     """Modes of what was measured, and notes on it.
 
-    Of steady states the lowest level counts, and the next one says whether it was low enough.
+    Of steady states the lowest level counts, and the next one says whether it was low enough. Where
+    the levels show that a mode depends on its amplitude, they are fitted together, and the modes
+    are those at no amplitude (see `amplitude_dependent_modes`).
 
     Arguments: `level` of steady states in place of the lowest; `base` what the responses are where
     the reference is the motion of a base; `settings` those of `fit_linear_modes`, of which free
@@ -56,7 +59,19 @@ def find_modes(
     chosen = levels[0] if level is None else level
     lowest = responses_of_states(source, chosen)
     modes = _of_responses(lowest.responses, base, {**settings, "std": lowest.std})
-    above = levels[levels.index(chosen) + 1 :]
+    onward = levels[levels.index(chosen) :]
+    above = onward[1:]
+    band = settings.get("from_frequency"), settings.get("to_frequency")
+    dependent = amplitude_dependent_modes(
+        rows_of_levels(source, onward, base=base, band=band),
+        modes,
+        residual_terms=settings.get("residual_terms") or "auto",
+        instrument_phase=modes.reference.quantity == "voltage"
+        if settings.get("instrument_phase") is None
+        else bool(settings["instrument_phase"]),
+    )
+    if dependent is not None:
+        return dependent[0], (dependent[1],)
     if not above:
         return modes, (Fact("one_level_for_modes"),)
     other = responses_of_states(source, above[0])

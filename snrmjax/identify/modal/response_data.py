@@ -37,11 +37,12 @@ class ResponseData(NamedTuple):
     source: ErrorSource
     averages: int | None
     notes: tuple[Fact | str, ...]
+    load: Float[np.ndarray, " line"] | float = 1.0  # of the reference, where motions were measured
 
     @property
     def measured_size(self) -> Float[np.ndarray, "channel line"]:
-        """|iΩ|^power of each channel: a receptance's factor to what was measured."""
-        return self.omega ** np.array(self.powers)[:, None]
+        """|iΩ|^power of each channel, and the load: a receptance's factor to what was measured."""
+        return self.load * self.omega ** np.array(self.powers)[:, None]
 
     @property
     def coherence(self) -> Float[np.ndarray, "channel line"]:

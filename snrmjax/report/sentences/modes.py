@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from snrmjax.report.sentences import Wording
+from snrmjax.report.sentences import Wording, enumerated
 
 
 def _amplitude_dependence(
@@ -23,6 +23,30 @@ def _amplitude_dependence(
         f"{factor * change:+.3g} {unit} from {low:.3g} to {high:.3g} m/s, where the errors allow "
         f"{factor * allowed:.2g} {unit}; at the lowest level some {factor * left:.2g} {unit} may "
         "be left, which is added to its error (1σ)"
+    )
+
+
+def _dependent_mode(
+    mode: int,
+    frequency_hz: float,
+    power: int,
+    shift_hz: float,
+    shift_std_hz: float,
+    bandwidths: float,
+    damping_change: float | None,
+    levels: tuple[int, ...],
+    velocity: float,
+) -> str:
+    grows = "the amplitude" if power == 1 else "the square of the amplitude"
+    damping = ""
+    if damping_change is not None:
+        damping = f" and its damping by {100 * damping_change:+.2g} % of critical"
+    of = f"level {levels[0]}" if len(levels) == 1 else f"levels {enumerated(levels)} together"
+    return (
+        f"mode {mode} depends on its amplitude: with {grows} its frequency changes by "
+        f"{shift_hz:+.3g} ± {1.96 * shift_std_hz:.2g} Hz (95 %){damping} from none to "
+        f"{velocity:.3g} m/s, {bandwidths:.2g} times its half-power bandwidth; its frequency "
+        f"({frequency_hz:.6g} Hz) and damping are those at no amplitude, fitted to {of}"
     )
 
 
@@ -74,6 +98,7 @@ SENTENCES: dict[str, Wording] = {
         "the two lowest levels agree within their errors: no amplitude dependence shows"
     ),
     "amplitude_dependence": _amplitude_dependence,
+    "amplitude_dependent_mode": _dependent_mode,
     # Scales of shapes.
     "scaled_by_drive_point": "scaled by the drive point {sensor}",
     "scaled_by_added_mass": "scaled by an added mass of {mass_kg:.4g} kg at {sensor}",

@@ -249,16 +249,19 @@ def test_the_lowest_level_of_steady_states():
     assert scaled.shape[0, 0] == pytest.approx(SHAPES[0, 0], rel=5e-3)
 
 
-def test_an_amplitude_dependence_is_said_and_added_to_the_error():
-    # Hardening: 2e-3 of the frequency for each 0.1 m/s.
-    found, notes = find_modes(states(0.02))
-    assert (notes[0].kind, notes[0]["mode"], notes[0]["of_damping"]) == (
-        *("amplitude_dependence", 1, False),
-    )
-    off = abs(found.natural_frequency[0] - STRUCTURE.natural_frequency[0])
-    assert off < 3 * found.natural_frequency_std[0]
-    alone = fit_linear_modes(responses_of_states(states(0.02), 1).responses)
-    assert off > 3 * alone.natural_frequency_std[0]
+def test_an_amplitude_dependence_is_fitted_with_both_levels():
+    # Hardening with the amplitude: 2 % of the frequency for each m/s.
+    own, data = STRUCTURE.natural_frequency[0], states(0.02)
+    found, notes = find_modes(data)
+    (note,) = notes
+    assert (note.kind, note["mode"], note["power"]) == ("amplitude_dependent_mode", 1, 1)
+    assert note["levels"] == (1, 2)
+    largest = np.abs(np.asarray(data.velocity)).max()
+    assert note["shift_hz"] == pytest.approx(own * 0.02 * largest / HERTZ, rel=0.03)
+    assert note["bandwidths"] == pytest.approx(0.02 * largest / 0.02, rel=0.03)
+    assert abs(found.natural_frequency[0] - own) < 3 * found.natural_frequency_std[0]
+    alone = fit_linear_modes(responses_of_states(data, 1).responses)
+    assert abs(alone.natural_frequency[0] - own) > 3 * alone.natural_frequency_std[0]
 
 
 BAD = [

@@ -1,0 +1,356 @@
+"""Modes of low-level tests that already depend on the amplitude: their values at no amplitude."""
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from snrmjax.identify.modal.linear_fit import ResidualTerms, basis_settings
+from snrmjax.identify.modal.modal_bases import (
+    AmplitudeDependence,
+    BasisSettings,
+    receptance_bases,
+    unpacked,
+)
+from snrmjax.identify.modal.modal_fit import LinearModalFit
+from snrmjax.identify.modal.modal_notes import lines_in_half_power
+from snrmjax.identify.modal.response_data import ResponseData
+from snrmjax.identify.modal.separable_fit import SeparableFit
+from snrmjax.identify.modal.weighted_fit import FitSpread, line_weights, modal_result, weighted_fit
+from snrmjax.measure.recordings.channels import Channel
+from snrmjax.measure.states import SteadyStates, relative_errors
+from snrmjax.model.base_motion import SensorMotion
+from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.units import HERTZ
+
+_POWERS = (1, 2)  # of the amplitude: hysteresis and friction, and smooth symmetric forces
+_REGION = 10.0  # half-power bandwidths about a mode, of the states from which a fit starts
+
+
+class LevelRows(NamedTuple):
+    """All states of some levels as rows of one fit, level after level."""
+
+    data: ResponseData
+    level: np.ndarray  # (row,)
+    velocity: Float[np.ndarray, " row"]  # m/s, the largest of all sensors
+
+
+class _Candidate(NamedTuple):
+    settings: BasisSettings
+    fit: SeparableFit
+    spread: FitSpread
+    deviance: float  # −2 log likelihood
+    n_unknowns: int
+
+    def criterion(self, n: float) -> float:
+        """Bayes' information criterion for n independent numbers."""
+        return self.deviance + self.n_unknowns * float(np.log(n))
+
+
+def amplitude_dependent_modes(
+    rows: LevelRows,
+    start: LinearModalFit,
+    *,
+    residual_terms: ResidualTerms = "auto",
+    instrument_phase: bool = False,
+) -> tuple[LinearModalFit, Fact] | None:
+    """The modes at no amplitude where a joint fit of levels shows that one depends on it.
+
+    The mode that responds most obeys (ω² − Ω² + 2iζωΩ + (α + iβΩ)|q|^p) q = F with p = 1 or 2 and
+    with β or without; all else is linear. Fits with and without α are compared by Bayes'
+    information criterion, for as many independent numbers as the correlation of the residuals
+    leaves; from the lowest level upward levels count as long as the next one asks for no frequency
+    and damping of its own. What the other candidates say, with their weights, widens the errors.
+
+    Arguments: `start` of the lowest level; further as `fit_linear_modes`.
+    Returns the fit and what it says, or None where no dependence shows.
+    Validity: one mode that depends on its amplitude, small changes of stiffness and damping, and
+    one solution near each state.
+    """
+    levels = list(dict.fromkeys(rows.level.tolist()))
+    best: tuple[LevelRows, list[_Candidate]] | None = None
+    for count in range(1, len(levels) + 1):
+        part = _levels(rows, levels[:count])
+        settings = basis_settings(part.data, residual_terms, instrument_phase, None)
+        found = _candidates(part, settings, start)
+        if not found:
+            break
+        if best is not None and _apart(part, found, levels[count - 1]):
+            break
+        best = part, found
+    if best is None:
+        return None
+    part, found = best
+    of = found[0].settings.dependence
+    return None if of is None else _told(part, found, of, start)
+
+
+def rows_of_levels(
+    data: SteadyStates,
+    levels: Sequence[int],
+    *,
+    base: SensorMotion | None = None,
+    band: tuple[float | None, float | None] = (None, None),
+) -> LevelRows:
+    """The states of levels, in this order and by frequency, as receptances with their errors.
+
+    A level with phases that were not measured is left out.
+
+    Arguments: `base` what the sensors record of a moving base, whose own motion is taken away;
+    `band` in rad/s, open where None.
+    """
+    level, omega = np.asarray(data.level), np.asarray(data.frequency)
+    low, high = (
+        end if end is not None else far for end, far in zip(band, (0.0, np.inf), strict=True)
+    )
+    unknown = np.unique(level[np.asarray(data.phase_unknown).reshape(len(level), -1).any(axis=1)])
+    inside = (omega >= low * (1 - 1e-12)) & (omega <= high * (1 + 1e-12))
+    place = {number: k for k, number in enumerate(levels) if number not in unknown}
+    keep = np.flatnonzero(inside & np.isin(level, list(place)))
+    places = np.array([place[number] for number in level[keep].tolist()])
+    order = keep[np.lexsort((omega[keep], places))]
+    force = np.asarray(data.force)[order]
+    volts = not np.isfinite(force).any()
+    load = np.asarray(data.drive)[order] if volts else force
+    reference = Channel("drive", "voltage", "V") if volts else Channel("force", "force", "N")
+    if data.base is not None:
+        reference = Channel("base", "acceleration", "m/s^2")
+    seen = np.asarray(data.measured)[order]
+    velocity = np.where(seen, np.asarray(data.velocity)[order], np.nan)
+    errors = np.asarray(relative_errors(data))[order]
+    std = np.sqrt(np.nansum(errors**2, axis=2) / 2) * np.abs(velocity)
+    stated = np.isfinite(errors).all(axis=2) & (std > 0)
+    known = bool(np.all(stated[seen]))
+    turn = 1j * omega[order, None] * load[:, None]
+    receptance = velocity / turn + (omega[order, None] ** -2.0 if base == "absolute" else 0.0)
+    given = ResponseData(
+        omega=omega[order],
+        receptance=receptance.T,
+        std=(std / np.abs(turn)).T if known else np.full(receptance.T.shape, np.nan),
+        powers=(1,) * len(data.sensors),
+        channels=tuple(Channel(name, "velocity", "m/s") for name in data.sensors),
+        reference=reference,
+        source="stated" if known else "residuals",
+        averages=None,
+        notes=(),
+        load=load,
+    )
+    return LevelRows(given, level[order], np.nanmax(np.abs(velocity), axis=1))
+
+
+def _levels(rows: LevelRows, levels: Sequence[int]) -> LevelRows:
+    return _chosen(rows, np.isin(rows.level, levels))
+
+
+def _chosen(rows: LevelRows, keep: Bool[np.ndarray, " row"]) -> LevelRows:
+    data = rows.data
+    part = data._replace(
+        omega=data.omega[keep],
+        receptance=data.receptance[:, keep],
+        std=data.std[:, keep],
+        load=np.asarray(data.load)[keep],
+    )
+    return LevelRows(part, rows.level[keep], rows.velocity[keep])
+
+
+def _candidates(
+    rows: LevelRows, settings: BasisSettings, start: LinearModalFit
+) -> list[_Candidate]:
+    """Fits of all kinds of dependence and of none, the most probable first."""
+    found = []
+    poles = np.concatenate([start.natural_frequency, start.damping_ratio])
+    size = np.max(np.abs(start.residue), axis=0)
+    mode = int(np.argmax(size / (start.damping_ratio * start.natural_frequency**2)))
+    linear = _fitted(rows, settings, [poles])
+    if linear is not None:
+        found.append(linear)
+    for power, damping in product(_POWERS, (False, True)):
+        found += _of_kind(rows, settings, (poles, mode, start), power, damping)
+    n = _independent_numbers(found, rows)
+    return sorted(found, key=lambda one: one.criterion(n))
+
+
+def _of_kind(
+    rows: LevelRows,
+    settings: BasisSettings,
+    of: tuple[np.ndarray, int, LinearModalFit],
+    power: int,
+    damping: bool,
+) -> Iterator[_Candidate]:
+    """Fits with one kind of dependence, of all modes and without those that stand for a skew.
+
+    A resonance that leans is fitted by two linear modes: the mode nearest to the one that depends
+    on its amplitude is left out as long as that is the more probable.
+    """
+    poles, mode, start = of
+    best: _Candidate | None = None
+    while True:
+        n = len(poles) // 2
+        dependence, regressed = _start(rows, (poles[mode], poles[n + mode]), start, power, damping)
+        dependence = dependence._replace(mode=mode)
+        terms = np.zeros(dependence.n_terms)
+        tries = [np.concatenate([poles, terms])]
+        if regressed is not None:
+            other = tries[0].copy()
+            other[[mode, n + mode]] = regressed[:2]
+            other[2 * n : 2 * n + len(terms)] = regressed[2 : 2 + len(terms)]
+            tries.append(other)
+        one = _fitted(rows, settings._replace(dependence=dependence), tries)
+        numbers = _independent_numbers([one] if one else [], rows)
+        if one is None or (best and one.criterion(numbers) >= best.criterion(numbers)):
+            break
+        best = one
+        if n == 1:
+            break
+        away = np.abs(poles[:n] - poles[mode])
+        nearest = int(np.argsort(away)[1])
+        poles = np.delete(poles, [nearest, n + nearest])
+        mode -= nearest < mode
+    if best is not None:
+        yield best
+
+
+def _start(
+    rows: LevelRows,
+    mode: tuple[float, float],
+    start: LinearModalFit,
+    power: int,
+    damping: bool,
+) -> tuple[AmplitudeDependence, np.ndarray | None]:
+    """The dependence with the amplitudes as measured; and ω, ζ, s, t by linear least squares.
+
+    Ω²x = ω²x + icΩx + α|x|^p x + iβΩ|x|^p x − PF at the sensor that moves most.
+    """
+    data, (natural, ratio) = rows.data, mode
+    nearest = int(np.argmin(np.abs(start.natural_frequency - natural)))
+    sensor = int(np.argmax(np.abs(start.residue[:, nearest])))
+    x = data.receptance[sensor] * data.load
+    seen = np.isfinite(x)
+    x = np.where(seen, x, np.nanmin(np.abs(x)))
+    load, omega = np.asarray(data.load), data.omega
+    near = np.abs(x) / np.abs(start.residue[sensor, nearest])
+    dependence = AmplitudeDependence(0, power, damping, natural, load, near)
+    share = (near / near.max()) ** power
+    use = seen & (np.abs(omega - natural) < _REGION * 2 * ratio * natural)
+    columns = [x, 1j * omega * x, natural**2 * share * x]
+    columns += [1j * natural * omega * share * x] * damping
+    table = np.stack([*columns, -load], axis=1)[use]
+    goal = (omega**2 * x)[use]
+    both, wanted = np.concatenate([table.real, table.imag]), np.append(goal.real, goal.imag)
+    if len(wanted) <= both.shape[1]:
+        return dependence, None
+    scale = np.maximum(np.linalg.norm(both, axis=0), 1e-300)
+    found = np.linalg.lstsq(both / scale, wanted, rcond=None)[0] / scale
+    if not (found[0] > 0 and found[1] > 0):
+        return dependence, None
+    own = np.sqrt(found[0])
+    return dependence, np.array([own, found[1] / (2 * own), *found[2:-1]])
+
+
+def _fitted(
+    rows: LevelRows, settings: BasisSettings, starts: Sequence[np.ndarray]
+) -> _Candidate | None:
+    """The best fit from several starts; None where none ends at modes with positive damping."""
+    data, found = rows.data, []
+    std = 1 / np.maximum(line_weights(data), 1e-300)
+    for start in starts:
+        unknowns = np.append(start, np.zeros(int(settings.phase)))
+        columns = receptance_bases(data.omega, unknowns, settings)[0].columns
+        if not np.isfinite(columns).all():
+            continue
+        fit, spread = weighted_fit(data, settings, unknowns, std)
+        if np.all(unpacked(fit.unknowns, settings)[1] > 0) and np.isfinite(fit.residuals).all():
+            good = np.isfinite(data.receptance)
+            of_size = 4 * np.sum(np.log(spread.std[good]))
+            deviance = float(np.sum(fit.residuals**2) + of_size)
+            n = len(fit.unknowns) + fit.coefficients.size
+            found.append(_Candidate(settings, fit, spread, deviance, n))
+    return min(found, key=lambda one: one.deviance, default=None)
+
+
+def _independent_numbers(found: Sequence[_Candidate], rows: LevelRows) -> float:
+    """How many independent numbers there are, by the correlation of the best fit's residuals."""
+    n = 2.0 * np.isfinite(rows.data.receptance).sum()
+    if not found:
+        return n
+    best = min(found, key=lambda one: one.deviance)
+    return n / (1 + 2 * max(float(np.sum(best.fit.correlation)), 0.0))
+
+
+def _apart(rows: LevelRows, found: Sequence[_Candidate], level: int) -> bool:
+    """Whether the states of a level ask for a frequency and a damping of their own."""
+    dependent = [one for one in found if one.settings.dependence is not None]
+    if not dependent:
+        return True
+    best = dependent[0]
+    own = best.settings.dependence
+    if own is None:
+        return True
+    apart = own._replace(apart=(rows.level == level).astype(float))
+    settings = best.settings._replace(dependence=apart)
+    n = best.settings.modes_of(best.fit.unknowns)
+    last = 2 * n + own.n_terms
+    start = np.concatenate([best.fit.unknowns[:last], np.zeros(2)])
+    other = _fitted(rows, settings, [start])
+    numbers = _independent_numbers([best], rows)
+    return other is not None and other.criterion(numbers) < best.criterion(numbers)
+
+
+def _told(
+    rows: LevelRows,
+    found: Sequence[_Candidate],
+    of: AmplitudeDependence,
+    start: LinearModalFit,
+) -> tuple[LinearModalFit, Fact]:
+    """The fit of the best candidate, with what the others say in its errors."""
+    best = found[0]
+    modes = modal_result(rows.data, best.settings, best.fit, best.spread, start.orders)
+    natural, ratio, _ = unpacked(best.fit.unknowns, best.settings)
+    n, k = len(natural), of.mode
+    place = int(np.argsort(np.argsort(natural))[k])
+    numbers = _independent_numbers(found, rows)
+    weights = np.array([one.criterion(numbers) for one in found])
+    weights = np.exp(-0.5 * (weights - weights.min()))
+    covariance = modes.mode_covariance.copy()
+    for one, weight in zip(found, weights / weights.sum(), strict=True):
+        w, z, _ = unpacked(one.fit.unknowns, one.settings)
+        nearest = int(np.argmin(np.abs(w - natural[k])))
+        away = np.array([w[nearest] - natural[k], z[nearest] - ratio[k]])
+        covariance[place, :2, :2] += weight * np.outer(away, away)
+    change, loss = best.fit.unknowns[2 * n], best.fit.unknowns[2 * n + 1] if of.damping else 0.0
+    column = receptance_bases(rows.data.omega, best.fit.unknowns, best.settings)[0].columns[:, k]
+    half = len(column) // 2
+    size = np.abs(column[:half] + 1j * column[half:]) * rows.data.load
+    share = (size / of.near.max()) ** of.power
+    ends = np.sqrt(natural[k] ** 2 + of.unit**2 * change * np.array([share.max(), 0.0]))
+    shift = float(ends[0] - ends[1])
+    error = best.fit.covariance[2 * n, 2 * n] ** 0.5 * abs(shift / change) if change else np.inf
+    lowest = rows.level == rows.level[0]
+    kept = _chosen(rows, lowest).data
+    curves = modes.curves._replace(
+        omega=kept.omega,
+        measured=kept.receptance,
+        fitted=modes.curves.fitted[:, lowest],
+        std=modes.curves.std[:, lowest],
+    )
+    fact = Fact(
+        "amplitude_dependent_mode",
+        mode=place + 1,
+        frequency_hz=float(natural[k]) / HERTZ,
+        power=of.power,
+        shift_hz=shift / HERTZ,
+        shift_std_hz=float(error) / HERTZ,
+        bandwidths=abs(shift) / float(2 * ratio[k] * natural[k]),
+        damping_change=float(0.5 * loss * of.unit / ends[0] * share.max()) if of.damping else None,
+        levels=tuple(dict.fromkeys(rows.level.tolist())),
+        velocity=float(rows.velocity.max()),
+    )
+    lines = np.unique(kept.omega)
+    in_band = lines_in_half_power(lines, modes.natural_frequency, modes.damping_ratio)
+    whole = dataclasses.replace(
+        modes, mode_covariance=covariance, curves=curves, lines_in_band=in_band
+    )
+    return whole, fact

@@ -1,0 +1,169 @@
+"""Weighted fits of modes to responses: weights that settle, and the result with its errors."""
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from snrmjax.identify.modal.modal_bases import (
+    BasisSettings,
+    real_and_imaginary,
+    receptance_bases,
+    unpacked,
+)
+from snrmjax.identify.modal.modal_fit import LinearModalFit, ResponseCurves
+from snrmjax.identify.modal.modal_notes import complex_residues, fit_notes, lines_in_half_power
+from snrmjax.identify.modal.pole_orders import PoleOrders
+from snrmjax.identify.modal.response_data import ResponseData, coherence_std, std_from_residuals
+from snrmjax.identify.modal.separable_fit import (
+    ChannelRows,
+    SeparableFit,
+    TermColumns,
+    fit_separable,
+)
+
+MOST_DAMPED = 0.9
+"""Damping ratio beyond which a fit finds no mode."""
+_ROUNDS = 3  # of fits and weights
+
+
+def line_weights(data: ResponseData) -> Float[np.ndarray, "channel line"]:
+    """1/σ of receptances; of one size for all that a channel measured where σ is unknown."""
+    good = np.isfinite(data.receptance)
+    size = data.measured_size
+    rough = np.sqrt(np.nanmean(np.abs(data.receptance * size) ** 2, axis=1))[:, None] / size
+    std = np.where(np.isfinite(data.std), data.std, 1e-2 * rough)
+    return np.where(good, 1 / std, 0.0)
+
+
+def filled_receptance(data: ResponseData) -> Complex[np.ndarray, "channel line"]:
+    """Receptances with 0 where they were not measured."""
+    return np.where(np.isfinite(data.receptance), data.receptance, 0.0)
+
+
+class FitSpread(NamedTuple):
+    """Errors that a fit was weighted by, and what its residuals make of stated ones."""
+
+    std: Float[np.ndarray, "channel line"]  # that weighted the last fit
+    misfit: Float[np.ndarray, " channel"]
+
+
+def weighted_fit(
+    data: ResponseData,
+    settings: BasisSettings,
+    unknowns: np.ndarray,
+    std: np.ndarray,
+    rounds: int = _ROUNDS,
+) -> tuple[SeparableFit, FitSpread]:
+    """The fit from given unknowns (see `receptance_bases`) and 1σ, its weights settled.
+
+    Each round takes the size of the errors from the residuals of the one before.
+    """
+    good = np.isfinite(data.receptance)
+    values = real_and_imaginary(filled_receptance(data))
+    powers, groups = data.bases(windowed=settings.window_time is not None)
+    n, band = settings.modes_of(unknowns), (data.omega.min(), data.omega.max())
+    most = np.ones(settings.n_terms)  # of the natural frequency squared, over the amplitudes
+    low = np.concatenate([np.full(n, 0.5 * band[0]), np.full(n, -MOST_DAMPED), -most])
+    high = np.concatenate([np.full(n, 2 * band[1]), np.full(n, MOST_DAMPED), most])
+    if settings.phase:
+        low, high = np.append(low, -np.pi), np.append(high, np.pi)
+
+    def basis_at(point: np.ndarray) -> list[TermColumns]:
+        return receptance_bases(data.omega, point, settings, powers)
+
+    coherence = data.coherence if data.source == "coherence" else None
+    scale = np.ones(len(values))
+    for turn in range(rounds):
+        weights = np.where(good, 1 / (std * scale[:, None]), 0.0)
+        measured = ChannelRows(values, np.tile(weights, (1, 2)), groups, 2)
+        fit = fit_separable(basis_at, measured, unknowns, (low, high))
+        unknowns = fit.unknowns
+        left = fit.residuals / np.maximum(np.tile(weights, (1, 2)), 1e-300)
+        lines = len(data.omega)
+        residuals = np.where(good, left[:, :lines] + 1j * left[:, lines:], np.nan)
+        fitted = filled_receptance(data) - np.nan_to_num(residuals)
+        if turn == rounds - 1:
+            break
+        if data.source == "residuals":
+            std, scale = std_from_residuals(data, residuals, fitted), np.ones(len(values))
+        elif coherence is not None:
+            # Weights that use the measured size prefer lines that are too small by chance.
+            std = coherence_std(np.abs(fitted), coherence, data.averages)
+        # The size of each channel's errors is what its residuals show.
+        rms = _rms(residuals / std, fit, good)
+        scale = np.maximum(rms, 1e-12 * rms.max()) if rms.max() > 0 else np.ones(len(rms))
+    misfit = _rms(residuals / std, fit, good)
+    # Covariances for the mean size that the last residuals have, close to one.
+    last = _rms(residuals / (std * scale[:, None]), fit, good)
+    return fit.with_variance(float(np.mean(last**2))), FitSpread(std * scale[:, None], misfit)
+
+
+def _rms(residuals: np.ndarray, fit: SeparableFit, good: np.ndarray) -> np.ndarray:
+    """Root mean square of real and imaginary parts by the degrees of freedom of each channel."""
+    shared = len(fit.unknowns) / len(residuals)
+    free = np.maximum(2 * good.sum(axis=1) - fit.coefficients.shape[1] - shared, 1.0)
+    return np.sqrt(np.nansum(np.abs(residuals) ** 2, axis=1) / free)
+
+
+def modal_result(
+    data: ResponseData,
+    settings: BasisSettings,
+    fit: SeparableFit,
+    spread: FitSpread,
+    orders: PoleOrders,
+) -> LinearModalFit:
+    """A fit as modes in the order of their frequencies, with what a reader must know of it."""
+    natural, ratio, angle = unpacked(fit.unknowns, settings)
+    rank = np.argsort(natural)
+    n, sensors = len(natural), len(data.channels)
+    covariance = np.zeros((n, 2 + sensors, 2 + sensors))
+    for place, k in enumerate(rank):
+        pair = [k, n + k]
+        covariance[place, :2, :2] = fit.covariance[np.ix_(pair, pair)]
+        cross = fit.cross_covariance(k)[pair]
+        covariance[place, :2, 2:], covariance[place, 2:, :2] = cross, cross.T
+        covariance[place, 2:, 2:] = fit.term_covariance(k)
+    terms = [k for k, used in enumerate((settings.lower, settings.upper)) if used]
+    residual, residual_std = np.zeros((2, sensors)), np.zeros((2, sensors))
+    for place, k in enumerate(terms):
+        residual[k] = fit.coefficients[:, n + place]
+        residual_std[k] = np.sqrt(np.diag(fit.term_covariance(n + place)))
+    powers, groups = data.bases(windowed=settings.window_time is not None)
+    bases = receptance_bases(data.omega, fit.unknowns, settings, powers)
+    lines = len(data.omega)
+    columns = np.stack([bases[group].columns for group in groups])
+    fitted = np.einsum("srt,st->sr", columns, fit.coefficients)
+    curves = ResponseCurves(
+        data.omega, data.receptance, fitted[:, :lines] + 1j * fitted[:, lines:], spread.std
+    )
+    collinearity, mean_phase, mean_phase_std = complex_residues(
+        data, settings, fit, spread.std, rank
+    )
+    modes = LinearModalFit(
+        natural_frequency=natural[rank],
+        damping_ratio=ratio[rank],
+        mode_covariance=covariance,
+        collinearity=collinearity,
+        orders=orders,
+        sensors=data.channels,
+        status=fit.status,
+        notes=(),
+        residue=fit.coefficients[:, rank],
+        lower=residual[0],
+        lower_std=residual_std[0],
+        upper=residual[1],
+        upper_std=residual_std[1],
+        phase=angle,
+        phase_std=float(np.sqrt(fit.covariance[-1, -1])) if settings.phase else 0.0,
+        mean_phase=mean_phase,
+        mean_phase_std=mean_phase_std,
+        lines_in_band=lines_in_half_power(data.omega, natural[rank], ratio[rank]),
+        misfit=spread.misfit if data.source != "residuals" else np.full(sensors, np.nan),
+        curves=curves,
+        reference=data.reference,
+        source=data.source,
+    )
+    notes = (*data.notes, *fit_notes(modes, data, settings, fit, rank))
+    return dataclasses.replace(modes, notes=notes)
