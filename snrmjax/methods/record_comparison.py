@@ -7,17 +7,21 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from snrmjax.measure.decays.decay_record import even_record
-from snrmjax.measure.decays.isolated_decay import MOST_COMPANY, IsolatedDecay
+from snrmjax.measure.decays.isolated_decay import IsolatedDecay
 from snrmjax.measure.recordings.stepped_sine import stepped_sine_states
 from snrmjax.measure.states import SteadyStates
 from snrmjax.measure.sweeps.slow_sweep import sweep_states
 from snrmjax.methods.records.pnlss import pnlss
-from snrmjax.methods.records.recorded_decays import read_decays, recorded_decays
+from snrmjax.methods.records.recorded_decays import (
+    read_decays,
+    recorded_decays,
+    restoring_force_of_mode,
+    ssm_of_mode,
+)
 from snrmjax.methods.records.recorded_test import RecordedTest, RecordKind
 from snrmjax.methods.records.recorded_velocity import recorded_velocity
 from snrmjax.methods.records.resonant_decay import decay_of_mode
 from snrmjax.methods.records.restoring_force import restoring_force
-from snrmjax.methods.records.ssm import ssm
 from snrmjax.methods.result import MethodResult, method_result
 from snrmjax.model.modes import LinearModes
 from snrmjax.numerics.facts import Fact
@@ -69,30 +73,9 @@ def _noted(result: MethodResult, notes: Sequence[Fact]) -> MethodResult:
     return dataclasses.replace(result, notes=(*result.notes, *notes))
 
 
-def _restoring_force_of(decay: IsolatedDecay) -> MethodResult:
-    """Company was taken away: what the forces leave says that they are not those of the mode."""
-    return restoring_force(decay.time, decay.velocity, most_left=MOST_COMPANY)
-
-
-def _ssm_of(decay: IsolatedDecay) -> MethodResult:
-    """Its 1σ knows white noise: where readings scatter more, it errs more."""
-    found = ssm(decay.time, decay.velocity, noise_std=decay.noise_std)
-    rows = np.argsort(decay.level.real)
-    at = np.log(np.asarray(found.velocity))
-    damping, omega = (
-        np.maximum(1.0, np.interp(at, decay.level.real[rows], one[rows]))
-        for one in (decay.excess.real, decay.excess.imag)
-    )
-    return dataclasses.replace(
-        found,
-        natural_frequency_std=found.natural_frequency_std * omega,
-        damping_ratio_std=found.damping_ratio_std * damping,
-    )
-
-
 def _restoring_force(test: RecordedTest, modes: LinearModes) -> list[MethodResult]:
     if test.kind is RecordKind.FREE_DECAY:
-        return _of_decays(_restoring_force_of)(test, modes)
+        return _of_decays(restoring_force_of_mode)(test, modes)
     channel, whole = _force_channel(test), (0, test.recording.n_samples)
     seen = recorded_velocity(test.recording, test.channels.reference, test.frequency, whole)
     force = test.recording.values([channel], seen.start, seen.start + len(seen.time))[0]
@@ -134,7 +117,7 @@ RECORD_METHODS: dict[str, RecordMethod] = {
     "restoring_force": RecordMethod(
         _restoring_force, (RecordKind.FREE_DECAY, RecordKind.BROADBAND)
     ),
-    "ssm": RecordMethod(_of_decays(_ssm_of), (RecordKind.FREE_DECAY,)),
+    "ssm": RecordMethod(_of_decays(ssm_of_mode), (RecordKind.FREE_DECAY,)),
     "pnlss": RecordMethod(
         lambda test, modes: [_pnlss_of([test], modes)], (RecordKind.BROADBAND,), _pnlss_of
     ),

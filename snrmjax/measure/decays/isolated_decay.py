@@ -41,6 +41,7 @@ from snrmjax.numerics.units import HERTZ
 PER_CYCLE = 2  # instants
 POINTS = 4  # cycles from one reading to the next
 MOST_COMPANY = 0.01  # largest share of the energy inside the band that is not the mode's
+NOT_KNOWN = 1 / 1.96  # 1σ over the damping, from where on its 95 % band holds zero
 _SIGMA = (1.0, 3.0)  # cycles of the filter's weights
 _CYCLES_A_SIGMA = 8 / 3  # of a fall to a quarter, in which one line would be drawn
 _BAND = 0.25  # of the mode's frequency: what the filter passes, one side
@@ -361,7 +362,7 @@ def _isolated(
     # Ends of the record, at which the filter sees one side alone, are left out of it.
     one_sided = round(sigma * PER_CYCLE)
     ends = part.start + one_sided, part.stop - 1 - one_sided
-    if np.median(np.abs(scatter[0] / reading.smooth.rate.real[rows])) > 1:
+    if np.median(np.abs(scatter[0] / reading.smooth.rate.real[rows])) > NOT_KNOWN:
         raise ValueError(_refusal(reading, part))
     inside = slice(*np.searchsorted(time, reading.carrier.time[list(ends)]))
     return IsolatedDecay(

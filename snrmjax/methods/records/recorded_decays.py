@@ -6,9 +6,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from snrmjax.measure.decays.isolated_decay import IsolatedDecay, isolate_decay
+from snrmjax.measure.decays.isolated_decay import (
+    MOST_COMPANY,
+    NOT_KNOWN,
+    IsolatedDecay,
+    isolate_decay,
+)
 from snrmjax.methods.records.recorded_test import RecordedTest
 from snrmjax.methods.records.recorded_velocity import recorded_velocity
+from snrmjax.methods.records.resonant_decay import decay_of_mode
+from snrmjax.methods.records.restoring_force import restoring_force
+from snrmjax.methods.records.ssm import ssm
 from snrmjax.methods.result import MethodResult
 from snrmjax.model.modes import LinearModes
 from snrmjax.numerics.facts import Fact
@@ -52,7 +60,7 @@ def read_decays(
         if one.decay is None:
             continue
         result = method(one.decay)
-        _require_band(result, one.decay)
+        _require_mode(result, one.decay)
         notes = dict.fromkeys((*result.notes, *one.notes, *left_out))
         found.append(dataclasses.replace(result, notes=tuple(notes)))
     if not found:
@@ -60,7 +68,67 @@ def read_decays(
     return found
 
 
-def _require_band(result: MethodResult, decay: IsolatedDecay) -> None:
+def restoring_force_of_mode(decay: IsolatedDecay) -> MethodResult:
+    """`restoring_force` of a mode apart from its company.
+
+    1σ, which the method does not give, is how far its curves are off the decay's own reading, with
+    the 1σ of that. Raises `ValueError` as the method does, and where its forces leave 1 % of the
+    acceleration's power: nothing else is in the record.
+    """
+    found = restoring_force(decay.time, decay.velocity, most_left=MOST_COMPANY)
+    (omega, omega_std), (ratio, ratio_std) = _reading_at(decay, np.asarray(found.velocity))
+    return dataclasses.replace(
+        found,
+        natural_frequency_std=np.hypot(found.natural_frequency - omega, omega_std),
+        damping_ratio_std=np.hypot(found.damping_ratio - ratio, ratio_std),
+    )
+
+
+def ssm_of_mode(decay: IsolatedDecay) -> MethodResult:
+    """`ssm` of a mode apart from its company.
+
+    Its 1σ, which knows white noise, grows as that of the decay's own reading does where company
+    disturbs it, and by the ratio by which the curves are off this reading beyond both (R. T. Birge,
+    Phys. Rev. 40 (1932) 207). Raises `ValueError` as the method does.
+    """
+    found = ssm(decay.time, decay.velocity, noise_std=decay.noise_std)
+    rows = np.argsort(decay.level.real)
+    size = np.asarray(found.velocity)
+    read = decay_of_mode(decay)
+    inside = read.found & (read.velocity >= np.nanmin(size)) & (read.velocity <= np.nanmax(size))
+    spread = {}
+    for name, excess in (
+        ("natural_frequency", decay.excess.imag),
+        ("damping_ratio", decay.excess.real),
+    ):
+        value, std, other, other_std = (
+            np.asarray(getattr(one, f"{name}{end}"))
+            for one in (found, read)
+            for end in ("", "_std")
+        )
+        grown = np.interp(np.log(size), decay.level.real[rows], excess[rows])
+        std = std * np.maximum(1.0, grown)
+        here, here_std = (
+            np.interp(np.asarray(read.velocity)[inside], size[found.found], one[found.found])
+            for one in (value, std)
+        )
+        away = (other[inside] - here) / np.hypot(other_std[inside], here_std)
+        spread[f"{name}_std"] = std * np.sqrt(max(1.0, float(np.mean(away**2))))
+    return dataclasses.replace(found, **spread)
+
+
+def _reading_at(decay: IsolatedDecay, velocity: np.ndarray) -> list[list[np.ndarray]]:
+    """Frequency and damping with their 1σ as the decay itself is read, at some amplitudes."""
+    read = decay_of_mode(decay)
+    known, at = np.log(np.asarray(read.velocity)[read.found]), np.log(velocity)
+    return [
+        [np.interp(at, known, np.asarray(getattr(read, f"{name}{end}"))[read.found])
+         for end in ("", "_std")]
+        for name in ("natural_frequency", "damping_ratio")
+    ]  # fmt: skip
+
+
+def _require_mode(result: MethodResult, decay: IsolatedDecay) -> None:
     omega = np.asarray(result.natural_frequency)[result.found]
     low, high = decay.band
     if omega.size and (omega.min() < low or omega.max() > high):
@@ -68,4 +136,12 @@ def _require_band(result: MethodResult, decay: IsolatedDecay) -> None:
             f"what was found, {omega.min() / HERTZ:.4g} to {omega.max() / HERTZ:.4g} Hz, lies "
             f"outside the mode's own band of {low / HERTZ:.4g} to {high / HERTZ:.4g} Hz: it "
             "follows another motion."
+        )
+    ratio, std = (
+        np.asarray(one)[result.found] for one in (result.damping_ratio, result.damping_ratio_std)
+    )
+    if ratio.size and np.nanmedian(std / ratio) > NOT_KNOWN:
+        raise ValueError(
+            f"its damping is off that of the decay by {100 * np.nanmedian(std / ratio):.2g} % "
+            "(median): it does not follow the mode."
         )
