@@ -115,7 +115,7 @@ class _Reading(NamedTuple):
     carrier: Carrier
     rate: Complex[np.ndarray, " k"]
     smooth: SlowFlow
-    noise: Float[np.ndarray, " k"]  # 1σ of ln A and of phase that white noise makes
+    noise: Float[np.ndarray, " k"]  # 1σ of ln A that the residual's spectrum makes
     sigma: float
 
 
@@ -204,9 +204,10 @@ def _read_from(
         before = carrier
         local = local_fit(time, signal, carrier, at, sigma)
         carrier, rate = Carrier(at, local.level), local.rate
+    rows = np.unique([*range(0, len(at), POINTS * PER_CYCLE), len(at) - 1])
+    read = local_fit(time, signal, before, at[rows], sigma, rows=True)
     left = signal - _wave(carrier, time)
-    samples = HERTZ / np.abs(rate.imag) / (time[1] - time[0])  # a cycle
-    noise = _white(left) / np.exp(carrier.value.real) / np.sqrt(np.sqrt(np.pi) * sigma * samples)
+    noise = np.interp(at, at[rows], _noise_of(left, read, sigma, time[1] - time[0])[0])
     independent = _independent(carrier.value.imag, sigma)
     weight = 1 / np.hypot(noise, _SMOOTH_ERROR * 0.1)
     smooth = slow_flow(at, carrier.value, weight, independent)
@@ -337,7 +338,8 @@ def _isolated(
     hum: list[tuple[float, float]],
 ) -> IsolatedDecay:
     """The usable part with its standard deviations."""
-    rows = np.arange(part.start, part.stop, POINTS * PER_CYCLE)
+    every = POINTS * PER_CYCLE
+    rows = np.arange(part.start, part.stop, every)
     at, sigma = reading.carrier.time[rows], reading.sigma
     read = local_fit(time, signal, reading.before, at, sigma, rows=True)
     # The same filter on the mode that it found alone: nothing else differs.
@@ -350,20 +352,21 @@ def _isolated(
     mode = alone + _harmonics(time, signal - alone, reading, part)
     left = signal - mode
     level_std, noise, white_only, white = _noise_of(left, read, sigma, time[1] - time[0])
-    off, wide = reading.rate - reading.smooth.rate, _SCATTER * sigma * PER_CYCLE
-    scatter = []
-    for one in (off.real, off.imag):
-        swings = one - gaussian_filter1d(one, wide, mode="nearest")
-        scatter.append(np.sqrt(gaussian_filter1d(swings**2, wide, mode="nearest"))[rows])
-    std = [
-        np.hypot(np.maximum(one, other), part_of_bias)
-        for one, other, part_of_bias in zip(noise, scatter, (bias.real, bias.imag), strict=True)
+    off = (reading.rate - reading.smooth.rate)[part]
+    excess = [
+        _excess(one, np.exp(np.interp(reading.carrier.time[part], at, np.log(std))), sigma)[::every]
+        for one, std in zip((off.real, off.imag), noise, strict=True)
     ]
+    std = [
+        np.hypot(one * np.maximum(1.0, times), part_of_bias)
+        for one, times, part_of_bias in zip(noise, excess, (bias.real, bias.imag), strict=True)
+    ]
+    beyond = noise[0] * np.sqrt(np.maximum(excess[0] ** 2 - 1, 0.0))
+    if np.median(np.abs(beyond / reading.smooth.rate.real[rows])) > NOT_KNOWN:
+        raise ValueError(_refusal(reading, part))
     # Ends of the record, at which the filter sees one side alone, are left out of it.
     one_sided = round(sigma * PER_CYCLE)
     ends = part.start + one_sided, part.stop - 1 - one_sided
-    if np.median(np.abs(scatter[0] / reading.smooth.rate.real[rows])) > NOT_KNOWN:
-        raise ValueError(_refusal(reading, part))
     inside = slice(*np.searchsorted(time, reading.carrier.time[list(ends)]))
     return IsolatedDecay(
         time[inside],
@@ -382,6 +385,17 @@ def _isolated(
         _band(reading, part),
         _company(time[: inside.stop], mode[: inside.stop], left[: inside.stop], hum),
     )
+
+
+def _excess(off: np.ndarray, std: np.ndarray, sigma: float) -> np.ndarray:
+    """How many times 1σ readings scatter about their own smooth course, over 4σ of the filter."""
+    wide, weight = _SCATTER * sigma * PER_CYCLE, 1 / std**2
+
+    def smooth(values: np.ndarray) -> np.ndarray:
+        return gaussian_filter1d(values, wide, mode="nearest")
+
+    swings = (off - smooth(weight * off) / smooth(weight)) / std
+    return np.sqrt(smooth(swings**2))
 
 
 def _harmonics(
