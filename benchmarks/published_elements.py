@@ -3,13 +3,15 @@
 Run: OMP_NUM_THREADS=1 python benchmarks/published_elements.py
 
 Sources: NLvib's examples 1 to 5 and 8 to 10 (Krack and Gross; their numbers, or those of an
-independent harmonic balance where none are printed), SSMTool's three oscillators and cantilevers
-(spectral submanifolds of order 3 and 7, collocation), closed forms of a Jenkins element and of
+independent harmonic balance where none are printed), SSMTool's three oscillators, cantilevers and
+von Karman beam (spectral submanifolds of order 3 and 7, collocation), closed forms of a Jenkins element and of
 Segalman's four-parameter Iwan joint. `published` is what the source has, to its digits;
 `difference` is relative. Seconds are those of the second run, programs compiled.
 """
 
 import dataclasses
+import itertools
+from collections import Counter
 from collections.abc import Callable, Iterator
 from functools import partial
 
@@ -226,6 +228,60 @@ def _friction_at_a_node() -> Rows:
     yield "its frequency, rad/s (printed to 3 digits)", float(curve.frequency[rms.argmax()]), 195.0
 
 
+def _with_stretching(
+    model: sj.model.Structure, axial: float, length: float, n_elements: int
+) -> sj.model.Structure:
+    """With V = E A (∫ w′² dx)² / 8 L, of a beam whose ends cannot come nearer.
+
+    The axial motion follows without inertia: far below its first natural frequency.
+    """
+    h = length / n_elements
+    slopes = np.array([[36, 3 * h, -36, 3 * h], [3 * h, 4 * h**2, -3 * h, -(h**2)]])
+    slopes = np.vstack([slopes, -slopes[0], [3 * h, -(h**2), -3 * h, 4 * h**2]]) / (30 * h)
+    names = [f"{kind}{k}" for k in range(n_elements + 1) for kind in "wr"]
+    shapes = np.zeros((len(names), model.n_modes))
+    for row, point in zip(np.asarray(model.modes.mode_shape), model.modes.sensors, strict=True):
+        shapes[names.index(point)] = row
+    squares = np.zeros((model.n_modes, model.n_modes))
+    for k in range(n_elements):
+        there = shapes[2 * k : 2 * k + 4]
+        squares += there.T @ slopes @ there
+    terms: Counter[tuple[int, ...]] = Counter()
+    for i, j, m, n in itertools.product(range(model.n_modes), repeat=4):
+        terms[tuple(sorted((i, j, m, n)))] += axial / (8 * length) * squares[i, j] * squares[m, n]
+    potential = sj.model.polynomial_potential(dict(terms), model.n_modes)
+    return dataclasses.replace(model, potential=potential)
+
+
+def _von_karman_beam() -> Rows:
+    mass, _, stiffness, points = sj.model.beam(
+        *(45e6 * 10**4 / 12, 1780e-9 * 100, 2700.0, 100),
+        supports=("clamped", "pinned"),
+        springs={"w50": 37.0},
+    )
+    model = sj.model.from_matrices(
+        *(mass, 2e-4 / 9 * stiffness, stiffness, points),
+        **{"force": "w50", "n_modes": 8, "residuals": False},
+    )
+    model = _with_stretching(model, 45e6 * 100, 2700.0, 100)
+    first = model.modes.natural_frequency.item(0)
+    yield "natural frequency, rad/s", first, 33.196
+    curves = sj.forced_response(
+        model, 20.0, 0.96 * first, 1.05 * first, harmonic_order=5, steps=LONG
+    )
+    found = np.sort(_events(curves, "fold"))
+    for fold, published in zip(found, (33.522, 33.523), strict=False):
+        yield "fold", float(fold), published
+    places = _events(curves, "neimark_sacker")
+    for place in (33.841, 34.028):
+        yield "Neimark-Sacker", _nearest(places, place), place
+    torus = sj.simulate.quasi_periodic_branch(model, curves[0])
+    ends = (("begins", 0, 5.847), ("ends", -1, 5.519))
+    for word, end, published in ends:
+        yield f"slow period where the torus {word}, s", float(torus.slow_period[end]), published
+    yield "end of the torus", float(torus.frequency[-1]), 34.028
+
+
 def _isola_of_negative_damping() -> Rows:
     elements = (
         _element("cubic_stiffness", "w25", coefficient=6.0),
@@ -292,6 +348,7 @@ PROBLEMS: dict[str, Callable[[], Rows]] = {
     "9 cubic spring at a tip": _cubic_at_a_tip,
     "13 three oscillators, 1:1:1": _three_oscillators,
     "14 cantilever on a spring, 1:3": _cantilever_on_a_spring,
+    "15 von Karman beam on a spring, 1:3": _von_karman_beam,
     "17 isola of negative damping": _isola_of_negative_damping,
     "18 Jenkins element, damped mode": _jenkins,
     "19 four-parameter Iwan joint": _iwan,
