@@ -18,7 +18,7 @@ def import_(
     files: Annotated[
         list[Path],
         typer.Argument(
-            help="UFF, MATLAB, HDF5, netCDF, TDMS, LabVIEW, other text; several files are one test.",
+            help="UFF, MATLAB, HDF5, netCDF, TDMS, LabVIEW, other text; several files: one test.",
             metavar="FILE…",
             show_default=False,
         ),

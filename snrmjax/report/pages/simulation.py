@@ -15,7 +15,7 @@ from snrmjax.report.figures.simulation import (
     simulated_response_figure,
 )
 from snrmjax.report.html import Report, ReportFigure, Section, write_report
-from snrmjax.report.sentences import sentences
+from snrmjax.report.sentences import number_of, sentences
 from snrmjax.report.style import save_figure, save_figures
 from snrmjax.simulate.continuation.response_curve import Branch, ResponseCurve, velocity_at_sensors
 
@@ -83,5 +83,5 @@ def _largest(curve: ResponseCurve, sensor: str) -> str:
     top = int(np.argmax(speed))
     return (
         f"{load}: {speed[top]:.4g} m/s at {sensor} at most, at "
-        f"{curve.frequency[top] / HERTZ:.5g} Hz; {len(curve.at_events('fold'))} folds"
+        f"{curve.frequency[top] / HERTZ:.5g} Hz; {number_of(len(curve.at_events('fold')), 'fold')}"
     )
