@@ -26,6 +26,7 @@ class FilesRead(NamedTuple):
     files: tuple[Path, ...]
     map_file: Path | None = None
     told: ImportMap = ImportMap()
+    is_base: bool = False  # the motion of a base is in the place of the force
 
 
 def check_files(
@@ -42,9 +43,9 @@ def check_files(
     structure = None if model is None else read_model(model)
     tables = [read_steady_states(path, structure) for path in data]
     recordings = [record for path in records for record in read_recordings(path)]
-    return with_imports(
-        check_test(tables, structure, recordings), FilesRead(tuple(map(Path, data)))
-    )
+    is_base = any(table.base is not None for table in tables)
+    read = FilesRead(tuple(map(Path, data)), is_base=is_base)
+    return with_imports(check_test(tables, structure, recordings), read)
 
 
 def files_of_test(folder: Path, files: TestFiles) -> FilesRead | None:
@@ -53,7 +54,8 @@ def files_of_test(folder: Path, files: TestFiles) -> FilesRead | None:
     records = [record.file.partition(": ")[0] for record in files.records]
     read = [*(state.file for state in files.states if state.table is None), *records]
     if tables and not read:
-        return FilesRead(tables)
+        is_base = any(state.states.base is not None for state in files.states)
+        return FilesRead(tables, is_base=is_base)
     told = folder / MAP
     if tables or not told.is_file():
         return None
@@ -108,7 +110,11 @@ def _joined(findings: Sequence[Finding]) -> ImportCorrection:
 def _command(correction: ImportCorrection, read: FilesRead) -> str:
     """The import that does a correction; empty where no options of it can."""
     own = read.map_file is None
-    options = _options_of_own(correction) if own else _options_of_laboratory(correction, read.told)
+    options = (
+        _options_of_own(correction, is_base=read.is_base)
+        if own
+        else _options_of_laboratory(correction, read.told)
+    )
     if not options:
         return ""
     told = () if own else ("--map", str(read.map_file))
@@ -119,7 +125,7 @@ def _command(correction: ImportCorrection, read: FilesRead) -> str:
     return f"`{' '.join(quoted)}`"
 
 
-def _options_of_own(correction: ImportCorrection) -> list[str]:
+def _options_of_own(correction: ImportCorrection, *, is_base: bool = False) -> list[str]:
     """Options that read our own table as what it is; none where it does not hold enough."""
     if correction.force_unit == "V":
         return ["--force-unit", "V"]
@@ -128,7 +134,7 @@ def _options_of_own(correction: ImportCorrection) -> list[str]:
         size = f"{correction.response:.8g} " if correction.response != 1 else ""
         words += ["--unit", f"{size}{_SI[correction.quantity]}"]
     if correction.force != 1:
-        words += ["--force-unit", f"{correction.force:.8g} N"]
+        words += ["--force-unit", f"{correction.force:.8g} {'m/s^2' if is_base else 'N'}"]
     return [*words, *(["--phase-sign", "lag"] if correction.conjugate else [])]
 
 
@@ -137,7 +143,8 @@ def _options_of_laboratory(correction: ImportCorrection, told: ImportMap) -> lis
     kinds = {response.quantity for response in told.responses}
     named = correction.response == 1 or correction.unit
     named = named and (correction.force == 1 or correction.force_unit)
-    if correction.quantity or not named or len(kinds) != 1:
+    of_base = bool(told.base) and correction.force != 1
+    if correction.quantity or not named or len(kinds) != 1 or of_base:
         return []
     if correction.conjugate and told.record:
         return []

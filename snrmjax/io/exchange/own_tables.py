@@ -70,6 +70,8 @@ def restated(states: SteadyStates, mapping: ImportMap) -> SteadyStates:
 
 def _with_force(states: SteadyStates, mapping: ImportMap) -> SteadyStates:
     """With the force, or the drive in its place, in the unit that is stated."""
+    if states.base is not None:
+        return _with_base(states, mapping)
     force = force_meaning(mapping, "N", "the force")
     factor = force.factor * AMPLITUDE_FACTORS[mapping.amplitude]
     missing = jnp.full(states.n_states, jnp.nan)
@@ -81,6 +83,24 @@ def _with_force(states: SteadyStates, mapping: ImportMap) -> SteadyStates:
         drive, newtons = (loads, missing) if force.is_voltage else (missing, loads)
     std = missing if force.is_voltage else states.force_std * factor
     return dataclasses.replace(states, force=newtons, drive=drive, force_std=std)
+
+
+def _with_base(states: SteadyStates, mapping: ImportMap) -> SteadyStates:
+    """With the base's acceleration in the unit that is stated."""
+    factor = AMPLITUDE_FACTORS[mapping.amplitude]
+    if mapping.force_unit:
+        quantity, by_unit, _ = motion_meaning(
+            "", mapping.force_unit, "", "the base", option="--force-unit"
+        )
+        if quantity != "acceleration":
+            raise ValueError(
+                f"--force-unit of a table with a base's acceleration must be one of acceleration, "
+                f"but {mapping.force_unit} is of {quantity}."
+            )
+        factor *= by_unit
+    return dataclasses.replace(
+        states, force=states.force * factor, force_std=states.force_std * factor
+    )
 
 
 def restated_how(mapping: ImportMap) -> Fact:

@@ -114,3 +114,14 @@ def test_a_record_of_steps_on_a_table(tmp_path, motion):
     assert code == 0, said
     head = (tmp_path / "record" / "record.csv").read_text().splitlines()[0]
     assert f"base_{kind}_" in head
+
+
+def test_our_own_table_of_a_base_in_another_unit(tmp_path):
+    head = "level,frequency_hz,base_acceleration_re_m_s2,base_acceleration_im_m_s2"
+    rows = "\n".join(f"1,{f},{0.1},0,0.2,0.1" for f in F)
+    (tmp_path / "own.csv").write_text(f"{head},velocity_re_m_s,velocity_im_m_s\n{rows}\n")
+    states = imported(tmp_path, tmp_path / "own.csv", "--force-unit", "g")
+    np.testing.assert_allclose(states.force, 0.1 * G, rtol=1e-14)
+    code, said = run_import(tmp_path / "own.csv", "--force-unit", "N", "--out", tmp_path / "no")
+    assert code == 2
+    assert "must be a displacement, velocity or acceleration" in said
