@@ -1,0 +1,97 @@
+"""Small inputs that once went wrong, where they lie beside the project, each by its command."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from truths.import_runs import run_import
+from typer.testing import CliRunner
+
+from snrmjax.cli import app
+from snrmjax.io.laboratory import read_laboratory_file
+from snrmjax.io.tables import read_steady_states
+
+CASES = Path(__file__).resolve().parents[3] / "shared" / "cases"
+pytestmark = pytest.mark.skipif(not CASES.exists(), reason="no cases beside the project")
+POUND = 4.4482216152605
+
+
+def run(*words):
+    result = CliRunner().invoke(app, list(map(str, words)))
+    if result.exception is not None and not isinstance(result.exception, ValueError | SystemExit):
+        raise result.exception
+    return result
+
+
+@pytest.mark.parametrize(
+    ("unit", "newtons"), [("lbf", 0.4 * POUND), ("kN", 400), ("mN", 4e-4), ("g", 0), ("banana", 0)]
+)
+def test_a_stated_unit_is_obeyed_or_refused(tmp_path, unit, newtons):
+    words = "--frequency frequency --response velocity:velocity:m/s --phase phase --phase-unit deg"
+    words += f" --phase-sign lead --amplitude peak --force-amplitude 0.4 --force-unit {unit}"
+    table = CASES / "force_unit_dropped" / "table.csv"
+    code, _ = run_import(table, *words.split(), "--out", tmp_path / "o")
+    assert code == (0 if newtons else 2)
+    if newtons:
+        np.testing.assert_allclose(
+            read_steady_states(tmp_path / "o" / "measured.csv").force, newtons
+        )
+
+
+@pytest.mark.parametrize("name", ["run.txt", "one_run.txt", "run_without_trailing_tab.txt"])
+def test_a_trailing_tab(name):
+    (table,) = read_laboratory_file(CASES / "header_trailing_tab" / name).tables
+    assert sorted(table.units.values()) == ["Deg", "Hz", "m/s"]
+    assert table.n_rows == (41 if name == "one_run.txt" else 82)
+
+
+def test_a_labview_file_with_decimal_commas():
+    (record,) = read_laboratory_file(CASES / "lvm_decimal_comma" / "test.lvm").recordings
+    assert (record.sampling_rate, record.channel_names) == (1000.0, ("Force", "Response"))
+    assert np.abs(record.values()).max() <= 1.0
+
+
+def test_radians_of_a_list_of_units_and_ratios(tmp_path):
+    code, said = run_import(CASES / "mat_units_field_rad" / "fr.mat")
+    assert code == 0
+    assert "--force force --response amplitude --out" in said
+    found = run(
+        "modes",
+        CASES / "compound_unit_label" / "ratio_g.uff",
+        "--drive-point",
+        "1+z",
+        "--out",
+        tmp_path / "model.toml",
+    )
+    assert found.exit_code == 0, found.exception
+    assert "59.999" in found.output
+
+
+def test_channels_of_two_files_and_of_two_clocks(tmp_path):
+    folder = CASES / "polytec_one_channel_a_file"
+    files = folder / "force.txt", folder / "velocity.txt"
+    words = ["--force", "Ref1 Force", "--response", "Vib Velocity", "--record", "broadband"]
+    code, said = run_import(*files, *words, "--out", tmp_path / "o")
+    assert code == 0, said
+    head = (tmp_path / "o" / "record.csv").read_text().splitlines()[0]
+    assert head == "time_s,force_n,velocity_m_s"
+    words = ["--force", "Force", "--response", "Acc:acceleration", "--record", "steps"]
+    code, said = run_import(
+        CASES / "tdms_start_times" / "skew.tdms", *words, "--out", tmp_path / "t"
+    )
+    assert code == 0, said
+    states = read_steady_states(tmp_path / "t" / "measured.csv")
+    at_50 = int(np.argmin(np.abs(np.asarray(states.frequency) - 100 * np.pi)))
+    assert np.angle(np.asarray(states.velocity)[0, 0], deg=True) == pytest.approx(72, abs=0.5)
+    assert abs(np.angle(np.asarray(states.velocity)[at_50, 0], deg=True)) < 1
+
+
+def test_the_sign_of_a_residue_is_kept(tmp_path):
+    measured = CASES / "unscaled_sign" / "measured.csv"
+    assert run("modes", measured, "--unscaled", "--out", tmp_path / "m.toml").exit_code == 0
+    assert (
+        run("check", measured, "--model", tmp_path / "m.toml", "--out", tmp_path / "c").exit_code
+        == 0
+    )
+    assert json.loads((tmp_path / "c" / "check.json").read_text()) == []
