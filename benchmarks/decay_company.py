@@ -20,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from harness import options, teller
 from scipy.integrate import solve_ivp
+from scipy.interpolate import CubicSpline
 
 import snrmjax as sj
 from snrmjax.measure import Channel, time_recording
@@ -178,7 +179,7 @@ def scored(result, truth):
         (1, result.natural_frequency, result.natural_frequency_std),
         (2, result.damping_ratio, result.damping_ratio_std),
     ):
-        true = np.interp(at[kept], truth[0], truth[row])
+        true = CubicSpline(truth[0], truth[row])(at[kept])
         away = np.asarray(found)[kept] / true - 1
         rows += [np.abs(away) * true / np.asarray(std)[kept], np.abs(away)]
     return np.array(rows)

@@ -50,6 +50,7 @@ _MAINS = (50.0, 60.0)
 _MAINS_OFF = 0.2  # Hz, that mains may be off
 _MAINS_NEAR = 3.0  # times the mode's frequency, or one over it
 _SURE = 4.0  # standard deviations by which hum stands out
+_NEIGHBOURS = np.arange(2, 9)  # lines on either side of which these are taken
 _APART = 2.0  # turns by which hum and mode must part to be told apart
 _SMOOTH_ERROR = 0.05  # of the mode's amplitude, that the smooth decay may be off
 _SCATTER = 4.0  # σ of the filter, over which scatter is averaged
@@ -268,20 +269,23 @@ def _hum(time: np.ndarray, signal: np.ndarray, reading: _Reading) -> list[_Tone]
 def _steady_tone(
     time: np.ndarray, inside: np.ndarray, left: np.ndarray, weight: np.ndarray, hertz: float
 ) -> _Tone | None:
-    """The tone that fits best within 0.2 Hz, if it stands out of what it leaves."""
-    at, best = time[inside], None
-    for one in hertz + np.linspace(-_MAINS_OFF, _MAINS_OFF, 21):
-        turn = np.exp(2j * np.pi * one * at)
-        design = np.stack([turn.real, -turn.imag, np.ones_like(at)], axis=1) * weight[:, None]
-        solved, *_ = np.linalg.lstsq(design, left * weight, rcond=None)
-        rest = float(np.sum((left * weight - design @ solved) ** 2))
-        if best is None or rest < best[0]:
-            std = np.sqrt(rest / len(at) * np.linalg.inv(design.T @ design)[0, 0])
-            best = rest, one, complex(solved[0], solved[1]), std
-    _, one, size, std = best
-    if abs(size) < _SURE * std:
+    """The tone within 0.2 Hz that is largest, if it stands out of the spectrum beside it."""
+    at = time[inside]
+    span = float(np.ptp(at))
+
+    def line(of: np.ndarray) -> np.ndarray:
+        turns = np.exp(-2j * np.pi * of[:, None] * at)
+        return 2 * (turns @ (weight**2 * left)) / np.sum(weight**2)
+
+    near = hertz + np.linspace(-_MAINS_OFF, _MAINS_OFF, 21)
+    lines = line(near)
+    best = int(np.argmax(np.abs(lines)))
+    away = _NEIGHBOURS / span
+    beside = np.abs(line(hertz + np.concatenate([-away, away])))
+    if np.abs(lines[best]) < _SURE * np.median(beside) / np.sqrt(2 * np.log(2)):
         return None
-    return _Tone(float(one), abs(size), (size * np.exp(2j * np.pi * one * time)).real)
+    wave = (lines[best] * np.exp(2j * np.pi * near[best] * time)).real
+    return _Tone(float(near[best]), float(np.abs(lines[best])), wave)
 
 
 def _usable(reading: _Reading) -> slice:
