@@ -10,7 +10,12 @@ from snrmjax.identify.inference.identification import identify_backbone
 from snrmjax.identify.joint.joint_fit import fit_jointly
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.states import SteadyStates, join_steady_states, with_levels_apart
-from snrmjax.methods.record_comparison import RECORD_METHODS, run_record_method, states_of
+from snrmjax.methods.record_comparison import (
+    RECORD_METHODS,
+    run_record_method,
+    states_of,
+    with_decays,
+)
 from snrmjax.methods.records.recorded_test import RecordedTest, RecordKind, recorded_test
 from snrmjax.methods.result import (
     MethodResult,
@@ -82,6 +87,7 @@ class Comparison(NamedTuple):
     stopped: dict[str, str]  # method: why
     data: SteadyStates | None = None  # of tables, stepped sines and slow sweeps
     records: tuple[Fact, ...] = ()  # what each time record was taken for, and why
+    decays: tuple[Fact, ...] = ()  # what lies beside the mode in free decays
 
     @property
     def reference(self) -> MethodResult | None:
@@ -164,7 +170,7 @@ def compare_methods(
     if not any(result.found.any() for result in results):
         why = MethodStatus(int(results[0].status[0])).message
         raise ValueError(f"no method found anything; {results[0].method}: {why}.")
-    return Comparison(tuple(results), stopped, read.states, read.facts())
+    return Comparison(tuple(results), stopped, read.states, read.facts(), read.company())
 
 
 class _Read(NamedTuple):
@@ -185,6 +191,15 @@ class _Read(NamedTuple):
         left_out = (Fact("data_left_out", why=why) for why in self.unknown + self.without_states)
         return (*taken, *left_out)
 
+    def company(self) -> tuple[Fact, ...]:
+        """How the mode of each free decay was isolated, and what else lies in the record."""
+        return tuple(
+            Fact("note_of_decay", name=test.recording.name, note=note)
+            for test in self.tests
+            for decay in test.decays
+            for note in decay.notes
+        )
+
 
 def _read(parts: Sequence[SteadyStates | TimeRecording], modes: LinearModes) -> _Read:
     states = [part for part in parts if isinstance(part, SteadyStates)]
@@ -198,6 +213,8 @@ def _read(parts: Sequence[SteadyStates | TimeRecording], modes: LinearModes) -> 
             read.unknown.append(str(error))
             continue
         read.counts.append(None)
+        if read.tests[-1].kind is RecordKind.FREE_DECAY:
+            read.tests[-1] = with_decays(read.tests[-1], modes)
         if read.tests[-1].kind in (RecordKind.STEPPED_SINE, RecordKind.SLOW_SWEEP):
             try:
                 found, read.counts[-1] = states_of(read.tests[-1])

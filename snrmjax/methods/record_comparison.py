@@ -60,6 +60,13 @@ def states_of(test: RecordedTest) -> tuple[SteadyStates, Fact]:
         raise ValueError(f"{test.recording.name}: {error}") from error
 
 
+def with_decays(test: RecordedTest, modes: LinearModes) -> RecordedTest:
+    """A record with the mode of each of its free decays, which methods then share."""
+    if test.recording.n_samples > _LONGEST:
+        return test
+    return test._replace(decays=recorded_decays(test, modes))
+
+
 def _of_decays(
     method: Callable[[IsolatedDecay], MethodResult],
 ) -> Callable[[RecordedTest, LinearModes], list[MethodResult]]:

@@ -92,8 +92,8 @@ class IsolatedDecay(NamedTuple):
         """What was done and what else lies in the record."""
         low, high = (edge / HERTZ for edge in self.band)
         of = self.company
-        omega = float(np.abs(self.bias.imag / self.rate.imag).max())
-        decay = float(np.abs(self.bias.real / self.smooth_rate.real).max())
+        omega = float(np.median(np.abs(self.bias.imag / self.rate.imag)))
+        decay = float(np.median(np.abs(self.bias.real / self.smooth_rate.real)))
         about = {"low_hz": low, "high_hz": high, "begin": self.begin}
         return (
             Fact("mode_isolated", share=of.mode_share, **about),

@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 
@@ -12,7 +11,7 @@ from snrmjax.measure.decays.isolated_decay import (
     IsolatedDecay,
     isolate_decay,
 )
-from snrmjax.methods.records.recorded_test import RecordedTest
+from snrmjax.methods.records.recorded_test import RecordedDecay, RecordedTest
 from snrmjax.methods.records.recorded_velocity import recorded_velocity
 from snrmjax.methods.records.resonant_decay import decay_of_mode
 from snrmjax.methods.records.restoring_force import restoring_force
@@ -23,16 +22,10 @@ from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.units import HERTZ
 
 
-class RecordedDecay(NamedTuple):
-    """One stretch of free decay: the mode alone, or why there is none."""
-
-    decay: IsolatedDecay | None
-    notes: tuple[Fact, ...]
-    why: str = ""
-
-
 def recorded_decays(test: RecordedTest, modes: LinearModes) -> tuple[RecordedDecay, ...]:
     """The mode of interest in every free decay of a record (`isolate_decay`)."""
+    if test.decays:
+        return test.decays
     rest = modes.natural_frequency.item(modes.mode_of_interest)
     found = []
     for part in test.free:
@@ -40,7 +33,9 @@ def recorded_decays(test: RecordedTest, modes: LinearModes) -> tuple[RecordedDec
             seen = recorded_velocity(test.recording, test.channels.reference, rest, part)
             decay = isolate_decay(seen.time, seen.velocity, rest)
         except ValueError as error:
-            found.append(RecordedDecay(None, (), str(error)))
+            # Of a single decay it is the reason why the methods of decays did not run.
+            why = (Fact("decay_left_out", why=str(error)),) if len(test.free) > 1 else ()
+            found.append(RecordedDecay(None, why, str(error)))
         else:
             found.append(RecordedDecay(decay, (*decay.notes(), *seen.notes)))
     return tuple(found)
@@ -51,18 +46,16 @@ def read_decays(
 ) -> list[MethodResult]:
     """What a method finds in the decays whose mode could be isolated.
 
-    A decay that could not be is named in a note. Raises `ValueError` where none could, and where a
+    Raises `ValueError` where none could, and where a
     method's frequencies lie outside the band of the mode: it follows another motion.
     """
-    left_out = [Fact("decay_left_out", why=one.why) for one in decays if one.decay is None]
     found = []
     for one in decays:
         if one.decay is None:
             continue
         result = method(one.decay)
         _require_mode(result, one.decay)
-        notes = dict.fromkeys((*result.notes, *one.notes, *left_out))
-        found.append(dataclasses.replace(result, notes=tuple(notes)))
+        found.append(result)
     if not found:
         raise ValueError(decays[0].why if decays else "the record has no free decay.")
     return found
@@ -142,6 +135,6 @@ def _require_mode(result: MethodResult, decay: IsolatedDecay) -> None:
     )
     if ratio.size and np.nanmedian(std / ratio) > NOT_KNOWN:
         raise ValueError(
-            f"its damping is off that of the decay by {100 * np.nanmedian(std / ratio):.2g} % "
-            "(median): it does not follow the mode."
+            f"the 1σ of its damping is {100 * np.nanmedian(std / ratio):.2g} % of the damping "
+            "(median): it does not tell how the mode decays."
         )

@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from snrmjax.measure.decays.isolated_decay import IsolatedDecay
 from snrmjax.measure.recordings.ring_down import find_ring_downs
 from snrmjax.measure.recordings.steps import moves_within_steps, recognise_steps
 from snrmjax.measure.recordings.time_recording import TimeRecording
@@ -63,6 +64,14 @@ class RecordChannels(NamedTuple):
     reference: str  # motion at the sensor where the mode moves most
 
 
+class RecordedDecay(NamedTuple):
+    """The mode alone in one stretch of free decay, or why there is none."""
+
+    decay: IsolatedDecay | None
+    notes: tuple[Fact, ...]
+    why: str = ""
+
+
 class RecordedTest(NamedTuple):
     """A time record, what it is, and by which rule."""
 
@@ -72,6 +81,7 @@ class RecordedTest(NamedTuple):
     why: Fact  # by which rule
     free: tuple[tuple[int, int], ...] = ()  # samples of free decays, start and stop
     frequency: float = np.nan  # rad/s, strongest of the motion
+    decays: tuple[RecordedDecay, ...] = ()  # of free decays, once they were looked at
 
 
 def recorded_test(recording: TimeRecording, modes: LinearModes) -> RecordedTest:

@@ -129,7 +129,9 @@ def decay_of_mode(decay: IsolatedDecay) -> MethodResult:
         ratio,
         np.hypot(decay.rate_std.real / natural, along_ratio * decay.level_std),
     )
-    return method_result("resonant_decay", points, 0, decay.notes())
+    return method_result(
+        "resonant_decay", points, 0, [Fact("decay_read_by", reading="a filter that moves with it")]
+    )
 
 
 def checked_record(

@@ -52,6 +52,7 @@ class SpectralSubmanifold(NamedTuple):
     largest: float
     noise_std: float  # m/s, of a sample: what the trajectory leaves
     manifold_misfit: float  # rms off the manifold over rms of the embedded record
+    left: float  # share of the record's power that the trajectory leaves
     samples: int
 
 
@@ -83,7 +84,8 @@ def ssm(
     The natural frequency is √(ω² + α²) of the decaying motion's ω(ρ) and α(ρ); the damping is the
     power lost over ½ m V², as at phase resonance (`NormalForm.modal_damping`).
 
-    Arguments and errors as in `fit_submanifold`. Returns a `MethodResult` of 25 amplitudes whose
+    Arguments and errors as in `fit_submanifold`, and `ValueError` where a decaying mode leaves a
+    quarter of the record's power. Returns a `MethodResult` of 25 amplitudes whose
     velocity is the fundamental's; 1σ from the fit's residual near the mode's frequency. An
     amplitude at which the mode gains energy is `NOT_A_MODE`.
     """
@@ -92,6 +94,11 @@ def ssm(
     )
     amplitude = np.linspace(found.smallest, found.largest, _POINTS)
     values = _curves(found.form, amplitude)
+    if found.left > _MOST_LEFT and np.any(values[1] > 0):
+        raise ValueError(
+            f"one decaying mode leaves {100 * found.left:.2g} % of the record's power: other motion "
+            "lies beside it; isolate the mode before (`isolate_decay`)."
+        )
     spread = _curve_std(found, amplitude)
     points = points_of_curves(amplitude, values[0], spread[0], values[1], spread[1])
     degree = 2 * len(found.form.decay) - 1
@@ -117,8 +124,8 @@ def fit_submanifold(
     by default one more than Schwarz' criterion asks for; the record is read down to
     `least_amplitude` (m/s); `noise_std` (m/s) of white noise as dense as that near the mode, where
     a filter took the rest of it away.
-    Returns a `SpectralSubmanifold`. Raises `ValueError` for a record as in `resonant_decay`, where
-    the record holds no decaying oscillation, and where the form leaves a quarter of its power.
+    Returns a `SpectralSubmanifold`. Raises `ValueError` for a record as in `resonant_decay` and
+    where the record holds no decaying oscillation.
     Validity: one mode (isolate it before, `isolate_decay`), smooth forces: dry friction is
     no polynomial, and 1σ does not know of it.
     """
@@ -148,12 +155,6 @@ def fit_submanifold(
     best = _selected(times, signal, coordinate, orders, terms, noise_std)
     if best is None:
         raise ValueError("the record holds no oscillation that decays smoothly.")
-    left = best.mean_square / float(np.var(signal))
-    if left > _MOST_LEFT:
-        raise ValueError(
-            f"one decaying mode leaves {100 * left:.2g} % of the record's power: other motion lies "
-            "beside it; isolate the mode before (`isolate_decay`)."
-        )
     return _submanifold(best, times, signal, misfit, noise_std)
 
 
@@ -317,6 +318,7 @@ def _submanifold(
         float(found.amplitude[min(first, len(times) - 1) :].max()),
         noise,
         misfit,
+        best.mean_square / float(np.var(signal)),
         len(times),
     )
 

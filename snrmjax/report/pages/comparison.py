@@ -43,15 +43,15 @@ _EVERY = (*METHODS, *RECORD_METHODS)
 _LINES = {"snrm": "-", "restoring_force": "--", "ssm": "-.", "pnlss": ":"}
 _MARKERS = ("o", ".", "s", "D", "^", "v", "x")
 # Methods whose 1σ knows noise alone, and those that also take all forces for polynomials.
-_OF_NOISE = ("concerto", "arslan_ozguven", "rct", "phase_resonance", "resonant_decay")
-_OF_POLYNOMIALS = ("ssm", "pnlss")
+_OF_NOISE = ("concerto", "arslan_ozguven", "rct", "phase_resonance")
+_OF_POLYNOMIALS = ("pnlss",)
 _AWAY = ("median_distance_from_snrm_hz", "median_relative_damping_distance_from_snrm")
 _FEW = 40  # points that are drawn large
 _CAPTION = (
     "Natural frequency and damping against the velocity amplitude at resonance, by each method "
     "from the same tests. Lines with 95 % bands are methods that give curves (the restoring-force "
-    "surface gives no band); methods that answer state by state, level by level or cycle by cycle "
-    "are points. Far outliers are counted at the edge."
+    "surface of a forced record gives no band); methods that answer state by state, level by "
+    "level or cycle by cycle are points. Far outliers are counted at the edge."
 )
 
 
@@ -83,8 +83,8 @@ def write(folder: Path, found: Comparison, *, title: str = "", model: str = "") 
 
 
 def headline(found: Comparison) -> list[str]:
-    """What each record was taken for, and the result."""
-    return [*map(str, found.records), comparison_sentence(found)]
+    """What each record was taken for, what lies beside the mode in decays, and the result."""
+    return [*map(str, (*found.records, *found.decays)), comparison_sentence(found)]
 
 
 def notes_of(found: Comparison) -> list[str]:
@@ -169,7 +169,8 @@ def _notes(found: Comparison) -> list[str]:
         for result in results
         for note in result.notes
     ]
-    return [*map(str, found.records), *notes_of(found), *notes_on_bands(results), *own]
+    about = map(str, (*found.records, *found.decays))
+    return [*about, *notes_of(found), *notes_on_bands(results), *own]
 
 
 def notes_on_bands(results: Sequence[MethodResult]) -> list[str]:
@@ -204,6 +205,7 @@ def _summary(found: Comparison) -> dict:
     near = {d.method: (d.frequency / HERTZ, d.damping) for d in found.distances() if own}
     return {
         "records": [str(record) for record in found.records],
+        "decays": [str(note) for note in found.decays],
         "bands": notes_on_bands(results),
         "methods": {
             result.method: {

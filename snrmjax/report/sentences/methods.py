@@ -42,19 +42,20 @@ SENTENCES: dict[str, Wording] = {
         "of the damping"
     ),
     "mode_isolated": (
-        "the mode was isolated by a filter that moves with it, within {low_hz:.4g} to "
-        "{high_hz:.4g} Hz, from {begin:.3g} s on; it has {share:%.3g} of the decay's energy"
+        "the mode, {share:%.3g} of the decay's energy, was isolated by a filter that moves with "
+        "it within {low_hz:.4g} to {high_hz:.4g} Hz, from {begin:.3g} s on"
     ),
     "company_of_decay": (
         "{share:%.2g} of the decay's energy is other motion, {line_share:%.2g} of it near "
         "{frequency_hz:.4g} Hz"
     ),
     "bias_of_mode_filter": (
-        "bias of the mode filter, estimated and taken away: up to {frequency:%.2g} of the "
-        "frequency and {damping:%.2g} of the damping"
+        "bias of the mode filter, estimated and taken away: typically {frequency:%.2g} of the "
+        "frequency and {damping:%.2g} of the damping, more near the ends"
     ),
     "hum_taken_away": "mains hum was taken away: {amplitude:.2g} m/s at {frequency_hz:.5g} Hz",
     "decay_left_out": "a decay was left out: {why}",
+    "note_of_decay": "{name}: {note}",
     "record_sorted": _record_sorted,
     "data_left_out": "left out: {why}",
     "steps_settled": "{n} of {n_steps} settled",
