@@ -1,4 +1,5 @@
 from .base_excitation import base_excited_states
+from .decays.isolated_decay import IsolatedDecay, isolate_decay
 from .equivalent_force import EquivalentForce, equivalent_force
 from .force_calibration import ForceCalibration, apply_calibration, calibrate_force
 from .indicators import appropriation_of, nnm_appropriation
@@ -18,6 +19,7 @@ __all__ = [
     "EquivalentForce",
     "ForceCalibration",
     "FrequencyResponses",
+    "IsolatedDecay",
     "MultisineResponses",
     "SteadyStates",
     "SteppedSineStates",
@@ -31,6 +33,7 @@ __all__ = [
     "find_ring_downs",
     "force_velocity_loop",
     "frequency_responses",
+    "isolate_decay",
     "join_steady_states",
     "multisine_responses",
     "nnm_appropriation",

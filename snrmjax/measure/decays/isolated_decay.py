@@ -18,45 +18,32 @@ import numpy as np
 from jaxtyping import Complex, Float
 from scipy.ndimage import gaussian_filter1d
 
+from snrmjax.measure.decays.decay_reading import (
+    PER_CYCLE,
+    POINTS,
+    DecayReading,
+    band_edge,
+    noise_of,
+    reading_of,
+    wave_of,
+)
 from snrmjax.measure.decays.decay_record import (
-    QUARTER,
     enough_cycles,
     even_record,
     require_cycles,
     require_samples,
 )
-from snrmjax.measure.decays.local_fit import (
-    ROUNDS,
-    Carrier,
-    LocalFit,
-    instants,
-    local_fit,
-    passed,
-)
-from snrmjax.measure.decays.mode_ridge import FRAME_CYCLES, Ridge, ridge_of_mode, spectral_peaks
-from snrmjax.measure.decays.slow_flow import SlowFlow, slow_flow
+from snrmjax.measure.decays.local_fit import ROUNDS, Carrier, local_fit
+from snrmjax.measure.decays.mains_hum import mains_hum
+from snrmjax.measure.decays.mode_ridge import ridge_of_mode, spectral_peaks
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.units import HERTZ
 
-PER_CYCLE = 2  # instants
-POINTS = 4  # cycles from one reading to the next
 MOST_COMPANY = 0.01  # largest share of the energy inside the band that is not the mode's
 NOT_KNOWN = 1 / 1.96  # 1σ over the damping, from where on its 95 % band holds zero
-_SIGMA = (1.0, 3.0)  # cycles of the filter's weights
-_CYCLES_A_SIGMA = 8 / 3  # of a fall to a quarter, in which one line would be drawn
-_BAND = 0.25  # of the mode's frequency: what the filter passes, one side
-_BESIDE = 0.6  # of it, one side, from where the density inside is taken
-_MAINS = (50.0, 60.0)
-_MAINS_OFF = 0.2  # Hz, that mains may be off
-_MAINS_NEAR = 3.0  # times the mode's frequency, or one over it
-_SURE = 4.0  # standard deviations by which hum stands out
-_NEIGHBOURS = np.arange(2, 9)  # lines on either side of which these are taken
-_APART = 2.0  # turns by which hum and mode must part to be told apart
-_SMOOTH_ERROR = 0.05  # of the mode's amplitude, that the smooth decay may be off
 _SCATTER = 4.0  # σ of the filter, over which scatter is averaged
 _HARMONICS = (2, 3, 4, 5)
 _COHERENT = 0.1  # of what lies near a harmonic, that may not turn with the mode
-_MEDIAN_OF_POWER = float(np.log(2))  # over the mean, of a spectrum's bins
 
 
 class Company(NamedTuple):
@@ -108,18 +95,6 @@ class IsolatedDecay(NamedTuple):
         )
 
 
-class _Reading(NamedTuple):
-    """A carrier read at half cycles, and the smooth decay through it."""
-
-    start: Carrier
-    before: Carrier  # of the last round but one
-    carrier: Carrier
-    rate: Complex[np.ndarray, " k"]
-    smooth: SlowFlow
-    noise: Float[np.ndarray, " k"]  # 1σ of ln A that the residual's spectrum makes
-    sigma: float
-
-
 def isolate_decay(
     time: Float[np.ndarray, " sample"],
     velocity: Float[np.ndarray, " sample"],
@@ -147,148 +122,18 @@ def isolate_decay(
             f"no mode that rings stands out of the noise near {frequency / HERTZ:.4g} Hz."
         )
     require_samples(HERTZ / (float(ridge.frequency.max()) * step))
-    start, sigma = _extended(ridge, times, frequency), _width(ridge)
     signal = values - values.mean()
-    reading = _read(times, signal, start, sigma)
-    hum = _hum(times, signal, reading)
+    reading = reading_of(times, signal, ridge, frequency)
+    hum = mains_hum(times, signal, reading)
     if hum:
         for tone in hum:
             signal = signal - tone.wave
-        reading = _read(times, signal, start, sigma)
+        reading = reading_of(times, signal, ridge, frequency)
     part = _usable(reading)
     return _isolated(times, signal, reading, part, [tone[:2] for tone in hum])
 
 
-def _extended(ridge: Ridge, time: np.ndarray, frequency: float) -> Carrier:
-    """A carrier of the ridge, and on to the ends of the record where these are a frame away."""
-    at = ridge.time
-    reach = FRAME_CYCLES * HERTZ / frequency
-    begin = time[0] if at[0] - time[0] < reach else at[0]
-    end = time[-1] if time[-1] - at[-1] < reach else at[-1]
-    times = np.concatenate([[begin], at[(at > begin) & (at < end)], [end]])
-    inside = np.clip(times, at[0], at[-1])
-    few = min(4, len(at))
-
-    def along(values: np.ndarray) -> np.ndarray:
-        ends = [
-            np.polyfit(at[rows], values[rows], 1)[0] if few > 1 else 0.0
-            for rows in (slice(0, few), slice(-few, None))
-        ]
-        slope = np.where(times < at[0], *ends)
-        return np.interp(inside, at, values) + slope * (times - inside)
-
-    omega = np.maximum(along(ridge.frequency), ridge.frequency.min() / 2)
-    phase = np.concatenate([[0.0], np.cumsum(np.diff(times) * (omega[1:] + omega[:-1]) / 2)])
-    return Carrier(times, along(np.log(ridge.amplitude)) + 1j * phase)
-
-
-def _width(ridge: Ridge) -> float:
-    """σ of the weights in cycles: 3, or less where the motion falls to a quarter in few cycles."""
-    cycles = float(np.sum(np.diff(ridge.time) * ridge.frequency[1:])) / HERTZ
-    fall = float(np.log(ridge.amplitude[0] / ridge.amplitude[-1]))
-    quarter = QUARTER * cycles / fall if fall > 0 else np.inf
-    return float(np.clip(quarter / _CYCLES_A_SIGMA, *_SIGMA))
-
-
-def _read(time: np.ndarray, signal: np.ndarray, start: Carrier, sigma: float) -> _Reading:
-    """Read from the ridge on, then from the smooth decay on, which is right up to the ends."""
-    at = instants(start, PER_CYCLE)
-    first = _read_from(time, signal, start, sigma, at)
-    return _read_from(time, signal, Carrier(at, first.smooth.level), sigma, at)
-
-
-def _read_from(
-    time: np.ndarray, signal: np.ndarray, start: Carrier, sigma: float, at: np.ndarray
-) -> _Reading:
-    before, carrier, rate = start, start, start.value
-    for _ in range(ROUNDS):
-        before = carrier
-        local = local_fit(time, signal, carrier, at, sigma)
-        carrier, rate = Carrier(at, local.level), local.rate
-    rows = np.unique([*range(0, len(at), POINTS * PER_CYCLE), len(at) - 1])
-    read = local_fit(time, signal, before, at[rows], sigma, rows=True)
-    left = signal - _wave(carrier, time)
-    noise = np.interp(at, at[rows], _noise_of(left, read, sigma, time[1] - time[0])[0])
-    independent = _independent(carrier.value.imag, sigma)
-    weight = 1 / np.hypot(noise, _SMOOTH_ERROR * 0.1)
-    smooth = slow_flow(at, carrier.value, weight, independent)
-    return _Reading(start, before, carrier, rate, smooth, noise, sigma)
-
-
-def _independent(phase: np.ndarray, sigma: float) -> float:
-    """How many independent readings a phase holds, by the width of the filter."""
-    nu = np.linspace(0, 1 / sigma, 400)
-    return float(np.ptp(phase)) / HERTZ * 2 * float(np.sum(passed(nu, sigma) ** 2)) * nu[1]
-
-
-def _wave(carrier: Carrier, time: np.ndarray) -> np.ndarray:
-    """The carrier's motion; zero where there is none."""
-    inside = (time >= carrier.time[0]) & (time <= carrier.time[-1])
-    wave = np.zeros_like(time)
-    wave[inside] = np.exp(carrier.curve()(time[inside])).real
-    return wave
-
-
-def _white(signal: np.ndarray) -> float:
-    """1σ of white noise by the median of the spectrum."""
-    from scipy.signal import welch
-
-    density = welch(signal, nperseg=min(len(signal), 4096))[1]
-    return float(np.sqrt(np.median(density) / _MEDIAN_OF_POWER / 2))
-
-
-class _Tone(NamedTuple):
-    hertz: float
-    amplitude: float
-    wave: Float[np.ndarray, " sample"]
-
-
-def _hum(time: np.ndarray, signal: np.ndarray, reading: _Reading) -> list[_Tone]:
-    """Steady tones of the mains in what the smooth decay leaves."""
-    carrier = Carrier(reading.carrier.time, reading.smooth.level)
-    inside = (time >= carrier.time[0]) & (time <= carrier.time[-1])
-    at = time[inside]
-    left = (signal - _wave(carrier, time))[inside]
-    size = np.exp(np.interp(at, carrier.time, carrier.value.real))
-    weight = 1 / np.hypot(_white(left), _SMOOTH_ERROR * size)
-    omega = reading.rate.imag
-    low, high = omega.min() / HERTZ / _MAINS_NEAR, omega.max() / HERTZ * _MAINS_NEAR
-    found = []
-    for mains in _MAINS:
-        for hertz in np.arange(mains, high, mains):
-            turns = np.abs(np.ptp(carrier.value.imag / HERTZ - hertz * carrier.time))
-            if hertz < low or turns < _APART:
-                continue
-            tone = _steady_tone(time, inside, left, weight, hertz)
-            if tone is not None:
-                found.append(tone)
-                left = left - tone.wave[inside]
-    return found
-
-
-def _steady_tone(
-    time: np.ndarray, inside: np.ndarray, left: np.ndarray, weight: np.ndarray, hertz: float
-) -> _Tone | None:
-    """The tone within 0.2 Hz that is largest, if it stands out of the spectrum beside it."""
-    at = time[inside]
-    span = float(np.ptp(at))
-
-    def line(of: np.ndarray) -> np.ndarray:
-        turns = np.exp(-2j * np.pi * of[:, None] * at)
-        return 2 * (turns @ (weight**2 * left)) / np.sum(weight**2)
-
-    near = hertz + np.linspace(-_MAINS_OFF, _MAINS_OFF, 21)
-    lines = line(near)
-    best = int(np.argmax(np.abs(lines)))
-    away = _NEIGHBOURS / span
-    beside = np.abs(line(hertz + np.concatenate([-away, away])))
-    if np.abs(lines[best]) < _SURE * np.median(beside) / np.sqrt(2 * np.log(2)):
-        return None
-    wave = (lines[best] * np.exp(2j * np.pi * near[best] * time)).real
-    return _Tone(float(near[best]), float(np.abs(lines[best])), wave)
-
-
-def _usable(reading: _Reading) -> slice:
+def _usable(reading: DecayReading) -> slice:
     """The longest stretch of instants in which the mode dominates inside the filter's band."""
     company = np.abs(reading.smooth.off) ** 2
     around = gaussian_filter1d(company, reading.sigma * PER_CYCLE, mode="nearest")
@@ -304,7 +149,7 @@ def _usable(reading: _Reading) -> slice:
     raise ValueError(_refusal(reading, slice(None)))
 
 
-def _refusal(reading: _Reading, part: slice) -> str:
+def _refusal(reading: DecayReading, part: slice) -> str:
     """Why the mode cannot be isolated."""
     off = reading.smooth.off[part]
     off = off * np.minimum(1.0, 1 / np.maximum(np.abs(off), 1e-300))
@@ -324,20 +169,15 @@ def _refusal(reading: _Reading, part: slice) -> str:
     )
 
 
-def _edge(sigma: float) -> float:
-    """Part of the mode's frequency beyond which the filter passes less than 1 %."""
-    return float(np.sqrt(-2 * np.log(1 - 0.99 ** (1 / ROUNDS))) / (2 * np.pi * sigma))
-
-
-def _band(reading: _Reading, part: slice) -> tuple[float, float]:
-    omega, edge = reading.rate.imag[part], _edge(reading.sigma)
+def _band(reading: DecayReading, part: slice) -> tuple[float, float]:
+    omega, edge = reading.rate.imag[part], band_edge(reading.sigma)
     return float(omega.min() * max(0.0, 1 - edge)), float(omega.max() * (1 + edge))
 
 
 def _isolated(
     time: np.ndarray,
     signal: np.ndarray,
-    reading: _Reading,
+    reading: DecayReading,
     part: slice,
     hum: list[tuple[float, float]],
 ) -> IsolatedDecay:
@@ -347,7 +187,7 @@ def _isolated(
     at, sigma = reading.carrier.time[rows], reading.sigma
     read = local_fit(time, signal, reading.before, at, sigma, rows=True)
     # The same filter on the mode that it found alone: nothing else differs.
-    alone = _wave(reading.carrier, time)
+    alone = wave_of(reading.carrier, time)
     again = reading.start
     for _ in range(ROUNDS):
         refound = local_fit(time, alone, again, reading.carrier.time, sigma)
@@ -355,7 +195,7 @@ def _isolated(
     bias = (refound.rate - reading.carrier.curve()(reading.carrier.time, 1))[rows]
     mode = alone + _harmonics(time, signal - alone, reading, part)
     left = signal - mode
-    level_std, noise, white_only, white = _noise_of(left, read, sigma, time[1] - time[0])
+    level_std, noise, white_only, white = noise_of(left, read, sigma, time[1] - time[0])
     off = (reading.rate - reading.smooth.rate)[part]
     excess = [
         _excess(one, np.exp(np.interp(reading.carrier.time[part], at, np.log(std))), sigma)[::every]
@@ -403,7 +243,7 @@ def _excess(off: np.ndarray, std: np.ndarray, sigma: float) -> np.ndarray:
 
 
 def _harmonics(
-    time: np.ndarray, left: np.ndarray, reading: _Reading, part: slice
+    time: np.ndarray, left: np.ndarray, reading: DecayReading, part: slice
 ) -> Float[np.ndarray, " sample"]:
     """Harmonics that turn with the mode, of sizes (c + d A²) A^h.
 
@@ -430,39 +270,6 @@ def _harmonics(
             wave = (solved[0] + solved[1] * of_time**2) * np.exp(1j * order * level.imag)
             waves[near] += (wave * of_time**order).real * (of_time <= 1)
     return waves
-
-
-def _noise_of(
-    left: np.ndarray, read: LocalFit, sigma: float, step: float
-) -> tuple[np.ndarray, list[np.ndarray], list[np.ndarray], float]:
-    """1σ that the residual's spectrum makes of ln A and of both parts of the rate.
-
-    Of these also what its white part makes, and that part's 1σ of a sample.
-    """
-    width = read.level_rows.shape[1]
-    index = read.first[:, None] + np.arange(width)
-    taper = np.hanning(width + 2)[1:-1]
-    power = np.abs(np.fft.rfft(left[index] * taper, axis=1)) ** 2 / np.sum(taper**2)
-    power = gaussian_filter1d(power, 1.0, axis=0, mode="nearest")
-    omega = HERTZ * np.fft.rfftfreq(width, step)
-    away = np.abs(omega / read.rate.imag[:, None] - 1)
-    beside = (away > _BAND) & (away < _BESIDE)
-    density = np.nanmedian(np.where(beside, power, np.nan), axis=1) / _MEDIAN_OF_POWER
-    inside = away <= _BAND
-    nu = np.linspace(0, 1 / sigma, 400)
-    gains = [np.sum((nu**k * passed(nu, sigma)) ** 2) for k in (0, 1)]
-    once = [np.sum((nu**k * np.exp(-((2 * np.pi * sigma * nu) ** 2) / 2)) ** 2) for k in (0, 1)]
-    found, white = [], []
-    for k, weights in (
-        (0, read.level_rows.real), (1, read.rate_rows.real), (1, read.rate_rows.imag),
-    ):  # fmt: skip
-        response = np.abs(np.fft.rfft(weights, axis=1)) ** 2 / width
-        response[:, 1 : (width + 1) // 2] *= 2
-        within = density * np.sum(response * inside, axis=1) * gains[k] / once[k]
-        beyond = np.sum(response * ~inside * power, axis=1) * ROUNDS**2
-        found.append(np.sqrt(within + beyond))
-        white.append(np.sqrt(within + density * np.sum(response * ~inside, axis=1)))
-    return found[0], found[1:], white[1:], float(np.sqrt(np.median(density)))
 
 
 def _company(

@@ -16,7 +16,7 @@ Applications, 1996, chapter 3) of the demodulated record (M. Feldman, Mech. Syst
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Complex, Float, Int
 from scipy.interpolate import CubicSpline
 
 REACH = 3.5  # σ, at which the weights are cut
@@ -41,7 +41,7 @@ class LocalFit(NamedTuple):
     """Local least squares at some instants."""
 
     time: Float[np.ndarray, " k"]
-    first: "np.ndarray"  # sample at which each window begins
+    first: Int[np.ndarray, " k"]  # sample at which each window begins
     level: Complex[np.ndarray, " k"]  # ln of the complex amplitude
     rate: Complex[np.ndarray, " k"]  # its derivative: −decay + iω
     level_rows: Complex[np.ndarray, "k window"]  # d ln a / d sample
@@ -83,7 +83,8 @@ def local_fit(
     width = int((last - first).max())
     first = np.minimum(first, len(time) - width)
     columns = _ORDERS if np.max(omega) * max(_ORDERS) * step < np.pi else ()
-    levels, rates, kept = [], [], ([], [])
+    levels, rates = [], []
+    kept: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
     for start in range(0, len(at), _CHUNK):
         part = slice(start, start + _CHUNK)
         index = first[part, None] + np.arange(width)

@@ -41,8 +41,8 @@ class Ridge(NamedTuple):
         return float(np.clip(rest, last / _RANGE, last * _RANGE))
 
 
-class Peaks(NamedTuple):
-    """Peaks of every frame: padded with NaN."""
+class SpectralPeaks(NamedTuple):
+    """SpectralPeaks of every frame: padded with NaN."""
 
     time: Float[np.ndarray, " frame"]
     frequency: Float[np.ndarray, "frame peak"]  # rad/s
@@ -52,8 +52,8 @@ class Peaks(NamedTuple):
 
 def spectral_peaks(
     time: Float[np.ndarray, " sample"], signal: Float[np.ndarray, " sample"], frequency: float
-) -> Peaks:
-    """Peaks of all frames above noise; `frequency` (rad/s) sets the frames' length."""
+) -> SpectralPeaks:
+    """SpectralPeaks of all frames above noise; `frequency` (rad/s) sets the frames' length."""
     from scipy.signal import find_peaks
 
     step = float(np.mean(np.diff(time)))
@@ -79,10 +79,10 @@ def spectral_peaks(
     for k, (omega, size_of) in enumerate(found):
         table[0, k, : len(omega)], table[1, k, : len(omega)] = omega, size_of
     middle = time[starts] + (length - 1) / 2 * step
-    return Peaks(middle, table[0], table[1], 2 * HERTZ / (length * step))
+    return SpectralPeaks(middle, table[0], table[1], 2 * HERTZ / (length * step))
 
 
-def ridge_of_mode(peaks: Peaks, frequency: float) -> Ridge | None:
+def ridge_of_mode(peaks: SpectralPeaks, frequency: float) -> Ridge | None:
     """The ridge of the mode whose natural frequency is `frequency` (rad/s), or None."""
     ridges = ridges_of(peaks, frequency)
     if not ridges:
@@ -95,7 +95,7 @@ def ridge_of_mode(peaks: Peaks, frequency: float) -> Ridge | None:
     return max(ridges, key=score)
 
 
-def ridges_of(peaks: Peaks, frequency: float) -> list[Ridge]:
+def ridges_of(peaks: SpectralPeaks, frequency: float) -> list[Ridge]:
     """Ridges that begin near a frequency in the last frames that have peaks, each once."""
     near = (peaks.frequency > frequency / _RANGE) & (peaks.frequency < frequency * _RANGE)
     frames = np.flatnonzero(near.any(axis=1))[::-1]
@@ -118,7 +118,7 @@ def ridges_of(peaks: Peaks, frequency: float) -> list[Ridge]:
 
 
 def _followed(
-    peaks: Peaks, frame: int, column: int, frequency: float
+    peaks: SpectralPeaks, frame: int, column: int, frequency: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Frames and columns of a ridge that is followed back from one peak."""
     rows, columns = [frame], [column]

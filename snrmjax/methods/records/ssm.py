@@ -96,8 +96,8 @@ def ssm(
     values = _curves(found.form, amplitude)
     if found.left > _MOST_LEFT and np.any(values[1] > 0):
         raise ValueError(
-            f"one decaying mode leaves {100 * found.left:.2g} % of the record's power: other motion "
-            "lies beside it; isolate the mode before (`isolate_decay`)."
+            f"one decaying mode leaves {100 * found.left:.2g} % of the record's power: other "
+            "motion lies beside it; isolate the mode before (`isolate_decay`)."
         )
     spread = _curve_std(found, amplitude)
     points = points_of_curves(amplitude, values[0], spread[0], values[1], spread[1])
