@@ -67,13 +67,18 @@ class PolynomialPotential(eqx.Module):
 
     @property
     def _gradient(self) -> tuple[tuple[Monomial, ...], Float[Array, "monomial mode"]]:
-        basis, to_coefficient = _derivative_map(self.monomials, self.n_modes)
-        return basis, (self.coefficient @ to_coefficient).reshape(len(basis), self.n_modes)
+        basis, *given = _derivative_map(self.monomials, self.n_modes)
+        return basis, self._taken(*given)
 
     @property
     def _hessian(self) -> tuple[tuple[Monomial, ...], Float[Array, "monomial pair"]]:
-        basis, to_coefficient = _second_derivative_map(self.monomials, self.n_modes)
-        return basis, (self.coefficient @ to_coefficient).reshape(len(basis), self.n_modes**2)
+        basis, *given = _second_derivative_map(self.monomials, self.n_modes)
+        return basis, self._taken(*given)
+
+    def _taken(self, monomial: np.ndarray, factor: np.ndarray) -> Float[Array, "monomial column"]:
+        """The coefficients of a derivative: each is one of the potential's times a factor."""
+        xp = np if isinstance(self.coefficient, np.ndarray) else jnp
+        return xp.append(self.coefficient, 0.0)[monomial] * factor
 
 
 def polynomial_potential(
@@ -178,11 +183,12 @@ def _factors(monomials: tuple[Monomial, ...], n_modes: int) -> np.ndarray:
     return index
 
 
+Derivative = tuple[tuple[Monomial, ...], np.ndarray, np.ndarray]
+
+
 @lru_cache(maxsize=256)
-def _derivative_map(
-    monomials: tuple[Monomial, ...], n_modes: int
-) -> tuple[tuple[Monomial, ...], np.ndarray]:
-    """Monomials of the gradient, and the constant map from coefficients to theirs."""
+def _derivative_map(monomials: tuple[Monomial, ...], n_modes: int) -> Derivative:
+    """Monomials of the gradient; of which of the potential's, times what, each coefficient is."""
     entries: list[tuple[int, Monomial, int, float]] = []
     for k, monomial in enumerate(monomials):
         for mode in sorted(set(monomial)):
@@ -193,14 +199,12 @@ def _derivative_map(
 
 
 @lru_cache(maxsize=256)
-def _second_derivative_map(
-    monomials: tuple[Monomial, ...], n_modes: int
-) -> tuple[tuple[Monomial, ...], np.ndarray]:
-    """Monomials of the Hessian, and the constant map from coefficients to theirs."""
+def _second_derivative_map(monomials: tuple[Monomial, ...], n_modes: int) -> Derivative:
+    """As `_derivative_map`, of the Hessian."""
     entries: list[tuple[int, Monomial, int, float]] = []
     for k, monomial in enumerate(monomials):
-        for i, j in itertools.product(range(n_modes), repeat=2):
-            if monomial.count(i) < 1 or monomial.count(j) < (2 if i == j else 1):
+        for i, j in itertools.product(sorted(set(monomial)), repeat=2):
+            if monomial.count(j) < (2 if i == j else 1):
                 continue
             rest = list(monomial)
             rest.remove(i)
@@ -212,10 +216,12 @@ def _second_derivative_map(
 
 def _assemble(
     entries: list[tuple[int, Monomial, int, float]], n_monomials: int, n_columns: int
-) -> tuple[tuple[Monomial, ...], np.ndarray]:
+) -> Derivative:
     basis = tuple(sorted({rest for _, rest, _, _ in entries}, key=lambda m: (len(m), m)))
     where = {rest: row for row, rest in enumerate(basis)}
-    matrix = np.zeros((n_monomials, len(basis) * n_columns))
+    # A coefficient that is nothing is taken from behind the last monomial.
+    monomial = np.full((len(basis), n_columns), n_monomials)
+    factors = np.zeros((len(basis), n_columns))
     for k, rest, column, factor in entries:
-        matrix[k, where[rest] * n_columns + column] += factor
-    return basis, matrix
+        monomial[where[rest], column], factors[where[rest], column] = k, factor
+    return basis, monomial, factors
