@@ -26,7 +26,9 @@ from snrmjax.model.base_motion import SensorMotion
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.units import HERTZ
 
-_POWERS = (1, 2)  # of the amplitude: hysteresis and friction, and smooth symmetric forces
+# Powers of the amplitude, of hysteresis and of smooth symmetric forces; of stiffness alone, and of
+# damping too.
+_KINDS = tuple(product((1, 2), (False, True)))
 _REGION = 10.0  # half-power bandwidths about a mode, of the states from which a fit starts
 
 
@@ -45,9 +47,20 @@ class _Candidate(NamedTuple):
     deviance: float  # −2 log likelihood
     n_unknowns: int
 
-    def criterion(self, n: float) -> float:
-        """Bayes' information criterion for n independent numbers."""
-        return self.deviance + self.n_unknowns * float(np.log(n))
+    @property
+    def criterion(self) -> float:
+        """Bayes' information criterion, for residuals that are white.
+
+        No dependence is as probable beforehand as all kinds of it together.
+        """
+        kinds = 1 if self.settings.dependence is None else len(_KINDS)
+        size = self.fit.residuals.size
+        return self.deviance + self.n_unknowns * float(np.log(size)) + 2 * float(np.log(kinds))
+
+    @property
+    def white(self) -> bool:
+        """Whether neighbouring residuals are as independent as errors are: nothing is left."""
+        return not self.fit.correlation.size
 
 
 def amplitude_dependent_modes(
@@ -61,12 +74,14 @@ def amplitude_dependent_modes(
 
     The mode that responds most obeys (ω² − Ω² + 2iζωΩ + (α + iβΩ)|q|^p) q = F with p = 1 or 2 and
     with β or without; all else is linear. Fits with and without α are compared by Bayes'
-    information criterion, for as many independent numbers as the correlation of the residuals
-    leaves; from the lowest level upward levels count as long as the next one asks for no frequency
-    and damping of its own. What the other candidates say, with their weights, widens the errors.
+    information criterion. From the lowest level upward levels count as long as the best fit leaves
+    nothing but errors (neighbouring residuals are not correlated) and the next level asks for no
+    frequency and damping of its own. What the other candidates say, with their weights, widens the
+    errors.
 
     Arguments: `start` of the lowest level; further as `fit_linear_modes`.
-    Returns the fit and what it says, or None where no dependence shows.
+    Returns the fit and what it says, or None where no dependence shows, or where what the lowest
+    level shows does not hold at the next.
     Validity: one mode that depends on its amplitude, small changes of stiffness and damping, and
     one solution near each state.
     """
@@ -76,7 +91,7 @@ def amplitude_dependent_modes(
         part = _levels(rows, levels[:count])
         settings = basis_settings(part.data, residual_terms, instrument_phase, None)
         found = _candidates(part, settings, start)
-        if not found:
+        if not (found and found[0].white):
             break
         if best is not None and _apart(part, found, levels[count - 1]):
             break
@@ -84,6 +99,8 @@ def amplitude_dependent_modes(
     if best is None:
         return None
     part, found = best
+    if len(levels) > 1 and len(set(part.level.tolist())) == 1:
+        return None
     of = found[0].settings.dependence
     return None if of is None else _told(part, found, of, start)
 
@@ -141,6 +158,20 @@ def rows_of_levels(
     return LevelRows(given, level[order], np.nanmax(np.abs(velocity), axis=1))
 
 
+def pole_of_states(rows: LevelRows) -> float | None:
+    """Natural frequency (rad/s) of one mode at the lowest level, by linear least squares.
+
+    None where they find no damped mode.
+    """
+    data = _levels(rows, rows.level[:1].tolist()).data
+    if not data.omega.size:
+        return None
+    size = np.where(np.isfinite(data.receptance), np.abs(data.receptance), 0.0) * data.load
+    sensor, top = np.unravel_index(np.argmax(size), size.shape)
+    found = _regressed(data, int(sensor), (float(data.omega[top]), np.inf), 2, False)
+    return None if found is None else float(found[0])
+
+
 def _levels(rows: LevelRows, levels: Sequence[int]) -> LevelRows:
     return _chosen(rows, np.isin(rows.level, levels))
 
@@ -167,10 +198,9 @@ def _candidates(
     linear = _fitted(rows, settings, [poles])
     if linear is not None:
         found.append(linear)
-    for power, damping in product(_POWERS, (False, True)):
+    for power, damping in _KINDS:
         found += _of_kind(rows, settings, (poles, mode, start), power, damping)
-    n = _independent_numbers(found, rows)
-    return sorted(found, key=lambda one: one.criterion(n))
+    return sorted(found, key=lambda one: one.criterion)
 
 
 def _of_kind(
@@ -199,8 +229,7 @@ def _of_kind(
             other[2 * n : 2 * n + len(terms)] = regressed[2 : 2 + len(terms)]
             tries.append(other)
         one = _fitted(rows, settings._replace(dependence=dependence), tries)
-        numbers = _independent_numbers([one] if one else [], rows)
-        if one is None or (best and one.criterion(numbers) >= best.criterion(numbers)):
+        if one is None or (best and one.criterion >= best.criterion):
             break
         best = one
         if n == 1:
@@ -230,10 +259,21 @@ def _start(
     x = data.receptance[sensor] * data.load
     seen = np.isfinite(x)
     x = np.where(seen, x, np.nanmin(np.abs(x)))
-    load, omega = np.asarray(data.load), data.omega
     near = np.abs(x) / np.abs(start.residue[sensor, nearest])
-    dependence = AmplitudeDependence(0, power, damping, natural, load, near)
-    share = (near / near.max()) ** power
+    dependence = AmplitudeDependence(0, power, damping, natural, np.asarray(data.load), near)
+    return dependence, _regressed(data, sensor, (natural, ratio), power, damping)
+
+
+def _regressed(
+    data: ResponseData, sensor: int, mode: tuple[float, float], power: int, damping: bool
+) -> np.ndarray | None:
+    """ω, ζ, s, t where asked for, and P by linear least squares at states about a mode."""
+    natural, ratio = mode
+    x = data.receptance[sensor] * data.load
+    seen = np.isfinite(x)
+    x = np.where(seen, x, 0.0)
+    load, omega = np.asarray(data.load), data.omega
+    share = (np.abs(x) / np.abs(x).max()) ** power
     use = seen & (np.abs(omega - natural) < _REGION * 2 * ratio * natural)
     columns = [x, 1j * omega * x, natural**2 * share * x]
     columns += [1j * natural * omega * share * x] * damping
@@ -241,13 +281,13 @@ def _start(
     goal = (omega**2 * x)[use]
     both, wanted = np.concatenate([table.real, table.imag]), np.append(goal.real, goal.imag)
     if len(wanted) <= both.shape[1]:
-        return dependence, None
+        return None
     scale = np.maximum(np.linalg.norm(both, axis=0), 1e-300)
     found = np.linalg.lstsq(both / scale, wanted, rcond=None)[0] / scale
     if not (found[0] > 0 and found[1] > 0):
-        return dependence, None
+        return None
     own = np.sqrt(found[0])
-    return dependence, np.array([own, found[1] / (2 * own), *found[2:-1]])
+    return np.array([own, found[1] / (2 * own), *found[2:]])
 
 
 def _fitted(
@@ -271,15 +311,6 @@ def _fitted(
     return min(found, key=lambda one: one.deviance, default=None)
 
 
-def _independent_numbers(found: Sequence[_Candidate], rows: LevelRows) -> float:
-    """How many independent numbers there are, by the correlation of the best fit's residuals."""
-    n = 2.0 * np.isfinite(rows.data.receptance).sum()
-    if not found:
-        return n
-    best = min(found, key=lambda one: one.deviance)
-    return n / (1 + 2 * max(float(np.sum(best.fit.correlation)), 0.0))
-
-
 def _apart(rows: LevelRows, found: Sequence[_Candidate], level: int) -> bool:
     """Whether the states of a level ask for a frequency and a damping of their own."""
     dependent = [one for one in found if one.settings.dependence is not None]
@@ -295,8 +326,7 @@ def _apart(rows: LevelRows, found: Sequence[_Candidate], level: int) -> bool:
     last = 2 * n + own.n_terms
     start = np.concatenate([best.fit.unknowns[:last], np.zeros(2)])
     other = _fitted(rows, settings, [start])
-    numbers = _independent_numbers([best], rows)
-    return other is not None and other.criterion(numbers) < best.criterion(numbers)
+    return other is not None and other.criterion < best.criterion
 
 
 def _told(
@@ -311,8 +341,7 @@ def _told(
     natural, ratio, _ = unpacked(best.fit.unknowns, best.settings)
     n, k = len(natural), of.mode
     place = int(np.argsort(np.argsort(natural))[k])
-    numbers = _independent_numbers(found, rows)
-    weights = np.array([one.criterion(numbers) for one in found])
+    weights = np.array([one.criterion for one in found])
     weights = np.exp(-0.5 * (weights - weights.min()))
     covariance = modes.mode_covariance.copy()
     for one, weight in zip(found, weights / weights.sum(), strict=True):

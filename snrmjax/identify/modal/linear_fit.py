@@ -136,15 +136,11 @@ def _orders(data: ResponseData, highest: int | None) -> PoleOrders:
             f"the highest order must be from 1 to half the number of lines, {lines // 2}, but is "
             f"{highest}."
         )
-    weights = line_weights(data)
-    weights = (
-        weights / np.sqrt(np.mean(np.abs(filled_receptance(data) * weights) ** 2, axis=1))[:, None]
-    )
+    measured, weights = filled_receptance(data), line_weights(data)
+    weights = weights / np.sqrt(np.mean(np.abs(measured * weights) ** 2, axis=1))[:, None]
     size = data.measured_size
     turn = (1j ** np.array(data.powers))[:, None]
-    return poles_of_responses(
-        data.omega, filled_receptance(data) * size * turn, weights / size, highest or most
-    )
+    return poles_of_responses(data.omega, measured * size * turn, weights / size, highest or most)
 
 
 def _start(

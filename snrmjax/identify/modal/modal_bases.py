@@ -154,7 +154,9 @@ def _dependent(
             slope = np.abs(dynamic) ** 2 + slope
             change = 0.5 * size * (np.abs(dynamic) ** 2 - (of.load / size) ** 2) / slope
             size = np.clip(size - change, 0.5 * size, 2 * size)
-        settled = np.abs(change) < _SETTLED * size
+            settled = np.abs(change) < _SETTLED * size
+            if settled.all():
+                break
         share = (size / largest) ** p
         q = of.load / (linear + strength * share)
         q = np.where(settled, q, np.nan)

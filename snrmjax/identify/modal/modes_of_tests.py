@@ -7,7 +7,11 @@ from typing import Any, NamedTuple, get_args
 import numpy as np
 from jaxtyping import Float
 
-from snrmjax.identify.modal.amplitude_fit import amplitude_dependent_modes, rows_of_levels
+from snrmjax.identify.modal.amplitude_fit import (
+    amplitude_dependent_modes,
+    pole_of_states,
+    rows_of_levels,
+)
 from snrmjax.identify.modal.free_decay import DecayModes, fit_free_decay
 from snrmjax.identify.modal.linear_fit import fit_linear_modes
 from snrmjax.identify.modal.modal_fit import LinearModalFit
@@ -58,17 +62,26 @@ def find_modes(
     levels = levels_by_velocity(source)
     chosen = levels[0] if level is None else level
     lowest = responses_of_states(source, chosen)
-    modes = _of_responses(lowest.responses, base, {**settings, "std": lowest.std})
     onward = levels[levels.index(chosen) :]
-    above = onward[1:]
     band = settings.get("from_frequency"), settings.get("to_frequency")
+    rows = rows_of_levels(source, onward, base=base, band=band)
+    asked = {**settings, "std": lowest.std}
+    try:
+        modes = _of_responses(lowest.responses, base, asked)
+    except ValueError:
+        given = settings.get("poles") is not None or settings.get("order") is not None
+        start = None if given else pole_of_states(rows)
+        if start is None:
+            raise
+        # Few states about one resonance, or one that leans: no pole settles over the order.
+        modes = _of_responses(lowest.responses, base, {**asked, "poles": (start,)})
+    above = onward[1:]
+    phase = settings.get("instrument_phase")
     dependent = amplitude_dependent_modes(
-        rows_of_levels(source, onward, base=base, band=band),
+        rows,
         modes,
         residual_terms=settings.get("residual_terms") or "auto",
-        instrument_phase=modes.reference.quantity == "voltage"
-        if settings.get("instrument_phase") is None
-        else bool(settings["instrument_phase"]),
+        instrument_phase=rows.data.reference.quantity == "voltage" if phase is None else phase,
     )
     if dependent is not None:
         return dependent[0], (dependent[1],)

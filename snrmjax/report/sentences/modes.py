@@ -43,7 +43,7 @@ def _dependent_mode(
         damping = f" and its damping by {100 * damping_change:+.2g} % of critical"
     of = f"level {levels[0]}" if len(levels) == 1 else f"levels {enumerated(levels)} together"
     return (
-        f"mode {mode} depends on its amplitude: with {grows} its frequency changes by "
+        f"mode {mode} depends on the amplitude: with {grows} its frequency changes by "
         f"{shift_hz:+.3g} ± {1.96 * shift_std_hz:.2g} Hz (95 %){damping} from none to "
         f"{velocity:.3g} m/s, {bandwidths:.2g} times its half-power bandwidth; its frequency "
         f"({frequency_hz:.6g} Hz) and damping are those at no amplitude, fitted to {of}"
