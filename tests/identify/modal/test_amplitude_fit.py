@@ -83,3 +83,19 @@ def test_derivatives_of_a_dependent_mode():
             by_difference = (columns(at + move) - columns(at - move)) / (2 * step)
             scale = np.abs(by_difference).max()
             np.testing.assert_allclose(slopes[k], by_difference, atol=1e-6 * scale)
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.9])
+def test_few_states_about_a_lone_resonance_give_its_mode(shift):
+    """Fourteen states a level, too few for poles of many orders."""
+    data = states(shift, 0.0, levels=(0.5, 1.0), noise=5e-3, stated=False)
+    k = np.flatnonzero(np.tile(np.arange(41) % 3 == 0, 2))
+    columns = (np.asarray(getattr(data, name))[k] for name in ("level", "frequency", "force"))
+    few = sj.measure.steady_states(*columns, np.asarray(data.velocity)[k], sensors=data.sensors)
+    with pytest.raises(ValueError, match="no pole is stable"):
+        fit_linear_modes(responses_of_states(few, 1).responses)
+    found, notes = find_modes(few)
+    assert (notes[0].kind == "amplitude_dependent_mode") == bool(shift)
+    off = [(found.natural_frequency - OWN) / found.natural_frequency_std]
+    off.append((found.damping_ratio - RATIO) / found.damping_ratio_std)
+    assert np.all(np.abs(off) < 3)
