@@ -143,7 +143,7 @@ def _scatter(
     chosen = _thinned(len(quantity))
     colours = _colours(len(shown.outputs))
     for output, effects, colour in zip(shown.outputs, shown.effects, colours, strict=True):
-        effect, few = effects[name], len(quantity) < FEWEST
+        effect, few = effects[name], output.n_known < FEWEST
         size, alpha = (8.0, 0.9) if few else (2.5, _CLOUD)
         dots: Style = {"linestyle": "none", "marker": ".", "markersize": size, "alpha": alpha}
         values = output.values[chosen] / y.size
@@ -167,17 +167,17 @@ def _scatter(
 
 
 def _share(axes: Axes, shown: OutputEffects, name: str) -> None:
-    """The share of variance above a panel, of the smallest and the largest force."""
+    """The share of variance above a panel, of the smallest and the largest force; and of whom."""
     known = [effects[name] for effects in shown.effects]
     shares = [100 * max(one.share, 0.0) for one in known if one is not None]
-    if not shares:
-        return
-    low, high = (f"{value:.0f}" for value in (min(shares), max(shares)))
-    text = f"{low} %" if low == high else f"{low} to {high} %"
-    least = min(output.n_known for output in shown.outputs)
-    if least < len(shown.outputs[0].values):
-        text += f" (of {least} of {len(shown.outputs[0].values)})"
-    axes.set_title(text, loc="left", fontsize=SMALL, color="0.25")
+    words = []
+    if shares:
+        low, high = (f"{value:.0f}" for value in (min(shares), max(shares)))
+        words.append(f"{low} %" if low == high else f"{low} to {high} %")
+    least, members = min(one.n_known for one in shown.outputs), len(shown.outputs[0].values)
+    if least < members:
+        words.append(of_members(least, members))
+    axes.set_title(", ".join(words), loc="left", fontsize=SMALL, color="0.25")
 
 
 def bands_figure(shown: Sequence[CurveBands]) -> Figure:
