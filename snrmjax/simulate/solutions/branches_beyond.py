@@ -77,7 +77,9 @@ def _starts_beyond(
 
     Beyond the outermost resonances an octave takes the place of the ratio to the next one.
     """
-    own = np.sort(natural)
+    own = np.sort(natural[natural > 0])
+    if not own.size:
+        return
     below, above = own[own < ends[0]], own[own > ends[1]]
     lower = own[: max(below.size, 1)][-2:]
     upper = own[-max(above.size, 1) :][:2]

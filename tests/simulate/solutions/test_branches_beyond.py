@@ -53,6 +53,16 @@ def test_the_stable_branch_beyond_the_folds_is_found(coefficient, force, ends, a
     )
 
 
+def test_the_small_motion_of_a_softening_mode_is_found_where_the_large_one_is_shown():
+    model, window = oscillator(-4e9), [0.94 * OMEGA, 1.1 * OMEGA]
+    (curve,) = sj.forced_response(model, [10.0], *window, harmonic_order=1)
+    settings = sj.simulate.ResponseSettings(harmonic_order=1)
+    (found,) = hidden_branches(model, [curve], *window, settings=settings)
+    small, _, large = amplitudes(-4e9, 10.0, window[0])
+    assert np.abs(curve.velocity[0, 1, 0]) == pytest.approx(large, rel=1e-6)
+    assert found.amplitude[0] == pytest.approx(small, rel=0.05)
+
+
 @pytest.mark.parametrize("ends", [(0.8, 1.5), (0.8, 1.16), (1.45, 1.6)])
 def test_a_window_that_shows_all_is_not_doubted(ends):
     """Up to beyond the folds, into them (where both branches are traced), and above them."""
