@@ -29,6 +29,7 @@ from snrmjax.numerics.units import HERTZ
 # Powers of the amplitude, of hysteresis and of smooth symmetric forces; of stiffness alone, and of
 # damping too.
 _KINDS = tuple(product((1, 2), (False, True)))
+_CHI_SQUARE = 5.99  # of two numbers at 95 %
 _REGION = 10.0  # half-power bandwidths about a mode, of the states from which a fit starts
 
 
@@ -87,6 +88,7 @@ def amplitude_dependent_modes(
     """
     levels = list(dict.fromkeys(rows.level.tolist()))
     best: tuple[LevelRows, list[_Candidate]] | None = None
+    before: list[_Candidate] = []  # the best of fewer levels
     for count in range(1, len(levels) + 1):
         part = _levels(rows, levels[:count])
         settings = basis_settings(part.data, residual_terms, instrument_phase, None)
@@ -95,6 +97,7 @@ def amplitude_dependent_modes(
             break
         if best is not None and _apart(part, found, levels[count - 1]):
             break
+        before += [] if best is None else [best[1][0]]
         best = part, found
     if best is None:
         return None
@@ -102,7 +105,7 @@ def amplitude_dependent_modes(
     if len(levels) > 1 and len(set(part.level.tolist())) == 1:
         return None
     of = found[0].settings.dependence
-    return None if of is None else _told(part, found, of, start)
+    return None if of is None else _told(part, found, of, start, before)
 
 
 def rows_of_levels(
@@ -329,13 +332,40 @@ def _apart(rows: LevelRows, found: Sequence[_Candidate], level: int) -> bool:
     return other is not None and other.criterion < best.criterion
 
 
+def _drift(
+    before: Sequence[_Candidate], mode: tuple[float, float, Float[np.ndarray, " sensor"]]
+) -> Float[np.ndarray, "entry entry"]:
+    """The largest square by which ω, ζ and residues moved since a fit of fewer levels.
+
+    Where ω and ζ did by more than the 95 % of that fit's own errors; else nothing.
+    """
+    natural, ratio, residue = mode
+    moved, farthest = np.zeros((2 + len(residue),) * 2), _CHI_SQUARE
+    for one in before:
+        w, z, _ = unpacked(one.fit.unknowns, one.settings)
+        nearest = int(np.argmin(np.abs(w - natural)))
+        rows = np.array([nearest, len(w) + nearest])
+        own = one.fit.covariance[np.ix_(rows, rows)]
+        away = np.array([w[nearest] - natural, z[nearest] - ratio])
+        apart = float(away @ np.linalg.solve(own, away))
+        if apart > farthest:
+            whole = np.concatenate([away, one.fit.coefficients[:, nearest] - residue])
+            moved, farthest = np.outer(whole, whole), apart
+    return moved
+
+
 def _told(
     rows: LevelRows,
     found: Sequence[_Candidate],
     of: AmplitudeDependence,
     start: LinearModalFit,
+    before: Sequence[_Candidate],
 ) -> tuple[LinearModalFit, Fact]:
-    """The fit of the best candidate, with what the others say in its errors."""
+    """The fit of the best candidate, with what the others say in its errors.
+
+    Also those of fewer levels (`before`): where the values at no amplitude move with every further
+    level by more than their own errors, a power of the amplitude is not all that the mode does.
+    """
     best = found[0]
     modes = modal_result(rows.data, best.settings, best.fit, best.spread, start.orders)
     natural, ratio, _ = unpacked(best.fit.unknowns, best.settings)
@@ -349,6 +379,7 @@ def _told(
         nearest = int(np.argmin(np.abs(w - natural[k])))
         away = np.array([w[nearest] - natural[k], z[nearest] - ratio[k]])
         covariance[place, :2, :2] += weight * np.outer(away, away)
+    covariance[place] += _drift(before, (natural[k], ratio[k], best.fit.coefficients[:, k]))
     change, loss = best.fit.unknowns[2 * n], best.fit.unknowns[2 * n + 1] if of.damping else 0.0
     column = receptance_bases(rows.data.omega, best.fit.unknowns, best.settings)[0].columns[:, k]
     half = len(column) // 2
