@@ -15,7 +15,7 @@ from snrmjax.methods.records.recorded_test import RecordedDecay, RecordedTest
 from snrmjax.methods.records.recorded_velocity import recorded_velocity
 from snrmjax.methods.records.resonant_decay import decay_of_mode
 from snrmjax.methods.records.restoring_force import restoring_force
-from snrmjax.methods.records.ssm import ssm
+from snrmjax.methods.records.ssm import curves_of_submanifold, fit_submanifold
 from snrmjax.methods.result import MethodResult
 from snrmjax.model.modes import LinearModes
 from snrmjax.numerics.facts import Fact
@@ -84,7 +84,8 @@ def ssm_of_mode(decay: IsolatedDecay) -> MethodResult:
     disturbs it, and by the ratio by which the curves are off this reading beyond both (R. T. Birge,
     Phys. Rev. 40 (1932) 207). Raises `ValueError` as the method does.
     """
-    found = ssm(decay.time, decay.velocity, noise_std=decay.noise_std)
+    manifold = fit_submanifold(decay.time, decay.velocity, noise_std=decay.noise_std)
+    found = curves_of_submanifold(manifold)
     rows = np.argsort(decay.level.real)
     size = np.asarray(found.velocity)
     read = decay_of_mode(decay)
@@ -100,7 +101,7 @@ def ssm_of_mode(decay: IsolatedDecay) -> MethodResult:
             for end in ("", "_std")
         )
         grown = np.interp(np.log(size), decay.level.real[rows], excess[rows])
-        std = std * np.maximum(1.0, grown)
+        std = std * np.maximum(1.0, grown * decay.noise_std / manifold.slow_std)
         here, here_std = (
             np.interp(np.asarray(read.velocity)[inside], size[found.found], one[found.found])
             for one in (value, std)

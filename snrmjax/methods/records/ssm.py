@@ -51,6 +51,7 @@ class SpectralSubmanifold(NamedTuple):
     smallest: float  # m/s, fundamental velocity amplitude
     largest: float
     noise_std: float  # m/s, of a sample: what the trajectory leaves
+    slow_std: float  # m/s, of white noise as dense as what it leaves beside the mode
     manifold_misfit: float  # rms off the manifold over rms of the embedded record
     left: float  # share of the record's power that the trajectory leaves
     samples: int
@@ -89,9 +90,15 @@ def ssm(
     velocity is the fundamental's; 1σ from the fit's residual near the mode's frequency. An
     amplitude at which the mode gains energy is `NOT_A_MODE`.
     """
-    found = fit_submanifold(
-        time, velocity, terms=terms, least_amplitude=least_amplitude, noise_std=noise_std
+    return curves_of_submanifold(
+        fit_submanifold(
+            time, velocity, terms=terms, least_amplitude=least_amplitude, noise_std=noise_std
+        )
     )
+
+
+def curves_of_submanifold(found: SpectralSubmanifold) -> MethodResult:
+    """Natural frequency and damping of a submanifold at 25 amplitudes; errors as in `ssm`."""
     amplitude = np.linspace(found.smallest, found.largest, _POINTS)
     values = _curves(found.form, amplitude)
     if found.left > _MOST_LEFT and np.any(values[1] > 0):
@@ -302,10 +309,11 @@ def _submanifold(
     free = len(times) - len(best.minimum.point)
     variance = float(left @ left) / free
     # Of coloured residuals only what turns with the mode, or slowly beside it, moves its curves.
-    slow = _BESIDE * len(form.decay)
+    lines = _BESIDE * len(form.decay)
     density = np.abs(np.fft.fft(left * np.exp(-1j * found.phase))) ** 2 / len(left)
-    near = np.concatenate([density[: slow + 1], density[-slow:]])
+    near = np.concatenate([density[: lines + 1], density[-lines:]])
     coloured = float(near.sum()) / (len(near) - 1 - len(form.decay))
+    slow = float(np.sqrt(max(variance, coloured, noise_std**2)))
     size = np.linalg.norm(found.jacobian, axis=0)
     inverse = np.linalg.pinv((found.jacobian / size).T @ (found.jacobian / size), hermitian=True)
     noise = float(np.sqrt(variance))
@@ -313,10 +321,11 @@ def _submanifold(
     first = int(np.searchsorted(found.phase - found.phase[0], 2 * np.pi))
     return SpectralSubmanifold(
         form,
-        max(variance, coloured, noise_std**2) * inverse / np.outer(size, size),
+        slow**2 * inverse / np.outer(size, size),
         float(max(found.amplitude.min(), min(noise, 0.1 * found.amplitude.max()))),
         float(found.amplitude[min(first, len(times) - 1) :].max()),
         noise,
+        slow,
         misfit,
         best.mean_square / float(np.var(signal)),
         len(times),
