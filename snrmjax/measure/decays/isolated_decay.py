@@ -193,7 +193,10 @@ def _isolated(
         refound = local_fit(time, alone, again, reading.carrier.time, sigma)
         again = Carrier(reading.carrier.time, refound.level)
     bias = (refound.rate - reading.carrier.curve()(reading.carrier.time, 1))[rows]
-    mode = alone + _harmonics(time, signal - alone, reading, part)
+    # The ends, at which the filter sees one side alone, are left out of the record.
+    one_sided = min(round(2 * sigma * PER_CYCLE), (part.stop - part.start) // 4)
+    kept = slice(part.start + one_sided, part.stop - one_sided)
+    mode = alone + _harmonics(time, signal - alone, reading, kept)
     left = signal - mode
     level_std, noise, white_only, white = noise_of(left, read, sigma, time[1] - time[0])
     off = (reading.rate - reading.smooth.rate)[part]
@@ -208,10 +211,7 @@ def _isolated(
     beyond = noise[0] * np.sqrt(np.maximum(excess[0] ** 2 - 1, 0.0))
     if np.median(np.abs(beyond / reading.smooth.rate.real[rows])) > NOT_KNOWN:
         raise ValueError(_refusal(reading, part))
-    # Ends of the record, at which the filter sees one side alone, are left out of it.
-    one_sided = round(sigma * PER_CYCLE)
-    ends = part.start + one_sided, part.stop - 1 - one_sided
-    inside = slice(*np.searchsorted(time, reading.carrier.time[list(ends)]))
+    inside = slice(*np.searchsorted(time, reading.carrier.time[[kept.start, kept.stop - 1]]))
     return IsolatedDecay(
         time[inside],
         mode[inside],
@@ -276,7 +276,8 @@ def _company(
     time: np.ndarray, mode: np.ndarray, left: np.ndarray, hum: list[tuple[float, float]]
 ) -> Company:
     total = float(np.sum(mode**2) + np.sum(left**2))
-    power = np.abs(np.fft.rfft((left - left.mean()) * np.hanning(len(left)))) ** 2
+    fading = np.hanning(2 * len(left))[len(left) :]  # the begin, where company is loud, counts
+    power = np.abs(np.fft.rfft((left - left.mean()) * fading)) ** 2
     omega = HERTZ * np.fft.rfftfreq(len(left), time[1] - time[0])
     power[0] = 0.0
     line = float(omega[np.argmax(power)])

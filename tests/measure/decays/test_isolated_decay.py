@@ -1,0 +1,118 @@
+"""One mode of a decay apart from others, hum, an offset and noise, against its own equation."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from truths import duffing
+
+import snrmjax as sj
+
+HERTZ, RATE = 2 * np.pi, 2000.0
+TIME = np.arange(0, 2.5, 1 / RATE)
+REST, DAMPING = duffing.REST, duffing.DECAY_RATE
+
+
+@pytest.fixture(scope="module")
+def mode():
+    return duffing.decay(RATE)[1]
+
+
+@pytest.fixture(scope="module")
+def backbone():
+    """Fundamental velocity and frequency of undamped motions, integrated over half a cycle."""
+
+    def turns(_, state):
+        return state[1]
+
+    turns.terminal, turns.direction = True, 1.0
+    rows = []
+    for size in np.linspace(1e-5, 2.1e-3, 60):
+        found = solve_ivp(
+            lambda _, s: (s[1], -(REST**2) * s[0] - duffing.DECAY_CUBIC * s[0] ** 3),
+            *((0, 0.1), (size, -1e-12)),
+            events=turns,
+            dense_output=True,
+            rtol=1e-10,
+            atol=1e-14,
+        )
+        omega = np.pi / found.t_events[0][0]
+        angle = np.pi * (np.arange(100) + 0.5) / 100
+        rows.append((-2 * np.mean(found.sol(angle / omega)[1] * np.sin(angle)), omega))
+    return np.array(rows).T
+
+
+def tone(hertz, size, ratio=0.0):
+    return size * np.exp(-ratio * HERTZ * hertz * TIME) * np.cos(HERTZ * hertz * TIME + 0.4)
+
+
+def company(mode, seed=0):
+    """30 % of the velocity at 2.7 times the frequency, 20 % at half of it, hum, offset, noise."""
+    largest = np.abs(mode).max()
+    noise = 0.01 * np.random.default_rng(seed).standard_normal(len(TIME))
+    others = tone(108.0, 0.3, 0.002) + tone(20.0, 0.2, 0.01) + tone(60.0, 0.01)
+    return mode + largest * (others + noise + 0.03)
+
+
+def test_the_frequency_of_a_mode_with_company_is_its_own(mode, backbone):
+    found = sj.measure.isolate_decay(TIME, company(mode), 1.01 * REST)
+    true = np.interp(np.exp(found.level.real), *backbone)
+    # The amplitude at which the truth is taken has its own error, along the backbone.
+    slope = found.smooth_bend.imag / found.smooth_rate.real
+    score = (found.rate.imag - true) / np.hypot(found.rate_std.imag, slope * found.level_std)
+    assert true.max() / true.min() > 1.05
+    assert np.mean(np.abs(score) < 1.96) > 0.85
+    assert 0.4 < np.sqrt(np.mean(score**2)) < 1.6
+    # Between the ends, where the filter sees both sides: 1 % of noise in some 300 samples.
+    np.testing.assert_allclose(found.rate.imag[2:-2], true[2:-2], rtol=1e-3)
+
+
+def test_what_lies_beside_the_mode_is_measured(mode):
+    record = company(mode)
+    found = sj.measure.isolate_decay(TIME, record, REST)
+    centred = record - record.mean()
+    np.testing.assert_allclose(
+        found.company.mode_share, np.sum(mode**2) / np.sum(centred**2), atol=0.02
+    )
+    assert found.company.frequency / HERTZ == pytest.approx(108, abs=1)
+    ((hertz, size),) = found.company.hum
+    assert hertz == pytest.approx(60, abs=0.1)
+    assert size == pytest.approx(0.01 * np.abs(mode).max(), rel=0.3)
+
+
+def test_a_mode_alone_passes_through(mode, backbone):
+    found = sj.measure.isolate_decay(TIME, mode, REST)
+    first = int(np.argmin(np.abs(TIME - found.time[0])))
+    away = found.velocity - mode[first : first + len(found.velocity)]
+    assert np.sqrt(np.mean(away**2) / np.mean(mode**2)) < 2e-3
+    # The decaying motion is slower than the undamped one by (D/2ω)²/2: 3e-6.
+    true = np.interp(np.exp(found.level.real), *backbone)
+    np.testing.assert_allclose(found.rate.imag[1:-1], true[1:-1], rtol=1e-4)
+
+
+@pytest.mark.parametrize("times", [0.9, 1.08])
+def test_a_mode_inside_the_band_is_refused(mode, times):
+    other = tone(40.0 * times, 0.5 * np.abs(mode).max(), 0.004)
+    with pytest.raises(ValueError, match="inside its band of .* another motion near"):
+        sj.measure.isolate_decay(TIME, mode + other, REST)
+
+
+def test_the_decay_begins_where_the_mode_dominates(mode):
+    """A neighbour, inside the band, that dies out in half a second."""
+    other = tone(37.0, 0.5 * np.abs(mode).max(), 0.03)
+    found = sj.measure.isolate_decay(TIME, mode + other, REST)
+    assert 0.05 < found.begin < 1.0
+
+
+def test_records_without_the_mode_are_refused(mode):
+    noise = np.random.default_rng(1).standard_normal(len(TIME))
+    for record, words in (
+        (noise, "cannot be isolated|no mode that rings"),
+        (np.where(TIME > 1, np.nan, mode), "NaN or inf"),
+        (np.clip(mode, -0.2, 0.2), "it is clipped"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            sj.measure.isolate_decay(TIME, record, REST)
+    with pytest.raises(ValueError, match="12 cycles are needed"):
+        sj.measure.isolate_decay(TIME[:400], mode[:400], REST)
+    with pytest.raises(ValueError, match="8 samples a cycle are needed"):
+        sj.measure.isolate_decay(TIME[::10], mode[::10], REST)
