@@ -132,7 +132,8 @@ DAMPING_CAPTION = (
 )
 MODE_CAPTION = (
     "The nonlinear normal mode of the model, followed by harmonic balance: velocity against "
-    "frequency, and frequency against energy."
+    "frequency, frequency against energy and, of several modes, how the energy is shared among "
+    "them. Dashed parts are unstable; a marker names an internal resonance."
 )
 
 

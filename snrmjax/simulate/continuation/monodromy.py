@@ -30,6 +30,7 @@ _MOST_SEGMENTS = 256
 _SEGMENT = 32  # steps whose propagators, or kicks, are computed side by side
 _KICKS = 3  # for every step of Magnus' method
 _LEAST_KICKS = 240
+_FEW_MODES = 6  # whose matrices are multiplied term by term, several points at once
 _FEW_SLIDERS = 16  # whose slip begins and ends with a step
 _GAUSS = np.array([0.5 - np.sqrt(0.15), 0.5, 0.5 + np.sqrt(0.15)])
 
@@ -72,8 +73,7 @@ def _by_kicks(
     all together where the damping couples them, which is exact; the kicks hold what else varies and
     couples, K(t). With K − h²K²/12 in place of K the map is that of a fourth-order method but for a
     change of coordinates, which its eigenvalues do not see: [B, [A, B]] of the flow A and the kicks
-    B holds K² alone, whatever the damping. Points lie along the last axis, so that one instruction
-    works on several.
+    B holds K² alone, whatever the damping.
     Reference: Takahashi & Imada, J. Phys. Soc. Jpn. 53 (1984) 3765, doi:10.1143/JPSJ.53.3765;
     López-Marcos, Sanz-Serna & Skeel, SIAM J. Sci. Comput. 18 (1997) 223,
     doi:10.1137/S1064827595288085.
@@ -110,34 +110,48 @@ def _by_kicks(
     kicks = jnp.maximum(_KICKS * steps_per_cycle * cycles, _LEAST_KICKS)
     n_segments, step = _segments(kicks, _KICKS * _MOST_SEGMENTS)
     speed = jnp.max(terms.stiffness / terms.mass) ** 0.5 / frequency  # of δq̇, over Ω
+    # Of few modes the points lie along the last axis, of many along the first.
+    wide = n > _FEW_MODES
+    of_states = -2 if wide else 0
+
+    def laid_out(matrix: Array) -> Array:
+        return jnp.moveaxis(matrix, -1, -3) if wide else matrix
+
+    def applied(matrix: Array, columns: Array) -> Array:
+        if wide:
+            return matrix @ columns
+        return sum((matrix[:, j, None] * columns[j] for j in range(len(columns))), jnp.zeros(()))
+
     if coupled:
-        flow = _flow(mean.at[modes, modes].add(linear), damping, step, speed)
+        flow = laid_out(_flow(mean.at[modes, modes].add(linear), damping, step, speed))
     else:
         mean = mean * np.eye(n)[:, :, None]
         damping = terms.damping[:, None] / (terms.mass[:, None] * frequency)
-        stay, go, back, last = (
-            part[:, None]
-            for part in _oscillation(linear + mean[modes, modes], damping, step, speed)
-        )
+        own = _oscillation(linear + mean[modes, modes], damping, step, speed)
+        stay, go, back, last = (laid_out(part[:, None]) for part in own)
 
     def kick(state: tuple, stiffness: Array) -> tuple[tuple, None]:
         q, v = state
         if coupled:
-            moved = sum(flow[:, j, None] * part for j, part in enumerate([*q, *v]))
-            q, v = moved[:n], moved[n:]
+            q, v = jnp.split(applied(flow, jnp.concatenate(state, of_states)), 2, of_states)
         else:
             q, v = stay * q + go * v, back * q + last * v
-        return (q, v - sum(stiffness[:, j, None] * q[j] for j in range(n))), None
+        return (q, v - applied(stiffness, q)), None
 
     def segment(number: Array, state: tuple) -> tuple:
         tau = (number * _SEGMENT + jnp.arange(_SEGMENT) + 0.5) * step
         k = stiffness(tau) - mean
-        square = sum(k[:, :, j, None] * k[:, None, j] for j in range(n))
-        return jax.lax.scan(kick, state, (k - step**2 / 12 * square) * (step / speed))[0]
+        if wide:
+            square = jnp.einsum("tijp,tjkp->tikp", k, k)
+        else:
+            square = sum((k[:, :, j, None] * k[:, None, j] for j in range(n)), jnp.zeros(()))
+        kicks = laid_out((k - step**2 / 12 * square) * (step / speed))
+        return jax.lax.scan(kick, state, kicks)[0]
 
-    eye = jnp.broadcast_to(jnp.eye(2 * n)[:, :, None], (2 * n, 2 * n, n_points))
-    found = jnp.concatenate(jax.lax.fori_loop(0, n_segments, segment, (eye[:n], eye[n:])))
-    return jnp.where(n_segments > 0, jnp.moveaxis(found, 2, 0), jnp.nan)
+    eye = laid_out(jnp.broadcast_to(jnp.eye(2 * n)[:, :, None], (2 * n, 2 * n, n_points)))
+    begin = tuple(jnp.split(eye, 2, of_states))
+    found = jnp.concatenate(jax.lax.fori_loop(0, n_segments, segment, begin), of_states)
+    return jnp.where(n_segments > 0, found if wide else jnp.moveaxis(found, 2, 0), jnp.nan)
 
 
 def _segments(steps: Array, most: int) -> tuple[Array, Array]:

@@ -171,6 +171,25 @@ def test_both_methods_give_the_same_multipliers(distance_between):
         assert distance_between(one, two) < 1e-6 * max(np.abs(one).max(), 1.0)
 
 
+@pytest.mark.parametrize("coupled", [True, False])
+def test_many_modes_have_the_multipliers_of_the_general_way(coupled, distance_between):
+    """Eight masses: matrices are multiplied whole, not term by term."""
+    dampers = [0.05, *[0.0] * 7, 0.02] if coupled else 0.0
+    matrices = chain([1.0] * 8, [1.0] * 9, dampers)
+    spring = make_effect("cubic_stiffness", {"coefficient": 0.3}, at=between("x4", "x3"))
+    nothing = make_effect("cubic_damping", {"coefficient": 0.0}, at="x1")
+    motion = np.zeros((2, 3, 8))
+    motion[:, 1] = np.outer([1.0, 2.0], np.sin(np.pi * np.arange(1, 9) / 9))
+    found = []
+    for effects in ((spring,), (spring, nothing)):
+        model = from_matrices(*matrices, force="x1", effects=effects)
+        modal = motion @ np.linalg.inv(np.asarray(model.modes.mode_shape)).T
+        found.append(floquet_multipliers(model, modal, np.array([0.8, 0.7])))
+    assert (model.modes.damping_coupling is not None) == coupled
+    for one, other in zip(*found, strict=True):
+        assert distance_between(one, other) < 1e-6
+
+
 @pytest.mark.parametrize("heaviest", [0.2, 30.0], ids=["light", "overdamped"])
 def test_multipliers_with_coupled_damping_are_those_of_the_integrated_equations(
     heaviest, distance_between
