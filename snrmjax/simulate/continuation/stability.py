@@ -39,9 +39,10 @@ def floquet_multipliers(
 
     Integrates m δq̈ + C(t)δq̇ + K(t)δq = 0 with the tangent matrices along the motion, by methods
     that keep a conservative structure's multipliers on the unit circle, however light the
-    damping: kicked oscillators, of order 4, for a potential alone, and Magnus' method of order 6
-    where other forces act (see `monodromy`). Sliders are linearised as they are: dragged or
-    stuck. A motion is stable when all multipliers lie inside the unit circle.
+    damping (see `monodromy`): kicked oscillators, of order 4, for springs and a potential; exact
+    pieces between slips and contacts where nothing else is nonlinear; Magnus' method of order 6
+    for all others. Sliders are linearised as they are: dragged or stuck. A motion is stable when
+    all multipliers lie inside the unit circle.
 
     Arguments: Fourier coefficients (kg^1/2 m) of the structure as simulated, `frequency` in
     rad/s, `steps_per_cycle` of the fastest tangent frequency. Points are worked on in blocks of

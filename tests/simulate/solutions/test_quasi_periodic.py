@@ -33,6 +33,8 @@ def test_the_branch_goes_from_one_bifurcation_to_the_other(pair):
     assert branch.frequency[0] == pytest.approx(1.11271, abs=1e-4)
     assert branch.frequency[-1] == pytest.approx(1.19574, abs=3e-4)
     assert branch.modulation[0] == 0.0
+    for ends in (branch.least_amplitude, branch.largest_amplitude):
+        np.testing.assert_allclose(ends[0], np.abs(branch.velocity[0]), rtol=1e-12)
     assert branch.modulation[-1] < 0.02 < branch.modulation.max()
     first, last = response.at_events("neimark_sacker")
     for place, end in ((first, 0), (last, -1)):
