@@ -132,16 +132,15 @@ def _check_sizes(counted: Sequence[tuple[Any, int, dict]], size: int, file: str)
 def _began(channels: Sequence[Any]) -> dict[str, float]:
     """Seconds by which channels began after the first of them, by the times that they state."""
     stated = {
-        channel.name: value
+        channel.name: value.astype("datetime64[us]")
         for channel in channels
         if isinstance(value := channel.properties.get("wf_start_time"), np.datetime64)
         and not np.isnat(value)
     }
-    first = min(stated.values(), default=np.datetime64(0, "us"))
-    return {
-        name: float((value - first) / np.timedelta64(1, "ns")) * 1e-9
-        for name, value in stated.items()
-    }
+    if not stated:
+        return {}
+    times = np.array(list(stated.values())).astype(np.int64)  # µs
+    return dict(zip(stated, (1e-6 * (times - times.min())).tolist(), strict=True))
 
 
 def _recording(path: Path, name: str, channels: Sequence[Any], shared: SharedAxis) -> TimeRecording:
