@@ -124,9 +124,10 @@ def joined_files(files: Sequence[LaboratoryFile]) -> list[LaboratoryFile]:
     joined = joined_by_clock(held) if len(held) == len(files) else None
     if joined is None or any(file.tables or file.responses for file in files):
         return list(files)
-    notes = tuple(dict.fromkeys(note for file in files for note in file.notes))
     record, name = joined
-    return [LaboratoryFile(name, files[0].kind, (record,), notes=(*record.notes, *notes))]
+    told = [Fact("channels_of_files", files=tuple(held))]
+    notes = tuple(dict.fromkeys([*told, *(note for file in files for note in file.notes)]))
+    return [LaboratoryFile(name, files[0].kind, (record,), notes=notes)]
 
 
 def _datasets(held: LaboratoryFile, mapping: ImportMap, *, strict: bool = False) -> list[_Dataset]:

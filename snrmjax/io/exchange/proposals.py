@@ -27,6 +27,9 @@ _RADIANS = 1.01 * np.pi  # which phases in radians do not exceed
 _A_TURN = 1.0  # rad that phases of a resonance cover at least
 
 
+_Content = TimeRecording | NumberTable | FrequencyResponses
+
+
 class _Options(dict[str, Any]):
     """Options by their keys: a word, or a list of words of an option that is given again."""
 
@@ -55,11 +58,8 @@ def proposed_commands(paths: Sequence[Path], files: Sequence[LaboratoryFile]) ->
     held = joined_files(files)[0]
     if held.tables and is_ours(held.tables[0].columns):
         return [f"it has our own columns: `snrmjax check`, `identify` and `test` take {held.name}."]
-    content: TimeRecording | NumberTable | FrequencyResponses = (
-        *held.recordings,
-        *held.tables,
-        *held.responses,
-    )[0]
+    contents: list[_Content] = [*held.recordings, *held.tables, *held.responses]
+    content = contents[0]
     found = _options_of(content)
     _take_amplitudes_of_names(found, files)
     if len(held.recordings) + len(held.tables) + bool(held.responses) > 1:
@@ -100,7 +100,7 @@ def _take_amplitudes_of_names(found: _Options, files: Sequence[LaboratoryFile]) 
 
 def _question(
     paths: Sequence[Path],
-    content: TimeRecording | NumberTable | FrequencyResponses,
+    content: _Content,
     found: _Options,
 ) -> str:
     """What an import with these options would ask; of a long record only channels are tried."""
@@ -115,7 +115,7 @@ def _question(
     return ""
 
 
-def _options_of(content: TimeRecording | NumberTable | FrequencyResponses) -> _Options:
+def _options_of(content: _Content) -> _Options:
     if isinstance(content, NumberTable):
         return _of_table(content)
     if isinstance(content, TimeRecording):

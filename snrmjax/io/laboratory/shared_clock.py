@@ -172,6 +172,6 @@ def joined_by_clock(
         each[0].sampling_rate,
         each[0].start_time,
         "",
-        (*notes, Fact("channels_of_files", files=tuple(single))),
+        notes,
     )
     return joined, ", ".join(single)

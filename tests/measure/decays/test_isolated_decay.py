@@ -92,7 +92,7 @@ def test_a_mode_alone_passes_through(mode, backbone):
 @pytest.mark.parametrize("times", [0.9, 1.08])
 def test_a_mode_inside_the_band_is_refused(mode, times):
     other = tone(40.0 * times, 0.5 * np.abs(mode).max(), 0.004)
-    with pytest.raises(ValueError, match="inside its band of .* another motion near"):
+    with pytest.raises(ValueError, match=r"inside its band of .* another motion near"):
         sj.measure.isolate_decay(TIME, mode + other, REST)
 
 
