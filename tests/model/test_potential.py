@@ -239,3 +239,19 @@ def test_shipped_flat_beam_is_the_mean_of_tab_a1():
         # Five digits are shipped of a mean of numbers with four, which agree to 5e-4 (DESIGN.md).
         np.testing.assert_allclose(coefficient, np.mean(estimates), rtol=1e-4)
         np.testing.assert_allclose(estimates, np.mean(estimates), rtol=5e-4)
+
+
+def test_many_modes_have_the_force_and_stiffness_of_a_stretched_string():
+    """V = (qᵀGq)² of twelve modes: ∂V = 4 (qᵀGq) Gq, ∂²V = 4 (qᵀGq) G + 8 Gq (Gq)ᵀ."""
+    n, random = 12, np.random.default_rng(1)
+    half = random.normal(size=(n, n))
+    g, q = half @ half.T, random.normal(size=n)
+    terms = {}
+    for i, j, k, m in itertools.product(range(n), repeat=4):
+        key = tuple(sorted((i, j, k, m)))
+        terms[key] = terms.get(key, 0.0) + g[i, j] * g[k, m]
+    potential = polynomial_potential(terms, n)
+    square, slope = q @ g @ q, g @ q
+    np.testing.assert_allclose(potential.force(q), 4 * square * slope, rtol=1e-11)
+    wanted = 4 * square * g + 8 * np.outer(slope, slope)
+    np.testing.assert_allclose(potential.stiffness(q), wanted, rtol=1e-11, atol=1e-11 * square)
