@@ -74,7 +74,8 @@ def resonant_decay(
     Raises `ValueError` for uneven times, a rate below eight samples a cycle, fewer than twelve
     cycles (five where the motion falls to a quarter), a clipped record and numbers that are not
     finite.
-    Validity: one mode, light damping, nothing driving; a filter as narrow as the frequency moves
+    Validity: one mode (with others beside it `isolate_decay` and `decay_of_mode`), light damping,
+    nothing driving; a filter as narrow as the frequency moves
     within its memory smooths both curves more than the note says.
     """
     times, signal = checked_record(time, velocity)

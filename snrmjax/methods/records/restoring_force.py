@@ -65,7 +65,7 @@ def fit_restoring_force(
     acceleration's power that the forces may leave.
     Returns a `RestoringForce`. Raises `ValueError` for a record as in `resonant_decay`, for a force
     without modes, for a degree outside 1 to 9, and for forces that leave more than `most_left`.
-    Validity: one mode in the record (filter others out before), an elastic force of displacement
+    Validity: one mode in the record (`isolate_decay` before), an elastic force of displacement
     alone and a damping force of velocity alone. Where the integrated displacement has its zero,
     and what an offset of the velocity makes of it, is fitted: the elastic force is zero at rest.
     """
