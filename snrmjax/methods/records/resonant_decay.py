@@ -75,8 +75,8 @@ def resonant_decay(
     cycles (five where the motion falls to a quarter), a clipped record and numbers that are not
     finite.
     Validity: one mode (with others beside it `isolate_decay` and `decay_of_mode`), light damping,
-    nothing driving; a filter as narrow as the frequency moves
-    within its memory smooths both curves more than the note says.
+    nothing driving; a filter as narrow as the frequency moves within its memory smooths both
+    curves more than the note says.
     """
     times, signal = checked_record(time, velocity)
     if reading not in get_args(Reading):
@@ -130,9 +130,12 @@ def decay_of_mode(decay: IsolatedDecay) -> MethodResult:
         ratio,
         np.hypot(decay.rate_std.real / natural, along_ratio * decay.level_std),
     )
-    return method_result(
-        "resonant_decay", points, 0, [Fact("decay_read_by", reading="a filter that moves with it")]
-    )
+    apart = float(np.max(np.abs(moves / 2 / smooth.real)))
+    notes = [
+        Fact("decay_read_by", reading="a filter that moves with it"),
+        Fact("decrement_apart", share=apart),
+    ]
+    return method_result("resonant_decay", points, 0, notes)
 
 
 def checked_record(

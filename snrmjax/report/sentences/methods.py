@@ -55,6 +55,10 @@ SENTENCES: dict[str, Wording] = {
     ),
     "hum_taken_away": "mains hum was taken away: {amplitude:.2g} m/s at {frequency_hz:.5g} Hz",
     "decay_left_out": "a decay was left out: {why}",
+    "decrement_apart": (
+        "damping is the power lost: the logarithmic decrement alone, which takes the change of "
+        "frequency for a loss or a gain, would differ by up to {share:%.2g} of itself"
+    ),
     "note_of_decay": "{name}: {note}",
     "record_sorted": _record_sorted,
     "data_left_out": "left out: {why}",
