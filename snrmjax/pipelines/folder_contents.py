@@ -17,7 +17,8 @@ from snrmjax.io.exchange.import_map import (
 from snrmjax.io.exchange.import_options import STAYS_RECORD
 from snrmjax.io.exchange.importing import Imported, import_files, joined_files
 from snrmjax.io.exchange.own_tables import is_own_file
-from snrmjax.io.exchange.record_import import mapped_record
+from snrmjax.io.exchange.proposals import proposed_commands
+from snrmjax.io.exchange.record_import import at_stated_rate, mapped_record
 from snrmjax.io.files import read_text
 from snrmjax.io.laboratory.contents import LaboratoryFile
 from snrmjax.io.laboratory.reading import read_laboratory_file
@@ -40,7 +41,7 @@ _AXES = ("frequency", "time")
 _SHOWN = 60  # lines of a text
 _MOST_NAMED = 6  # files that were passed over, in a message
 _LOADS = ("force", "voltage")
-_TOLD = ("channels_shifted", "samples_missing", "runs_side_by_side", "rate_left_open")
+_TOLD = ("channels_shifted", "samples_missing", "runs_side_by_side", "whole_rate_of_digits")
 
 
 class NamedStates(NamedTuple):
@@ -120,10 +121,11 @@ class TestFiles(NamedTuple):
         yield from self.passed
 
 
-def read_test_files(folder: Path, model: Path | None = None) -> TestFiles:
+def read_test_files(folder: Path, model: Path | None = None, rate: float = 0.0) -> TestFiles:
     """Read every file of a folder, by its content; folders inside it are left alone.
 
-    Arguments: `model` is a file with the linear model, in place of the one in the folder.
+    Arguments: `model` is a file with the linear model, in place of the one in the folder; `rate` in
+    Hz that of all records, where files state it with few digits.
     Raises `ValueError` for a folder that is missing or holds nothing measured, for a file of
     measurements that cannot be read, for several models, and as `import_files` does for a table
     whose columns neither are understood nor stand in a `map.toml`.
@@ -134,7 +136,7 @@ def read_test_files(folder: Path, model: Path | None = None) -> TestFiles:
     models = [] if model is None else [model]
     maps = [file for file in files if file.name == MAP]
     told = read_import_map(maps[0]) if maps else ImportMap()
-    notes: list[str] = []
+    told = told._replace(rate=rate or told.rate)
     states: list[NamedStates] = []
     responses: list[NamedResponses] = []
     records: list[NamedRecord] = []
@@ -164,6 +166,8 @@ def read_test_files(folder: Path, model: Path | None = None) -> TestFiles:
             states.append(NamedStates(path.name, read_steady_states(path), path))
         else:
             raw.append(read_laboratory_file(path, told.text_format))
+    assumed_of: dict[str, list[str]] = {}  # files by what was assumed of them
+    _ask_for_rate(raw, told)
     for held, names in _joined(raw):
         paths, file, assumed = [folder / name for name in names], held.name, Assumptions()
         stepped = held.recordings and told.base and told.record not in STAYS_RECORD
@@ -175,13 +179,15 @@ def read_test_files(folder: Path, model: Path | None = None) -> TestFiles:
         else:
             responses += [NamedResponses(file, one) for one in _linear(held, paths[0])]
         for recording in () if stepped else held.recordings:
-            record = (
-                recording if told.is_empty else mapped_record(recording, told, file, assumed)[0]
-            )
+            record = at_stated_rate(recording, told.rate, file)
+            record = record if told.is_empty else mapped_record(record, told, file, assumed)[0]
             several = f"{file}: {recording.name}"
             records.append(NamedRecord(several if len(held.recordings) > 1 else file, record))
-        notes += [f"{file}: {key}: {why}" for key, why in assumed.items()]
-        notes += [f"{file}: {note}" for note in held.notes if note.kind in _TOLD]
+        said = [f"{key}: {why}" for key, why in assumed.items()]
+        said += [str(note) for note in held.notes if note.kind in _TOLD]
+        for line in said:
+            assumed_of.setdefault(line, []).append(file)
+    notes = [f"{', '.join(named)}: {line}" for line, named in assumed_of.items()]
     if len(models) > 1:
         listed = " and ".join(model.name for model in models)
         raise ValueError(
@@ -211,6 +217,20 @@ def _measured_text(path: Path, told: ImportMap) -> LaboratoryFile | None:
     axes = {table.role(name) for table in held.tables for name in table.columns}
     named = told.frequency in {name for table in held.tables for name in table.columns}
     return held if held.recordings or held.responses or named or axes & {*_AXES} else None
+
+
+def _ask_for_rate(raw: Sequence[LaboratoryFile], told: ImportMap) -> None:
+    """Raise `ValueError` where records state their rate with few digits, and nobody else does."""
+    if told.rate:
+        return
+    for held in raw:
+        for note in held.notes:
+            if note.kind == "rate_left_open":
+                raise ValueError(
+                    f"which sampling rate has {held.name}? Its step of {note['step']} s has few "
+                    f"digits, so that frequencies may be off by {note['off']:.1g} %. Say so by "
+                    f"`--rate {note['rate']:g}`, if that is it."
+                )
 
 
 def _joined(raw: Sequence[LaboratoryFile]) -> list[tuple[LaboratoryFile, list[str]]]:
@@ -260,11 +280,18 @@ def _imported(paths: Sequence[Path], told: ImportMap) -> Imported:
     try:
         return import_files(paths, told)
     except ValueError as error:
-        named = " ".join(map(str, paths))
         raise ValueError(
-            f"{error} `snrmjax import {named}` says how; put the {MAP} that the import writes "
-            "beside the file."
+            f"{_asked(paths)} Put the {MAP} that it writes into {paths[0].parent.name} (without "
+            f"one: {error})"
         ) from error
+
+
+def _asked(paths: Sequence[Path]) -> str:
+    """The question what columns are, with the import that answers it."""
+    held = [read_laboratory_file(path) for path in paths]
+    command = next(line for line in proposed_commands(paths, held) if line.startswith("  snrmjax"))
+    names = ", ".join(path.name for path in paths)
+    return f"what are the columns of {names}? `{command.strip()}` says so, if its names are right."
 
 
 def _linear(held: LaboratoryFile, path: Path) -> tuple[FrequencyResponses, ...]:

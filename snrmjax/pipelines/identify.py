@@ -22,6 +22,7 @@ from snrmjax.identify.inference.optimal_design import (
     next_measurements,
 )
 from snrmjax.identify.joint.joint_fit import JointFit, corrected_states, fit_jointly
+from snrmjax.identify.joint.outlying_states import note_on_outlying
 from snrmjax.identify.pointwise.backbone import BackboneValues
 from snrmjax.identify.pointwise.prediction_result import PredictedResponse, Resonance
 from snrmjax.identify.prediction.notes import notes_on_negative_damping
@@ -172,6 +173,7 @@ def _by_joint_fit(data: SteadyStates, model: Structure, options: IdentifyOptions
     notes = (
         *doubts,
         *data.notes,
+        *note_on_outlying(fit, robust=options.robust),
         *found.notes,
         *linear_damping_note(fit, model),
         *_note_on_gain(fit),

@@ -265,6 +265,12 @@ class WholeTestOptions:
     drive_point: str | None = option(
         None, "Sensor at the force, by which mode shapes are scaled.", "NAME"
     )
+    rate: float | None = option(
+        None,
+        "Sampling rate of the records in Hz, where files state it with few digits.",
+        "HZ",
+        positive="Hz",
+    )
     base: Literal["absolute", "relative"] | None = option(
         None,
         "What the sensors record of a structure whose base moves: their own motion (absolute) or "

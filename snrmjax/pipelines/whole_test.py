@@ -7,11 +7,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from snrmjax.doctor.check import check_test
 from snrmjax.doctor.column_misreadings import doubt
 from snrmjax.doctor.findings import Checkup
+from snrmjax.identify.joint.outlying_states import outlying_states
 from snrmjax.identify.modal.modes_of_tests import find_modes
 from snrmjax.identify.modal.response_data import joined_responses
 from snrmjax.identify.scaling.scale import DrivePoint, scale_modes
@@ -94,7 +96,7 @@ def run_whole_test(
     options = checked(dataclasses.replace(options or WholeTestOptions(), **settings))
     folder = Path(folder)
     stage, name = _Stages(progress), folder.resolve().name
-    files = read_test_files(folder, options.model)
+    files = read_test_files(folder, options.model, options.rate or 0.0)
     read = files_of_test(folder, files)
     stage.ends("files")
     model, modes = files.model, None
@@ -133,7 +135,7 @@ def run_whole_test(
     diagnosed = None
     left_out = not_diagnosed(data, model) if options.diagnose else ()
     if options.diagnose and not left_out:
-        diagnosed = diagnose_test(data, model)
+        diagnosed = diagnose_test(_without_outlying(data, identified), model)
         stage.ends("diagnosis")
     notes = (
         *left_out,
@@ -292,12 +294,25 @@ def _stop_at_errors(checkup: Checkup) -> None:
     )
 
 
+def _without_outlying(data: SteadyStates, identified: IdentifiedTest) -> SteadyStates:
+    """The states without those that no curve of one mode explains: no effect does, either."""
+    far = outlying_states(identified.joint.fit) if identified.joint is not None else np.arange(0)
+    if not far.size or 2 * far.size > data.n_states:
+        return data
+    keep = np.setdiff1d(np.arange(data.n_states), far)
+    chosen: SteadyStates = jax.tree.map(lambda column: np.asarray(column)[keep], data)
+    return dataclasses.replace(chosen, notes=(*data.notes, Fact("outlying_left_out", n=far.size)))
+
+
 def _identified(data: SteadyStates, model: Structure) -> tuple[IdentifiedTest, tuple[Note, ...]]:
     """A joint fit; curves through the points where the states are too few for one."""
     drive_only = not np.isfinite(np.asarray(data.force)).any()
     free = ("instrument_phase",) if drive_only else ()
     try:
-        return identify_test(data, model, fit="auto", free=free), ()
+        found = identify_test(data, model, fit="auto", free=free)
+        if found.joint is not None and outlying_states(found.joint.fit).size:
+            found = identify_test(data, model, fit="auto", free=free, robust=True)
+        return found, ()
     except ValueError as error:
         if drive_only:
             raise

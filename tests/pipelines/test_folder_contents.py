@@ -141,3 +141,22 @@ def test_another_model_may_be_named(folder, tmp_path_factory):
     found = read_test_files(folder, other)
     assert found.model.name == "other beam"
     assert dict(found.passed)["model.toml"] == "not used: the model is linear.toml"
+
+
+def test_a_rate_of_few_digits_is_asked_for(tmp_path):
+    """0.000488 s may be any rate from 2048 to 2051 Hz."""
+    head = ["LabVIEW Measurement", "Separator\tTab", "X_Columns\tNo", "***End_of_Header***", ""]
+    head += ["Channels\t2", "Y_Unit_Label\tN\tm/s", "Delta_X\t0.000488\t0.000488"]
+    head += ["***End_of_Header***", "X_Value\tforce\ttip"]
+    both = record().values()
+    rows = [f"\t{a!r}\t{b!r}" for a, b in both.T.tolist()]
+    (tmp_path / "steps.lvm").write_text("\n".join([*head, *rows]))
+    with pytest.raises(ValueError, match=r"which sampling rate has steps\.lvm.*--rate 2048"):
+        read_test_files(tmp_path)
+    (one,) = read_test_files(tmp_path, rate=2048.0).records
+    assert one.record.sampling_rate == 2048.0
+    with pytest.raises(ValueError, match="which of both is right"):
+        read_test_files(tmp_path, rate=1000.0)
+    (tmp_path / "map.toml").write_text("rate = 2050.0\n")
+    (one,) = read_test_files(tmp_path).records
+    assert one.record.sampling_rate == 2050.0

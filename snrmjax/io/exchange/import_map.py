@@ -12,6 +12,7 @@ from snrmjax.io.toml_table import TomlTable, parsed_toml
 from snrmjax.measure.recordings.step_counts import StepCounts
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.names import suggestion
+from snrmjax.numerics.rules import NOT_NEGATIVE
 
 if TYPE_CHECKING:
     from snrmjax.io.laboratory.contents import TextFormat
@@ -39,6 +40,10 @@ _RECORDS = ("steps", "sweep", "decay", "broadband")
 KEYS = {
     "dataset": MapKey("which of the file's datasets"),
     "record": MapKey(f"what a time record is: {', '.join(_RECORDS)}", "KIND", _NUMBERS, _RECORDS),
+    "rate": MapKey(
+        "sampling rate in Hz of records whose file has few digits; 0: the file's",
+        *("HZ", _NUMBERS),
+    ),
     "frequency": MapKey("column of the forcing frequency"),
     "frequency_unit": MapKey("unit of the frequency: Hz or rad/s", "UNIT", _NUMBERS),
     "force": MapKey("channel or column of the force (or of the voltage that drives it)"),
@@ -134,6 +139,7 @@ class ImportMap(NamedTuple):
     responses: tuple[ResponseMap, ...] = ()
     dataset: str = ""
     record: str = ""
+    rate: float = 0.0
     frequency: str = ""
     frequency_unit: str = ""
     force: str = ""
@@ -155,7 +161,8 @@ class ImportMap(NamedTuple):
     @property
     def is_empty(self) -> bool:
         """Whether nothing is said of channels."""
-        return self._replace(separator="", decimal="", header_row=0, dataset="") == ImportMap()
+        plain = self._replace(separator="", decimal="", header_row=0, dataset="", rate=0.0)
+        return plain == ImportMap()
 
     @property
     def base_motion(self) -> ResponseMap:
@@ -232,6 +239,8 @@ def map_of_options(map_file: Path | None, given: Mapping[str, Any]) -> ImportMap
         words["force_amplitude"] = _stated_amplitudes(words["force_amplitude"])
     if "base" in words:
         _require_base(words["base"])
+    if "rate" in words and not 0 < words["rate"] < float("inf"):
+        raise ValueError(f"--rate must be above zero, but is {words['rate']:g} Hz.")
     told = ImportMap() if map_file is None else read_import_map(map_file)
     unit, response = words.pop("unit", ""), given.get("response") or ()
     responses = tuple(response_word(word, unit) for word in response) or told.responses
@@ -331,6 +340,8 @@ def _value(table: TomlTable, key: str) -> Any:
         return value
     if key == "header_row":
         return table.whole(key, 0)
+    if key == "rate":
+        return table.number(key, NOT_NEGATIVE)
     if key == "force_amplitude":
         return (
             (value,)

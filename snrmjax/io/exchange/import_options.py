@@ -18,7 +18,7 @@ _OBEYED: dict[Content, set[str]] = {
         *("frequency", "frequency_unit", "force_phase", "over_force", "phase_unit"),
         *("phase", "imaginary", "amplitude_std", "phase_std"),
     },
-    "records": {*_ANY, "force", "base", "record", "level", "drive", "sensor", "phase_sign"},
+    "records": {*_ANY, "force", "base", "record", "rate", "level", "drive", "sensor", "phase_sign"},
 }
 _WHAT: dict[Content, str] = {
     "own table": "a table with our own columns",

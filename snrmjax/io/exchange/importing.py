@@ -18,7 +18,7 @@ from snrmjax.io.exchange.import_options import (
 )
 from snrmjax.io.exchange.import_units import Force
 from snrmjax.io.exchange.own_tables import restated, restated_how, states_of_own_table
-from snrmjax.io.exchange.record_import import import_record, mapped_record
+from snrmjax.io.exchange.record_import import at_stated_rate, import_record, mapped_record
 from snrmjax.io.exchange.response_import import import_responses
 from snrmjax.io.exchange.table_import import import_table
 from snrmjax.io.laboratory.contents import LaboratoryFile, NumberTable
@@ -163,7 +163,8 @@ def _records(
     kept: list[TimeRecording] = []
     steps: list[StepCounts] = []
     used = mapping
-    for record, file in records:
+    for recorded, file in records:
+        record = at_stated_rate(recorded, mapping.rate, file)
         record, used = mapped_record(record, mapping, file, assumed)
         states, used, further, counts = import_record(record, used, file, assumed)
         notes += [Fact("note_of_file", file=file, note=note) for note in further]

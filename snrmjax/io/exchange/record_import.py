@@ -20,7 +20,22 @@ from snrmjax.numerics.facts import Fact
 ENDINGS = {"velocity": "m_s", "acceleration": "m_s2", "displacement": "m"}
 """Units of motions in names of columns."""
 
+_FEW_DIGITS = 0.02  # relative: two digits of a step
 _DIRECT: dict[str, Levels] = {"force": "force", "drive": "drive", "runs": "runs"}
+
+
+def at_stated_rate(record: TimeRecording, rate: float, file: str) -> TimeRecording:
+    """A record with the sampling rate (Hz) that is stated, if one is; 0: its own.
+
+    Raises `ValueError` for one that a few digits of the file's own do not explain.
+    """
+    own = record.sampling_rate
+    if rate and abs(rate / own - 1) > _FEW_DIGITS:
+        raise ValueError(
+            f"--rate says {rate:g} Hz, but {file} {own:g} Hz: which of both is right? Few digits "
+            "of the file do not explain that much."
+        )
+    return dataclasses.replace(record, sampling_rate=rate) if rate else record
 
 
 def mapped_record(

@@ -306,7 +306,9 @@ def _exact_step(word: str, step: float, notes: list[Fact]) -> float:
         notes.append(Fact("whole_rate_of_digits", step=word, rate=least))
         return 1 / least
     if half / step > _ROUNDED:
-        notes.append(Fact("rate_left_open", step=word, rate=rate, off=100 * half / step))
+        # The roundest of the rates that it can mean: most often a power of two.
+        likely = max(range(least, most + 1), key=lambda n: n & -n) if least <= most else rate
+        notes.append(Fact("rate_left_open", step=word, rate=likely, off=100 * half / step))
     return step
 
 

@@ -261,7 +261,24 @@ def _biased(velocity: float, frequency: float, damping: float, clear: bool) -> s
     return f"{said}." if clear else f"{said}: within its error."
 
 
+def _outlying(*, states: Sequence[tuple[int, float]], farthest: float, robust: bool) -> str:
+    """States far from the curves, and what was done or can be done about them."""
+    named = [f"level {level} at {hertz:.5g} Hz" for level, hertz in states[:_LISTED]]
+    further = f" and {len(states) - _LISTED} further" if len(states) > _LISTED else ""
+    lie = "lies" if len(states) == 1 else "lie up to"
+    done = (
+        "given little weight here"
+        if robust
+        else "leave them out of the table, or give them little weight by `--robust`"
+    )
+    return (
+        f"{enumerated(named)}{further} {lie} {farthest:.2g} times the noise from the curves, as "
+        f"states beside a jump do that have not settled: {done}."
+    )
+
+
 SENTENCES: dict[str, Wording] = {
+    "states_outlying": _outlying,
     # Coupled modes.
     "modes_coupled": _coupled,
     "modes_not_coupled": _not_coupled,

@@ -91,7 +91,10 @@ SENTENCES: dict[str, Wording] = {
     "whole_rate_of_digits": (
         "the step {step} s has few digits: {rate} Hz, the only whole rate that is printed so."
     ),
-    "rate_left_open": "the step {step} s has few digits: frequencies may be off by {off:.1g} %.",
+    "rate_left_open": (
+        "the step {step} s has few digits: frequencies may be off by {off:.1g} %, unless the "
+        "sampling rate is stated (`--rate`, or `rate` in map.toml); it may be {rate:g} Hz."
+    ),
     "channels_shifted": lambda names, seconds: (
         "by the starting times that the file states, "
         + ", ".join(

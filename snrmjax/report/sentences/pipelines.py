@@ -82,6 +82,9 @@ def _by_import(advice: object, commands: tuple[str, ...]) -> str:
 
 
 SENTENCES: dict[str, Wording] = {
+    "outlying_left_out": (
+        "{n:#state} far from the curves of one mode left out of the diagnosis (see the backbone)."
+    ),
     "advice_by_import": _by_import,
     "advice_at_once": "{names} at once: {command}. Alone, {alone}",
     "load": _load,
