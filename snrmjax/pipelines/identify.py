@@ -1,6 +1,7 @@
 """Identification: backbone and damping from a table of steady states, and what they predict."""
 
 import dataclasses
+import functools
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,7 +23,7 @@ from snrmjax.identify.inference.optimal_design import (
     next_measurements,
 )
 from snrmjax.identify.joint.joint_fit import JointFit, corrected_states, fit_jointly
-from snrmjax.identify.joint.outlying_states import note_on_outlying
+from snrmjax.identify.joint.outlying_states import note_on_outlying, outlying_states
 from snrmjax.identify.pointwise.backbone import BackboneValues
 from snrmjax.identify.pointwise.prediction_result import PredictedResponse, Resonance
 from snrmjax.identify.prediction.notes import notes_on_negative_damping
@@ -156,14 +157,17 @@ def _by_joint_fit(data: SteadyStates, model: Structure, options: IdentifyOptions
         raise ValueError(
             f"--fit takes one or two families, but {options.fit!r} names {len(names)}."
         )
-    fit = fit_jointly(
-        data,
-        model,
+    fitted = functools.partial(
+        fit_jointly,
+        *(data, model),
         backbone=names[0],
         damping=names[1] if len(names) == 2 else "auto",
         free=[name for several in options.free for name in several.split(",")],
-        robust=options.robust,
     )
+    fit = fitted(robust=options.robust)
+    # Curves that outliers have bent may miss other states: a fit in which they weigh little tells.
+    telling = fit if options.robust or not outlying_states(fit).size else fitted(robust=True)
+    outlying = note_on_outlying(telling, robust=options.robust)
     data = corrected_states(data, fit)
     found = identification_of_fit(data, fit)
     predictions, trends = predictions_of_fit(fit, options)
@@ -173,7 +177,7 @@ def _by_joint_fit(data: SteadyStates, model: Structure, options: IdentifyOptions
     notes = (
         *doubts,
         *data.notes,
-        *note_on_outlying(fit, robust=options.robust),
+        *outlying,
         *found.notes,
         *linear_damping_note(fit, model),
         *_note_on_gain(fit),
