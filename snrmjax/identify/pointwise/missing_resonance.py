@@ -54,8 +54,8 @@ def jump_at_resonance(
     """The frequencies between which a level jumps past its phase resonance; None where it does not.
 
     Between states of one branch tan φ falls steadily with frequency, so that a resonance between
-    them can be interpolated. Across a jump it falls twice as steeply as beside it, or comes back:
-    what lies between was not measured.
+    them can be interpolated. Across a jump it falls twice as steeply as beside it, twice as steeply
+    on one side as on the other, or comes back: what lies between was not measured.
 
     Arguments: `tangent` of the phases of a level's states, rising, and their frequencies.
     Validity: at least two states on one side; with fewer no jump can be told.
@@ -72,7 +72,9 @@ def jump_at_resonance(
     if not slopes:
         return None
     slope = _slope(tangent[pair], frequency[pair])
-    return ends if slope >= 0 or slope < _STEEPER * min(*slopes, 0.0) else None
+    # Steep on one side and flat on the other are two branches, whatever is between them.
+    apart = len(slopes) == 2 and min(slopes) < _STEEPER * max(slopes)
+    return ends if slope >= 0 or apart or slope < _STEEPER * min(*slopes, 0.0) else None
 
 
 def _slope(tangent: Float[np.ndarray, " 2"], frequency: Float[np.ndarray, " 2"]) -> float:

@@ -257,7 +257,7 @@ def _key_numbers(diagnosis: Diagnosis, predicted: Sequence[LevelResponse]) -> li
             pairs.append((f"predicted without having seen level {top.level}", top.after))
         unit = velocity_unit(one for _, one in pairs)
         text = "; ".join(f"{name}: {resonance_in_words(one, unit)}" for name, one in pairs)
-        rows.append((f"resonance at {with_unit(top.force, 'N')}", text))
+        rows.append((f"resonance at {with_unit(top.force, diagnosis.data.force_unit)}", text))
     if diagnosis.decide_by:
         rows.append(("what to measure next", diagnosis.decide_by))
     return rows
@@ -306,7 +306,9 @@ def _comparison_section(
         if any(row.held_out for row in predicted):
             header.append("predicted without having seen the level")
             caption += " The last column is of models that were fitted without that level."
-        tables.append(ReportTable(header, resonance_rows(predicted), caption))
+        tables.append(
+            ReportTable(header, resonance_rows(predicted, diagnosis.data.force_unit), caption)
+        )
     figures = [shown[name] for name in ("responses", "residuals") if name in shown]
     text = [_located(part, diagnosis.gap.after) for part in diagnosis.located]
     if not text:

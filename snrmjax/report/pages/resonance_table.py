@@ -8,7 +8,7 @@ from snrmjax.diagnose.response_prediction import LevelResponse, PhaseResonance
 from snrmjax.report.style import Unit, unit_for, with_unit
 
 
-def resonance_rows(rows: Sequence[LevelResponse]) -> list[tuple[str, ...]]:
+def resonance_rows(rows: Sequence[LevelResponse], force_unit: str = "N") -> list[tuple[str, ...]]:
     """The rows of the table of resonances, all velocities in one unit."""
     each = [(row.measured, row.before, row.completed, row.after) for row in rows]
     unit = velocity_unit(one for four in each for one in four)
@@ -18,7 +18,7 @@ def resonance_rows(rows: Sequence[LevelResponse]) -> list[tuple[str, ...]]:
         texts = [resonance_in_words(one, unit) for one in seen]
         if some_unseen:
             texts.append(resonance_in_words(unseen, unit) if row.held_out else "–")
-        table.append((str(row.level), _unbroken(with_unit(row.force, "N")), *texts))
+        table.append((str(row.level), _unbroken(with_unit(row.force, force_unit)), *texts))
     return table
 
 
