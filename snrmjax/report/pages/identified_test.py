@@ -17,7 +17,7 @@ from snrmjax.pipelines.identify import FitDetails, IdentifiedTest
 from snrmjax.pipelines.predictions import Prediction
 from snrmjax.report.figures import identification as plot
 from snrmjax.report.figures.simulation import normal_mode_figure
-from snrmjax.report.html import Report, ReportFigure, Section, write_report
+from snrmjax.report.html import Report, ReportFigure, Section, with_error, write_report
 from snrmjax.report.pages import coupled_modes as coupled_page
 from snrmjax.report.pages.identification import ComparedResponses, identification_report
 from snrmjax.report.pages.joint_fit import (
@@ -26,7 +26,7 @@ from snrmjax.report.pages.joint_fit import (
     joint_sections,
     words_of_fit,
 )
-from snrmjax.report.sampling import SHOWN_AMPLITUDES, VELOCITY, ShownAmplitude
+from snrmjax.report.sampling import BAND, SHOWN_AMPLITUDES, VELOCITY, ShownAmplitude
 from snrmjax.report.style import PrintedFigure, save_figures
 
 
@@ -46,11 +46,14 @@ def headline(found: IdentifiedTest) -> list[str]:
     values = found.values
     speed, ratio = np.asarray(values.velocity), 100 * np.asarray(values.damping_ratio)
     hertz = np.asarray(values.natural_frequency) / HERTZ
+    errors = BAND * np.asarray(values.natural_frequency_std) / HERTZ
+    spreads = BAND * 100 * np.asarray(values.damping_ratio_std)
     ends = [
-        f"{hertz[k]:.5g} Hz and {ratio[k]:.3g} % of critical damping at {speed[k]:.3g} m/s"
+        f"{with_error(hertz[k], errors[k])} Hz and {with_error(ratio[k], spreads[k])} % of "
+        f"critical damping at {speed[k]:.3g} m/s"
         for k in (0, -1)
     ]
-    lines = [f"backbone: {ends[0]} to {ends[1]}"]
+    lines = [f"backbone: {ends[0]} to {ends[1]} (± 95 %)"]
     for prediction in found.predictions:
         for each in prediction.resonances:
             place = f"{each.frequency / HERTZ:.5g} Hz, {each.velocity:.3g} m/s"
