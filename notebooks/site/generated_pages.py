@@ -1,0 +1,151 @@
+"""What the site takes from the package: its API, commands, effects, glossary, figures, KaTeX.
+
+A hook of MkDocs. The public names are those of the rooms' `__init__.pyi`, each documented where it
+is defined.
+"""
+
+import ast
+import re
+from pathlib import Path
+
+import typer
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.exceptions import PluginError
+from mkdocs.structure.files import File, Files
+
+import snrmjax
+from snrmjax.cli import app
+
+SITE = Path(__file__).parent
+PACKAGE = SITE.parents[1] / "snrmjax"
+KATEX = SITE / "node_modules/katex/dist"
+ROOMS = (
+    *("measure", "identify", "simulate", "model", "diagnose", "doctor", "methods"),
+    *("condense", "study", "pipelines", "io", "io.calculix", "plot"),
+)
+# What all results share, and what all effects do: bases that no room exports.
+BASES = {
+    "identify": ["snrmjax.numerics.result.AbstractResult", "snrmjax.numerics.status.Status"],
+    "model": ["snrmjax.model.effect_base.AbstractEffect"],
+}
+
+
+def public_names(module: str) -> dict[str, str]:
+    """Where each public name of a module is defined, namespaces left out."""
+    folder = PACKAGE.joinpath(*module.split(".")) if module else PACKAGE
+    stub = folder / "__init__.pyi"
+    path = stub if stub.is_file() else folder.with_suffix(".py")
+    package = f"snrmjax.{module}" if module else "snrmjax"
+    found: dict[str, str] = {}
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    public = next(
+        ast.literal_eval(node.value)
+        for node in tree.body
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__"
+    )
+    for node in tree.body:
+        if isinstance(node, ast.ImportFrom) and (node.module or node.level == 0):
+            source = f"{package}.{node.module}" if node.level else str(node.module)
+            found |= {name.name: f"{source}.{name.name}" for name in node.names}
+    names = {name: found[name] for name in public if name in found}
+    missing = [n for n in public if n not in names and f"{module}.{n}".strip(".") not in ROOMS]
+    if missing:
+        raise PluginError(f"{path}: no page would have the public names {', '.join(missing)}.")
+    return names
+
+
+def api_page(module: str) -> str:
+    """Every public name of a module, for mkdocstrings."""
+    title = f"sj.{module}" if module else "snrmjax"
+    whole = f"snrmjax.{module}" if module else "snrmjax"
+    blocks = [f"# {title}", f"::: {whole}\n    options: {{members: false, show_root_heading: false}}"]
+    if module:
+        blocks.insert(1, "With `import snrmjax as sj`.")
+    else:
+        blocks[1] = (
+            "With `import snrmjax as sj`: the verbs to start with. The rest is in namespaces: "
+            + ", ".join(f"[`sj.{room}`]({room}.md)" for room in ROOMS)
+            + ". The words are in the [glossary](../glossary.md)."
+        )
+    blocks += [f"::: {where}" for where in public_names(module).values()]
+    if module in BASES:
+        blocks += ["## What these have in common"]
+        blocks += [f"::: {where}\n    options: {{heading_level: 3}}" for where in BASES[module]]
+    return "\n\n".join(blocks) + "\n"
+
+
+def cell(text: str) -> str:
+    """Text for a cell of a table."""
+    return re.sub(r"\s+", " ", text).replace("|", "\\|").strip()
+
+
+def commands_page() -> str:
+    """Every command with its options, as `--help` says them."""
+    blocks = ["# Commands", "Each command says the same with `--help`."]
+
+    def add(command, name: str) -> None:  # type: ignore[no-untyped-def]
+        if hasattr(command, "commands"):
+            for key, one in command.commands.items():
+                add(one, f"{name} {key}")
+            return
+        rows = ["| option | what it is |", "|---|---|"]
+        for option in command.params:
+            if option.hidden or option.name == "help":
+                continue
+            words = option.opts if option.param_type_name == "option" else [option.name.upper()]
+            shown = " ".join(f"`{word}`" for word in words)
+            if option.param_type_name == "option" and not option.is_flag:
+                shown += f" {cell(option.metavar or '')}".rstrip()
+            rows.append(f"| {shown} | {cell(option.help or '')} |")
+        text = re.sub(r"\[/?[a-z ]+\]", "", command.help or "").replace("\b", "")
+        blocks.extend([f"## {name}", text, "\n".join(rows), command.epilog or ""])
+
+    add(typer.main.get_command(app), "snrmjax")
+    return "\n\n".join(blocks) + "\n"
+
+
+def effects_page() -> str:
+    """Every effect that files and diagnoses know."""
+    blocks = [
+        "# Effects",
+        "The kinds that a model file may name under `[[effect]]`. Without `at` or `between` they "
+        "act on the mode of interest and their parameters are modal; with them they act at points "
+        "and their parameters are in N, m and kg "
+        "([how to place one](../how-to/element.md)).",
+    ]
+    for kind, effect in snrmjax.model.EFFECTS.items():
+        rows = ["| parameter | what it is | modal unit |", "|---|---|---|"]
+        for name, of in effect.parameters().items():
+            rows.append(f"| `{name}` | {cell(of.meaning)} | {cell(of.unit)} |")
+        blocks += [f"## {kind}", effect.description, "\n".join(rows)]
+    return "\n\n".join(blocks) + "\n"
+
+
+def glossary() -> str:
+    """The glossary of the package's docstring, its terms in bold."""
+    text = (snrmjax.__doc__ or "").partition("Glossary\n")[2]
+    return re.sub(r"^- ([^:]+):", r"- **\1**:", text.strip(), flags=re.MULTILINE)
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the generated pages, the figures and KaTeX."""
+    if not KATEX.is_dir():
+        raise PluginError("KaTeX is not installed: run `npm ci --prefix notebooks/site` once.")
+    pages = {f"reference/{room}.md": api_page(room) for room in ROOMS}
+    pages["reference/index.md"] = api_page("")
+    pages["reference/commands.md"] = commands_page()
+    pages["reference/effects.md"] = effects_page()
+    for path, content in pages.items():
+        files.append(File.generated(config, path, content=content))
+    scripts = [KATEX / "katex.min.js", KATEX / "katex.min.css", KATEX / "contrib/auto-render.min.js"]
+    assets = {f"assets/katex/{path.name}": path for path in scripts}
+    assets |= {f"assets/katex/fonts/{p.name}": p for p in (KATEX / "fonts").glob("*.woff2")}
+    assets |= {f"assets/figures/{p.name}": p for p in (SITE.parent / "figures").glob("*.png")}
+    for path, source in assets.items():
+        files.append(File.generated(config, path, abs_src_path=str(source)))
+    return files
+
+
+def on_page_markdown(markdown: str, **_: object) -> str:
+    """Put the package's glossary where a page asks for it."""
+    return markdown.replace("<!-- glossary of the package -->", glossary())
