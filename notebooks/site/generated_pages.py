@@ -5,6 +5,7 @@ is defined.
 """
 
 import ast
+import importlib
 import re
 from pathlib import Path
 
@@ -54,23 +55,47 @@ def public_names(module: str) -> dict[str, str]:
     return names
 
 
-def api_page(module: str) -> str:
-    """Every public name of a module, for mkdocstrings."""
-    title = f"sj.{module}" if module else "snrmjax"
-    whole = f"snrmjax.{module}" if module else "snrmjax"
-    blocks = [f"# {title}", f"::: {whole}\n    options: {{members: false, show_root_heading: false}}"]
-    if module:
-        blocks.insert(1, "With `import snrmjax as sj`.")
-    else:
-        blocks[1] = (
-            "With `import snrmjax as sj`: the verbs to start with. The rest is in namespaces: "
-            + ", ".join(f"[`sj.{room}`]({room}.md)" for room in ROOMS)
-            + ". The words are in the [glossary](../glossary.md)."
-        )
-    blocks += [f"::: {where}" for where in public_names(module).values()]
-    if module in BASES:
+def api_page(room: str) -> str:
+    """Every public name of a room, for mkdocstrings."""
+    blocks = [
+        f"# sj.{room}",
+        "With `import snrmjax as sj`.",
+        f"::: snrmjax.{room}\n    options: {{members: false, show_root_heading: false}}",
+        *(f"::: {where}" for where in public_names(room).values()),
+    ]
+    if room in BASES:
         blocks += ["## What these have in common"]
-        blocks += [f"::: {where}\n    options: {{heading_level: 3}}" for where in BASES[module]]
+        blocks += [f"::: {where}\n    options: {{heading_level: 3}}" for where in BASES[room]]
+    return "\n\n".join(blocks) + "\n"
+
+
+def first_sentence(text: str | None) -> str:
+    """The first line of a docstring."""
+    return cell((text or "").strip().partition("\n")[0])
+
+
+def top_page() -> str:
+    """The verbs of `sj`, each linked to its room or documented here, and the rooms."""
+    elsewhere = {where for room in ROOMS for where in public_names(room).values()}
+    verbs = ["| verb | what it does |", "|---|---|"]
+    here = []
+    for name, where in public_names("").items():
+        said = first_sentence(getattr(snrmjax, name).__doc__)
+        verbs.append(f"| [`sj.{name}`][{where}] | {said} |")
+        if where not in elsewhere:
+            here.append(f"::: {where}")
+    rooms = ["| namespace | what it holds |", "|---|---|"]
+    for room in ROOMS:
+        said = first_sentence(importlib.import_module(f"snrmjax.{room}").__doc__)
+        rooms.append(f"| [`sj.{room}`]({room}.md) | {said} |")
+    blocks = [
+        "# snrmjax",
+        "With `import snrmjax as sj`. Every name has shapes, units and errors beside it; the words "
+        "are in the [glossary](../glossary.md).",
+        *("## The verbs to start with", "\n".join(verbs)),
+        *("## The rest, by namespace", "\n".join(rooms)),
+        *("## Only here", *here),
+    ]
     return "\n\n".join(blocks) + "\n"
 
 
@@ -97,8 +122,7 @@ def commands_page() -> str:
             if option.param_type_name == "option" and not option.is_flag:
                 shown += f" {cell(option.metavar or '')}".rstrip()
             rows.append(f"| {shown} | {cell(option.help or '')} |")
-        text = re.sub(r"\[/?[a-z ]+\]", "", command.help or "").replace("\b", "")
-        blocks.extend([f"## {name}", text, "\n".join(rows), command.epilog or ""])
+        blocks.extend([f"## {name}", command.help or "", "\n".join(rows), command.epilog or ""])
 
     add(typer.main.get_command(app), "snrmjax")
     return "\n\n".join(blocks) + "\n"
@@ -132,7 +156,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     if not KATEX.is_dir():
         raise PluginError("KaTeX is not installed: run `npm ci --prefix notebooks/site` once.")
     pages = {f"reference/{room}.md": api_page(room) for room in ROOMS}
-    pages["reference/index.md"] = api_page("")
+    pages["reference/index.md"] = top_page()
     pages["reference/commands.md"] = commands_page()
     pages["reference/effects.md"] = effects_page()
     for path, content in pages.items():
