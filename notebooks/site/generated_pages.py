@@ -8,6 +8,7 @@ import ast
 import importlib
 import re
 from pathlib import Path
+from typing import Any
 
 import typer
 from mkdocs.config.defaults import MkDocsConfig
@@ -60,7 +61,7 @@ def api_page(room: str) -> str:
     blocks = [
         f"# sj.{room}",
         "With `import snrmjax as sj`.",
-        f"::: snrmjax.{room}\n    options: {{members: false, show_root_heading: false}}",
+        f"::: snrmjax.{room}\n    options: {{members: false, show_root_heading: false, show_root_toc_entry: false}}",
         *(f"::: {where}" for where in public_names(room).values()),
     ]
     if room in BASES:
@@ -108,7 +109,7 @@ def commands_page() -> str:
     """Every command with its options, as `--help` says them."""
     blocks = ["# Commands", "Each command says the same with `--help`."]
 
-    def add(command, name: str) -> None:  # type: ignore[no-untyped-def]
+    def add(command: Any, name: str) -> None:
         if hasattr(command, "commands"):
             for key, one in command.commands.items():
                 add(one, f"{name} {key}")
@@ -117,11 +118,14 @@ def commands_page() -> str:
         for option in command.params:
             if option.hidden or option.name == "help":
                 continue
-            words = option.opts if option.param_type_name == "option" else [option.name.upper()]
-            shown = " ".join(f"`{word}`" for word in words)
-            if option.param_type_name == "option" and not option.is_flag:
-                shown += f" {cell(option.metavar or '')}".rstrip()
-            rows.append(f"| {shown} | {cell(option.help or '')} |")
+            if option.param_type_name == "option":
+                words = [f"`{word}`" for word in (*option.opts, *option.secondary_opts)]
+                words.append("" if option.is_flag else cell(option.metavar or ""))
+            else:
+                words = [f"`{option.metavar or option.name.upper()}`"]
+            if option.required:
+                words.append("(required)")
+            rows.append(f"| {' '.join(filter(None, words))} | {cell(option.help or '')} |")
         blocks.extend([f"## {name}", command.help or "", "\n".join(rows), command.epilog or ""])
 
     add(typer.main.get_command(app), "snrmjax")
@@ -161,7 +165,11 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     pages["reference/effects.md"] = effects_page()
     for path, content in pages.items():
         files.append(File.generated(config, path, content=content))
-    scripts = [KATEX / "katex.min.js", KATEX / "katex.min.css", KATEX / "contrib/auto-render.min.js"]
+    scripts = [
+        KATEX / "katex.min.js",
+        KATEX / "katex.min.css",
+        KATEX / "contrib/auto-render.min.js",
+    ]
     assets = {f"assets/katex/{path.name}": path for path in scripts}
     assets |= {f"assets/katex/fonts/{p.name}": p for p in (KATEX / "fonts").glob("*.woff2")}
     assets |= {f"assets/figures/{p.name}": p for p in (SITE.parent / "figures").glob("*.png")}
