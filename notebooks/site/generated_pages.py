@@ -25,6 +25,9 @@ ROOMS = (
     *("measure", "identify", "simulate", "model", "diagnose", "doctor", "methods"),
     *("condense", "study", "pipelines", "io", "io.calculix", "plot"),
 )
+NO_MORE_THAN_ITS_DOCSTRING = (
+    "{members: false, show_root_heading: false, show_root_toc_entry: false}"
+)
 # What all results share, and what all effects do: bases that no room exports.
 BASES = {
     "identify": ["snrmjax.numerics.result.AbstractResult", "snrmjax.numerics.status.Status"],
@@ -61,7 +64,7 @@ def api_page(room: str) -> str:
     blocks = [
         f"# sj.{room}",
         "With `import snrmjax as sj`.",
-        f"::: snrmjax.{room}\n    options: {{members: false, show_root_heading: false, show_root_toc_entry: false}}",
+        f"::: snrmjax.{room}\n    options: {NO_MORE_THAN_ITS_DOCSTRING}",
         *(f"::: {where}" for where in public_names(room).values()),
     ]
     if room in BASES:
