@@ -1,5 +1,8 @@
-// The tags that pymdownx.arithmatex puts around equations.
 document.addEventListener("DOMContentLoaded", () => {
+  // What the theme leaves out for readers by keyboard and by ear.
+  document.querySelector(".md-search")?.setAttribute("aria-label", "Search");
+  for (const code of document.querySelectorAll("pre > code")) code.tabIndex = 0;
+  // The tags that pymdownx.arithmatex puts around equations.
   for (const element of document.querySelectorAll(".arithmatex")) {
     renderMathInElement(element, {
       delimiters: [
