@@ -18,7 +18,7 @@ def simulate(
         list[float],
         typer.Option(
             help="Peak amplitude of the harmonic force in N, or of the base's acceleration in m/s² "
-            "where the model has [base]; give it again for further ones.",
+            "where the model has a base that moves; give it again for further ones.",
             metavar="N",
             show_default=False,
         ),
