@@ -16,6 +16,7 @@ from snrmjax.cli import main
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.frequency_responses import frequency_responses
 from snrmjax.measure.recordings.time_recording import time_recording
+from snrmjax.pipelines.modes import find_linear_modes
 
 RATIOS = [0.01, 0.008, 0.006]
 STRUCTURE = chain([1.0, 1.2, 0.8], [8e4, 9e4, 1.1e5], RATIOS)
@@ -218,3 +219,25 @@ def test_the_measured_beam_has_the_modes_that_its_source_states(tmp_path):
     mass = 1 / float(found.mode_shape[0, 0] * found.participation[0])
     assert mass == pytest.approx(1.89, rel=0.01)
     assert "depends on the amplitude" in said
+
+
+@pytest.mark.parametrize(
+    ("sources", "option", "said"),
+    [
+        ("responses", {"level": 2}, "`--level` has no effect on modes from frequency responses"),
+        ("decays", {"window": "hann"}, "`--window` has no effect on modes from records"),
+        ("decays", {"base": "absolute"}, "`--base` has no effect on modes from records"),
+        ("responses", {"mass_at": "tip"}, "`--mass-at` belongs to an added mass"),
+        ("responses", {"newtons_per_volt_std": 0.1}, "belongs to a calibration"),
+        ("responses", {"turned": True, "unscaled": True}, "no effect beside `--unscaled`"),
+    ],
+)
+def test_options_that_nothing_obeys_are_refused(sources, option, said):
+    given = {
+        "decays": (),
+        "responses": frequency_responses(
+            np.array([500.0, 510.0]), np.ones((1, 1, 2)) + 0j, [Channel("tip")], [Channel("force")]
+        ),
+    }[sources]
+    with pytest.raises(ValueError, match=said):
+        find_linear_modes(given, **option)

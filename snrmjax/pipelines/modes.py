@@ -31,7 +31,7 @@ from snrmjax.measure.states import SteadyStates, join_steady_states
 from snrmjax.model.base_motion import SensorMotion, base_motion
 from snrmjax.model.structures import Structure, structure
 from snrmjax.numerics.facts import Fact
-from snrmjax.pipelines.options import ModesOptions, checked
+from snrmjax.pipelines.options import ModesOptions, checked, flag_of
 
 ModalFit = LinearModalFit | DecayModes
 ModalSources = FrequencyResponses | SteadyStates | tuple[TimeRecording, ...]
@@ -68,6 +68,7 @@ def find_linear_modes(
     Raises `ValueError` as `find_modes` and `scale_modes` do, and for two ways to scale.
     """
     options = checked(dataclasses.replace(options or ModesOptions(), **settings))
+    _refuse_unused(options, sources)
     low, high = options.from_hz, options.to_hz
     fit: dict[str, Any] = {
         name: getattr(options, name)
@@ -98,6 +99,17 @@ def find_linear_modes(
     return LinearModesFound(name, fitted, scaled, interest, (*notes, *scaled.notes))
 
 
+def _refuse_unused(options: ModesOptions, sources: ModalSources) -> None:
+    """Raise `ValueError` that names an option which has no effect on what the modes come from."""
+    kind = type(sources) if isinstance(sources, FrequencyResponses | SteadyStates) else tuple
+    for field in dataclasses.fields(options):
+        stated = getattr(options, field.name) != field.default
+        if stated and field.name in _UNUSED[kind]:
+            raise ValueError(
+                f"`{flag_of(field)}` has no effect on modes from {_WORDS[kind]}: leave it out."
+            )
+
+
 def read_modal_sources(
     files: Sequence[FilePath],
 ) -> FrequencyResponses | SteadyStates | tuple[TimeRecording, ...]:
@@ -122,6 +134,14 @@ def read_modal_sources(
     return tuple(record for one in found if isinstance(one, tuple) for record in one)
 
 
+_UNUSED: dict[type, tuple[str, ...]] = {
+    FrequencyResponses: ("level",),
+    SteadyStates: ("window",),
+    tuple: (
+        *("level", "reference", "order", "from_hz", "residual_terms", "window"),
+        *("instrument_phase", "base"),
+    ),
+}
 _WORDS = {
     FrequencyResponses: "frequency responses",
     SteadyStates: "steady states",

@@ -349,11 +349,24 @@ class ModesOptions:
     drive_point: str | None = option(
         None, "Sensor at the force (default: by point and axis).", "NAME", panel=_ONE_SCALE
     )
-    turned: bool = option(False, "The drive point's sensor is against the force.", panel=_ONE_SCALE)
+    turned: bool = option(
+        False,
+        "The drive point's sensor is against the force.",
+        panel=_ONE_SCALE,
+        alone=("unscaled",),
+        why_alone="unscaled shapes have no drive point",
+    )
     second_mass: float | None = option(
         None, "Added mass in kg of a second test.", flag="--added-mass", panel=_ONE_SCALE
     )
-    mass_at: str | None = option(None, "Sensor at the added mass.", "NAME", panel=_ONE_SCALE)
+    mass_at: str | None = option(
+        None,
+        "Sensor at the added mass.",
+        "NAME",
+        panel=_ONE_SCALE,
+        needs=("second_mass",),
+        why_needed="belongs to an added mass: add `--added-mass` (kg)",
+    )
     with_mass: tuple[Path, ...] = option(
         (), "Test with the added mass (repeatable).", "FRF", panel=_ONE_SCALE
     )
@@ -377,7 +390,13 @@ class ModesOptions:
     newtons_per_volt: float | None = option(
         None, "Calibration of a drive voltage.", panel=_ONE_SCALE
     )
-    newtons_per_volt_std: float = option(0.0, "Its 1σ.", panel=_ONE_SCALE)
+    newtons_per_volt_std: float = option(
+        0.0,
+        "Its 1σ.",
+        panel=_ONE_SCALE,
+        needs=("newtons_per_volt",),
+        why_needed="belongs to a calibration: add `--newtons-per-volt`",
+    )
     calibration_std: float = option(0.0, "Relative 1σ of response over force.", panel=_ONE_SCALE)
     free: bool = option(False, "Structure free as a rigid body: write that mode.", panel=_ONE_SCALE)
     mass: float | None = option(
