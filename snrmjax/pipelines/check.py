@@ -48,15 +48,18 @@ def check_files(
     return with_imports(check_test(tables, structure, recordings), read)
 
 
-def files_of_test(folder: Path, files: TestFiles) -> FilesRead | None:
-    """What the states of a folder were read from; None where nobody says how, or of both kinds."""
+def files_of_test(folder: Path, files: TestFiles, map_file: Path | None = None) -> FilesRead | None:
+    """What the states of a folder were read from; None where nobody says how, or of both kinds.
+
+    Arguments: `map_file` in place of the folder's map.toml.
+    """
     tables = tuple(state.table for state in files.states if state.table is not None)
     records = [record.file.partition(": ")[0] for record in files.records]
     read = [*(state.file for state in files.states if state.table is None), *records]
     if tables and not read:
         is_base = any(state.states.base is not None for state in files.states)
         return FilesRead(tables, is_base=is_base)
-    told = folder / MAP
+    told = map_file or folder / MAP
     if tables or not told.is_file():
         return None
     return FilesRead(

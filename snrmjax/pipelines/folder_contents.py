@@ -121,11 +121,14 @@ class TestFiles(NamedTuple):
         yield from self.passed
 
 
-def read_test_files(folder: Path, model: Path | None = None, rate: float = 0.0) -> TestFiles:
+def read_test_files(
+    folder: Path, model: Path | None = None, rate: float = 0.0, map_file: Path | None = None
+) -> TestFiles:
     """Read every file of a folder, by its content; folders inside it are left alone.
 
     Arguments: `model` is a file with the linear model, in place of the one in the folder; `rate` in
-    Hz that of all records, where files state it with few digits.
+    Hz that of all records, where files state it with few digits; `map_file` says what columns and
+    channels are, in place of the folder's map.toml.
     Raises `ValueError` for a folder that is missing or holds nothing measured, for a file of
     measurements that cannot be read, for several models, and as `import_files` does for a table
     whose columns neither are understood nor stand in a `map.toml`.
@@ -134,7 +137,8 @@ def read_test_files(folder: Path, model: Path | None = None, rate: float = 0.0) 
         raise ValueError(f"{folder} must be a folder with the files of a test.")
     files = sorted(one for one in folder.iterdir() if one.is_file() and one.name[0] != ".")
     models = [] if model is None else [model]
-    maps = [file for file in files if file.name == MAP]
+    own = [file for file in files if file.name == MAP]
+    maps = own if map_file is None else [map_file]
     told = read_import_map(maps[0]) if maps else ImportMap()
     told = told._replace(rate=rate or told.rate)
     states: list[NamedStates] = []
@@ -145,7 +149,7 @@ def read_test_files(folder: Path, model: Path | None = None, rate: float = 0.0) 
     raw: list[LaboratoryFile] = []
     for path in files:
         suffix = path.suffix.lower()
-        if path in maps:
+        if path in own:
             passed.append((path.name, "how files are imported"))
             texts.append((path.name, _lines(path)))
         elif suffix == ".toml":
@@ -172,7 +176,7 @@ def read_test_files(folder: Path, model: Path | None = None, rate: float = 0.0) 
         paths, file, assumed = [folder / name for name in names], held.name, Assumptions()
         stepped = held.recordings and told.base and told.record not in STAYS_RECORD
         if held.tables or stepped or (held.responses and (told.force_amplitude or told.base)):
-            found = _imported(paths, told)
+            found = _imported(paths, told, folder)
             assumed.update(found.assumed)
             if found.states is not None:
                 states.append(NamedStates(file, found.states))
@@ -276,22 +280,25 @@ def _is_model(path: Path) -> bool:
         return True
 
 
-def _imported(paths: Sequence[Path], told: ImportMap) -> Imported:
+def _imported(paths: Sequence[Path], told: ImportMap, folder: Path) -> Imported:
     try:
         return import_files(paths, told)
     except ValueError as error:
-        raise ValueError(
-            f"{_asked(paths)} Put the {MAP} that it writes into {paths[0].parent.name} (without "
-            f"one: {error})"
-        ) from error
+        raise ValueError(f"{_asked(paths, folder)} (Without a map: {error})") from error
 
 
-def _asked(paths: Sequence[Path]) -> str:
-    """The question what columns are, with the import that answers it."""
+def _asked(paths: Sequence[Path], folder: Path) -> str:
+    """The question what columns are, with the commands that answer it."""
     held = [read_laboratory_file(path) for path in paths]
     command = next(line for line in proposed_commands(paths, held) if line.startswith("  snrmjax"))
     names = ", ".join(path.name for path in paths)
-    return f"what are the columns of {names}? `{command.strip()}` says so, if its names are right."
+    base = (
+        " --base absolute` (or relative: what the sensors record)" if " --base " in command else "`"
+    )
+    return (
+        f"what are the columns of {names}? `{command.strip()}` says so, if its names are right; "
+        f"then `snrmjax test {folder} --map imported/{MAP}{base} reads all files of the folder so."
+    )
 
 
 def _linear(held: LaboratoryFile, path: Path) -> tuple[FrequencyResponses, ...]:

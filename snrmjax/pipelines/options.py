@@ -265,6 +265,14 @@ class WholeTestOptions:
     drive_point: str | None = option(
         None, "Sensor at the force, by which mode shapes are scaled.", "NAME"
     )
+    map_file: Path | None = option(
+        None,
+        "Map of an import (map.toml) that says what columns and channels are, in place of the "
+        "folder's.",
+        "TOML",
+        flag="--map",
+        panel=FILES,
+    )
     rate: float | None = option(
         None,
         "Sampling rate of the records in Hz, where files state it with few digits.",

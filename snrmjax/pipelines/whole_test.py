@@ -96,8 +96,8 @@ def run_whole_test(
     options = checked(dataclasses.replace(options or WholeTestOptions(), **settings))
     folder = Path(folder)
     stage, name = _Stages(progress), folder.resolve().name
-    files = read_test_files(folder, options.model, options.rate or 0.0)
-    read = files_of_test(folder, files)
+    files = read_test_files(folder, options.model, options.rate or 0.0, options.map_file)
+    read = files_of_test(folder, files, options.map_file)
     stage.ends("files")
     model, modes = files.model, None
     if model is not None and options.base is not None:

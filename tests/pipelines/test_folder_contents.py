@@ -72,7 +72,7 @@ def test_a_map_beside_a_table_of_other_names_is_used(tmp_path):
     (tmp_path / "log.csv").write_text(
         "Freq [Hz],Load [N],V [mm/s],Phase [deg]\n49,1,111.8,26.565\n50,1,150,0\n51,1,100,-30\n"
     )
-    with pytest.raises(ValueError, match=r"snrmjax import .*log\.csv"):
+    with pytest.raises(ValueError, match=r"snrmjax import .*log\.csv.*--map imported/map\.toml"):
         read_test_files(tmp_path)
     (tmp_path / "map.toml").write_text(
         'force = "Load"\nfrequency = "Freq"\namplitude = "peak"\nphase_unit = "deg"\n'
@@ -160,3 +160,17 @@ def test_a_rate_of_few_digits_is_asked_for(tmp_path):
     (tmp_path / "map.toml").write_text("rate = 2050.0\n")
     (one,) = read_test_files(tmp_path).records
     assert one.record.sampling_rate == 2050.0
+
+
+def test_a_map_elsewhere_takes_the_place_of_the_folders(tmp_path):
+    folder = tmp_path / "test"
+    folder.mkdir()
+    (folder / "log.csv").write_text(
+        "Freq [Hz],Load,V [mm/s],Phase [deg]\n49,1,111.8,26.565\n50,1,150,0\n51,1,100,-30\n"
+    )
+    (folder / "map.toml").write_text('force = "Nothing"\n')
+    (tmp_path / "told.toml").write_text(
+        'force = "Load"\nforce_unit = "mN"\nfrequency = "Freq"\n[[response]]\nchannel = "V"\n'
+    )
+    (found,) = read_test_files(folder, map_file=tmp_path / "told.toml").states
+    np.testing.assert_allclose(found.states.force, 1e-3)
