@@ -43,12 +43,10 @@ def refuse_unused(
         raise ValueError(f"--{key.replace('_', '-')} has no effect {why}: leave it out.")
 
     for key in stated:
-        if key not in _OBEYED[content] and not (key == "response" and content == "own table"):
+        if key not in _OBEYED[content]:
             refuse(key, f"on {_WHAT[content]}, as {file} holds")
         if key in _TEXT and not {"csv"}.intersection(kinds):
             refuse(key, f"on {file}, which states itself how it is written")
-    if "dataset" in stated and content == "own table":
-        return
     for first, second in (
         ("base", "force"),
         ("base", "force_unit"),
@@ -61,11 +59,8 @@ def refuse_unused(
         refuse("force_phase", "without the column of a force or a base")
     if "force_phase" in stated and mapping.over_force:
         refuse("force_phase", "beside --over-force: phases are then relative to the force")
-    if (
-        "force_unit" in stated
-        and not (mapping.force or mapping.force_amplitude)
-        and (content != "own table")
-    ):
+    has_force = content == "own table" or mapping.force or mapping.force_amplitude
+    if "force_unit" in stated and not has_force:
         refuse("force_unit", "without --force or --force-amplitude")
     if content == "records" and mapping.record in STAYS_RECORD:
         for key in ("level", "drive"):

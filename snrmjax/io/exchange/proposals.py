@@ -26,7 +26,6 @@ _TRIED = 2**21  # samples of a record that is read to see whether it is of steps
 _RADIANS = 1.01 * np.pi  # which phases in radians do not exceed
 _A_TURN = 1.0  # rad that phases of a resonance cover at least
 
-
 _Content = TimeRecording | NumberTable | FrequencyResponses
 
 
@@ -41,7 +40,9 @@ class _Options(dict[str, Any]):
         """As they are written on a command line."""
         for key, value in self.items():
             for word in value if isinstance(value, list) else [value]:
-                yield f"--{key.replace('_', '-')}" + ("" if word is True else f" {_quoted(word)}")
+                yield f"--{key.replace('_', '-')}" + (
+                    "" if word is True else f" {shlex.quote(word)}"
+                )
 
     def mapping(self) -> ImportMap:
         """As the map of an import."""
@@ -54,7 +55,7 @@ def proposed_commands(paths: Sequence[Path], files: Sequence[LaboratoryFile]) ->
     Capitals are to be filled in: what neither the files nor the names of their columns say. A
     command without them was tried on the files.
     """
-    named = " ".join(_quoted(str(path)) for path in paths)
+    named = " ".join(shlex.quote(str(path)) for path in paths)
     held = joined_files(files)[0]
     if held.tables and is_ours(held.tables[0].columns):
         return [f"it has our own columns: `snrmjax check`, `identify` and `test` take {held.name}."]
@@ -98,11 +99,7 @@ def _take_amplitudes_of_names(found: _Options, files: Sequence[LaboratoryFile]) 
         found["force_amplitude"] = [BY_NAME]
 
 
-def _question(
-    paths: Sequence[Path],
-    content: _Content,
-    found: _Options,
-) -> str:
+def _question(paths: Sequence[Path], content: _Content, found: _Options) -> str:
     """What an import with these options would ask; of a long record only channels are tried."""
     try:
         mapping = found.mapping()
@@ -132,16 +129,15 @@ class _Motion(NamedTuple):
     is_stated: bool  # quantity and unit are the file's
 
     @property
-    def word(self) -> str:
-        """As NAME, or NAME:QUANTITY:UNIT where the file does not say what it is."""
-        known = self.quantity if self.quantity in DERIVATIVE else "QUANTITY"
-        return self.name if self.is_stated else f"{self.name}:{known}:UNIT"
-
-    @property
     def base_word(self) -> str:
         """As `--base` wants it, with the quantity always."""
         known = self.quantity if self.quantity in DERIVATIVE else "QUANTITY"
         return f"{self.name}:{known}" + ("" if self.is_stated else ":UNIT")
+
+    @property
+    def word(self) -> str:
+        """As NAME, or NAME:QUANTITY:UNIT where the file does not say what it is."""
+        return self.name if self.is_stated else self.base_word
 
 
 def _motion_of(name: str, unit: str, role: str) -> _Motion:
@@ -234,9 +230,8 @@ def _of_record(record: TimeRecording) -> _Options:
         if one not in loads[:1]
     ]
     if not loads:
-        called = [one for one in record.channels if _role(one) == "force"]
-        loads = called
-        named = [one for one in named if one.name not in {each.name for each in called}]
+        loads = [one for one in record.channels if _role(one) == "force"]
+        named = [one for one in named if one.name not in {each.name for each in loads}]
     moved = [] if loads else [one for one in named if is_of_base(one.name)][:1]
     responses = [one for one in named if one not in moved and one.is_stated] or [
         one for one in named if one not in moved
@@ -297,16 +292,12 @@ def _modes(named: str, sets: object) -> list[str]:
         if one.name == reference.name
         or (one.point and (one.point, one.direction) == (reference.point, reference.direction))
     ]
-    scale = f"--drive-point {_quoted(at_force[0].name)}" if at_force else "--drive-point SENSOR"
+    scale = f"--drive-point {shlex.quote(at_force[0].name)}" if at_force else "--drive-point SENSOR"
     scale = "--base absolute --unscaled" if of_base else scale
-    which = f" --reference {_quoted(reference.name)}" if len(sets.references) > 1 else ""
+    which = f" --reference {shlex.quote(reference.name)}" if len(sets.references) > 1 else ""
     return [
         "or, of an impact or broadband test, linear modes"
         + ("" if at_force or of_base else " (SENSOR is the one at the force)")
         + ":",
         f"  snrmjax modes {named}{which} {scale} --out model.toml",
     ]
-
-
-def _quoted(word: str) -> str:
-    return shlex.quote(word)

@@ -12,9 +12,7 @@ from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.time_recording import AbstractSamples, TimeRecording
 from snrmjax.numerics.facts import Fact
 
-_WHOLE = (
-    1e-2  # of a sample, within which a shift is one of whole samples: 3.6° at the sampling rate
-)
+_WHOLE = 1e-2  # of a sample, within which a shift is one of whole samples
 _ALIKE = 1e-12  # relative, of two steps in the properties of one device
 
 
@@ -93,25 +91,21 @@ def note_on_shift(shared: SharedAxis) -> tuple[Fact, ...]:
 
 
 class _JoinedSamples(AbstractSamples):
-    """Channels of several records of one length."""
+    """The channels of records of one channel each, all of one length."""
 
     def __init__(self, records: Sequence[TimeRecording]) -> None:
-        self._places = [
-            (record.samples, k) for record in records for k in range(len(record.channels))
-        ]
-        self._samples = records[0].n_samples
+        self._records = [record.samples for record in records]
 
     @property
     def shape(self) -> tuple[int, int]:
         """Channels and samples."""
-        return len(self._places), self._samples
+        return len(self._records), self._records[0].shape[1]
 
     def read(
         self, channels: Sequence[int], start: int, stop: int
     ) -> Num[np.ndarray, "channel sample"]:
         """A stretch of some channels."""
-        rows = [self._places[k] for k in channels]
-        return np.stack([samples.read([row], start, stop)[0] for samples, row in rows])
+        return np.concatenate([self._records[k].read([0], start, stop) for k in channels])
 
 
 def joined_structs(records: Sequence[TimeRecording]) -> list[TimeRecording]:
