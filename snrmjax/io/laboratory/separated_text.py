@@ -350,6 +350,9 @@ def _columns(
             continue
         values = pandas.to_numeric(column, errors="coerce").to_numpy(dtype=float)
         words = np.flatnonzero(np.isnan(values) & column.notna().to_numpy())
+        if not words.size:  # integers that are too long for pandas
+            columns[name] = values
+            continue
         if 2 * words.size < values.size:
             row, word = rows[int(words[0])][0], str(column.iloc[int(words[0])])
             raise ValueError(

@@ -200,3 +200,9 @@ def test_channels_in_several_files_are_one_record(tmp_path):
     code, said = run_import(files[0], *words[:3], "Ref1 Force:velocity:m/s", "--out", tmp_path)
     assert code == 2
     assert "as the response and as what drives the structure" in said
+
+
+def test_a_number_of_very_many_digits_is_a_number(tmp_path):
+    rows = "\n".join(f"{k},{10**25 + k}" for k in range(5))
+    (table,) = read(tmp_path, f"f [Hz],v [m/s]\n{rows}\n", "a.csv").tables
+    assert table.columns["v"].tolist() == [1e25] * 5
