@@ -59,34 +59,42 @@ def off_left_out(model, key, n_sensors):
 
 
 def true_mode(key, sensor, speeds):
-    """Natural frequency and damping ratio of the true nonlinear mode at velocities of a sensor.
+    """Natural frequency and damping ratio of the true damped mode at velocities of a sensor.
 
-    By a harmonic balance of its own, of five harmonics without damping; the damping ratio is what
-    both modes dissipate in that motion.
+    By a harmonic balance of its own, of five harmonics: the periodic motion that a damping force
+    of the opposite sign, -2 d v per unit of mass in all modes, keeps going at the frequency Ω; its
+    damping ratio is d/Ω. The mode without damping is no truth here: beside an internal resonance
+    it gives the second mode far more than any damped structure does.
     """
     omega, zeta, shape = (np.array(key[name]) for name in ("omega", "zeta", "shape"))
     order, tau = np.arange(6), 2 * np.pi * np.arange(64) / 64
-    cosines = np.cos(np.outer(tau, order))
+    waves = np.exp(1j * np.outer(order, tau))
 
     def left(unknown, speed, size):
-        q, frequency = unknown[:-1].reshape(2, -1) * size, unknown[-1] * omega[0]
-        inside = np.stack(gradient(q @ cosines.T, key["terms"])) @ cosines / 32
+        real, imaginary = unknown[:12].reshape(2, 6), unknown[12:22].reshape(2, 5)
+        q = size * (real + 1j * np.pad(imaginary, ((0, 0), (1, 0))))
+        frequency, growth = unknown[22:] * omega[0]
+        inside = np.stack(gradient((q @ waves).real, key["terms"])) @ waves.conj().T / 32
         inside[:, 0] /= 2
-        balance = (omega[:, None] ** 2 - (order * frequency) ** 2) * q + inside
-        seen = frequency * (shape[sensor] @ q[:, 1]) * np.sign(shape[sensor, 0])
-        return np.append(balance.reshape(-1) / (omega[0] ** 2 * size), seen / speed - 1)
+        spin = 1j * order * frequency
+        linear = omega[:, None] ** 2 + spin**2 + 2 * (zeta * omega - growth)[:, None] * spin
+        balance = (linear * q + inside) / (omega[0] ** 2 * size)
+        seen = abs(frequency * (shape[sensor] @ q[:, 1]))
+        conditions = seen / speed - 1, q[0, 1].imag / size
+        return np.concatenate(
+            [balance.real.ravel(), balance.imag[:, 1:].ravel(), np.array(conditions)]
+        )
 
-    found, unknown = [], np.zeros(13)
-    unknown[[1, -1]] = 1.0
+    found, unknown = [], np.zeros(24)
+    unknown[[1, 22, 23]] = 1.0, 1.0, zeta[0]
     for speed in speeds:
         size = speed / (omega[0] * abs(shape[sensor, 0]))
         new, _, good, _ = fsolve(left, unknown, (speed, size), full_output=True, xtol=1e-11)
         if good != 1:
             found.append((np.nan, np.nan))
             continue
-        unknown, frequency = new, new[-1] * omega[0]
-        energy = np.sum((order * frequency * new[:-1].reshape(2, -1)) ** 2, axis=1)
-        found.append((frequency, np.sum(zeta * omega * energy) / np.sum(energy) / frequency))
+        unknown = new
+        found.append((new[22] * omega[0], new[23] / new[22]))
     return np.array(found).T
 
 
