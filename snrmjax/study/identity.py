@@ -11,11 +11,12 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from snrmjax import __version__
 from snrmjax.condense.beam_models import BeamModels
 from snrmjax.study.study import Study
 
 _LONGEST = 64  # numbers of an array that are written out; longer ones are known by their hash
-_PACKAGES = ("snrmjax", "jax", "jaxlib", "numpy")
+_PACKAGES = ("jax", "jaxlib", "numpy")
 
 
 def description(study: Study) -> dict[str, Any]:
@@ -29,7 +30,10 @@ def description(study: Study) -> dict[str, Any]:
     }
     return {
         "study": {**parts, "members_a_chunk": study.chunk_size},
-        "versions": {name: importlib.metadata.version(name) for name in _PACKAGES},
+        "versions": {
+            "snrmjax": __version__,
+            **{name: importlib.metadata.version(name) for name in _PACKAGES},
+        },
     }
 
 

@@ -1,13 +1,13 @@
 """The report of a diagnosis: verdict, effects and their laws, evidence, resonances."""
 
 from collections.abc import Mapping, Sequence
-from importlib.metadata import version
 from pathlib import Path
 
 import jax
 import numpy as np
 from matplotlib.figure import Figure
 
+from snrmjax import __version__
 from snrmjax.diagnose.decide import Verdict
 from snrmjax.diagnose.diagnosis_result import Diagnosis
 from snrmjax.diagnose.evidence import NOISE_REJECTED, NONE, UNKNOWN
@@ -202,7 +202,7 @@ def diagnosis_report(
     shown = {name: ReportFigure(figure, captions[name]) for name, figure in figures.items()}
     return Report(
         title=title,
-        done=[*(done or {}).items(), ("program", f"snrmjax {version('snrmjax')}")],
+        done=[*(done or {}).items(), ("program", f"snrmjax {__version__}")],
         result=diagnosis.verdict_sentence,
         summary=_key_numbers(diagnosis, predicted),
         notes=[*map(str, diagnosis.notes)],

@@ -1,12 +1,12 @@
 """The report of an identification: its numbers, notes and figures in words."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from importlib.metadata import version
 from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
 
+from snrmjax import __version__
 from snrmjax.identify.inference.identification import Identification
 from snrmjax.identify.joint.joint_fit import NoiseEstimate
 from snrmjax.identify.pointwise.backbone import Backbone
@@ -147,7 +147,7 @@ def identification_report(
         sections.append(Section("Predicted responses", further_levels, shown, [table]))
     return Report(
         title=title,
-        done=[*(done or {}).items(), ("program", f"snrmjax {version('snrmjax')}")],
+        done=[*(done or {}).items(), ("program", f"snrmjax {__version__}")],
         result=identification_sentence(identification, modes),
         summary=identification_summary(identification, modes, words),
         notes=list(dict.fromkeys(map(str, [*notes, *identification.notes]))),

@@ -1,12 +1,12 @@
 """An identification in full: its figures, its page, and the files that are written of it."""
 
 from collections.abc import Mapping
-from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
 
+from snrmjax import __version__
 from snrmjax.identify.prediction.notes import where_in_words
 from snrmjax.io import joint_results, results
 from snrmjax.io.files import write_summary
@@ -204,7 +204,7 @@ def write(
         stds = [b.velocity_std for prediction in found.predictions for b in prediction.banded]
         given = (folder / "prediction.csv", found.responses)
         results.write_prediction(*given, drives=drives, velocity_stds=stds, force_unit=unit)
-    summary: dict[str, object] = {"program": "snrmjax", "version": version("snrmjax"), **done}
+    summary: dict[str, object] = {"program": "snrmjax", "version": __version__, **done}
     if found.coupled is not None:
         summary["coupled_modes"] = coupled_page.write(folder, found.coupled)
     if found.joint is None:

@@ -1,9 +1,9 @@
 """The page of a whole test: files, check, all states to look at, and what each stage found."""
 
-from importlib.metadata import version
 from pathlib import Path
 from typing import NamedTuple
 
+from snrmjax import __version__
 from snrmjax.doctor.findings import Checkup
 from snrmjax.io.laboratory.checkups import write_checkup
 from snrmjax.io.tables import write_steady_states
@@ -103,7 +103,7 @@ def _report(found: WholeTest, stages: list[_Stage], result: str) -> Report:
             notes.setdefault(note, f"{name}: ")
     return Report(
         title=f"Test: {found.name}",
-        done=[("program", f"snrmjax {version('snrmjax')}")],
+        done=[("program", f"snrmjax {__version__}")],
         result=result,
         summary=list(dict.fromkeys(rows)),
         notes=[f"{stage}{note}" for note, stage in notes.items()],
