@@ -18,9 +18,6 @@ from typing import Any
 
 import validation_results as of
 import validation_tables as tables
-from mkdocs.config.defaults import MkDocsConfig
-from mkdocs.exceptions import PluginError
-from mkdocs.structure.files import File, Files
 from validation_figures import FIGURES, drawn
 from validation_tables import number, per_cent
 
@@ -101,6 +98,10 @@ def _of_paper() -> dict[str, str]:
             f"{beam} error": per_cent(ours["median"]),
             f"{beam} error as printed": per_cent(as_printed["median"]),
         }
+    (rest,) = (r for r in of.results("paper_figures") if "from_rest" in r)
+    found["rest force"] = f"{number(1e3 * rest['from_rest'], 4)} mN"
+    found["rest frequency"] = f"{number(rest['frequency_hz'])} Hz"
+    found["rest first"], found["rest second"] = (f"{number(v, 2)} m/s" for v in rest["velocity"])
     return found
 
 
@@ -158,6 +159,7 @@ def _of_coverage() -> dict[str, str]:
         "count": str(len(ours)),
         "as stated": str(sum(c.says == "as stated" for c in ours)),
         "narrow": str(sum(c.says == "too narrow" for c in ours)),
+        "by chance": number(0.05 * len(ours), 2),
     }
 
 
@@ -184,7 +186,7 @@ def filled(markdown: str) -> str:
     """A page with all that it names in double braces."""
     unknown = [name for name in NAMED.findall(markdown) if name not in put_in()]
     if unknown:
-        raise PluginError(f"No result is called {', '.join(unknown)}.")
+        raise ValueError(f"No result is called {', '.join(unknown)}.")
     return NAMED.sub(lambda found: put_in()[found[1]], markdown)
 
 
@@ -197,8 +199,10 @@ def figures() -> dict[str, str]:
     }
 
 
-def on_files(files: Files, config: MkDocsConfig) -> Files:
+def on_files(files: Any, config: Any) -> Any:
     """Add the figures."""
+    from mkdocs.structure.files import File  # the command does without MkDocs
+
     for name, content in figures().items():
         files.append(File.generated(config, f"assets/validation/{name}", content=content))
     return files

@@ -66,7 +66,7 @@ def identified(beam: str) -> Callable[[Pen], Figure]:
     """Figures 7 and 10: states, points on the backbone and their damping."""
 
     def draw(pen: Pen) -> Figure:
-        figure, ((a, b, c),) = _panels(1, 3, 3.3)
+        figure, ((a, b, c),) = _panels(1, 3, 3.5)
         states, points = _curve(beam, "states"), _curve(beam, "points")
         mode = _curve(beam, "mode")
         dot = {"color": BLUE, "linestyle": "none", "marker": "o", "markersize": 3}
@@ -121,6 +121,9 @@ def responses(beam: str) -> Callable[[Pen], Figure]:
                     right.plot(hertz, phase, **style)
             peak = of.only("paper_figures", beam=beam, resonance=force)
             left.plot(peak["frequency_hz"][0], peak["velocity"][0], "*", color=BLUE, markersize=9)
+            for rest in of.chosen("paper_figures", beam=beam, from_rest=force):
+                hollow = {"marker": "o", "markersize": 6, "color": pen.ink, "fillstyle": "none"}
+                left.plot(rest["frequency_hz"], rest["velocity"][0], **hollow)
             left.set_title(f"{1e3 * force:.4g} mN")
             left.set_ylim(0, 1.15 * np.max(exact["velocity"]))
             left.set_ylabel("Velocity (m/s)")
@@ -223,10 +226,11 @@ def reliability(pen: Pen) -> Figure:
             middle = (one.low + one.high) / 2
             axes.plot([one.low, one.high], [share, share], color=colour, linewidth=3)
             axes.plot([middle, middle], [low, high], color=colour, linewidth=1)
-            up = share < 0.25
-            place = (middle, high + 0.03) if up else (middle, low - 0.03)
-            va = "bottom" if up else "top"
-            axes.annotate(str(one.answers), place, ha="center", va=va, fontsize=8, color=pen.ink)
+            x, y, side = middle, (high + 0.03 if share < 0.25 else low - 0.03), "center"
+            if not 0.1 < y < 0.9:  # beside the line where its end is at the edge
+                x, y, side = middle + 0.03, np.clip(y, 0.1, 0.9), "left"
+            va = "bottom" if share < 0.25 else "top"
+            axes.annotate(str(one.answers), (x, y), ha=side, va=va, fontsize=8, color=pen.ink)
         axes.set_title(name.replace(", ", ",\n").replace(" (", "\n("), fontsize=9.5)
         axes.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02), xticks=[0, 0.5, 1], yticks=[0, 0.5, 1])
     for axes in grid.flat[len(sets) :]:

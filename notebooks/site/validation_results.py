@@ -135,7 +135,7 @@ def coverages() -> list[Coverage]:
         ("frequency", "natural frequency", BAND),
         ("damping", "damping", BAND),
         ("next", "resonance of a level not measured, frequency", 1.0),
-        ("next speed", "the same, velocity", 1.0),
+        ("next speed", "resonance of a level not measured, velocity", 1.0),
     ):
         add(title, about, _inside(fits, key, most))
     tests = [r for r in results("low_level_tests") if "seed" in r]
@@ -300,11 +300,11 @@ def wrongly_named(row: Row) -> bool:
 PROGRAMS = {"pyharm": "pyHarm-os", "nlvib": "NLvib-py", "tmdsimpy": "tmdsimpy"}
 PROGRAMS |= {"jaxcont": "jaxcont", "numpy_scipy": "NumPy/SciPy", "no_stability": "snrmjax, bare"}
 PROBLEMS = {
-    "pair": "Pair of Volvert and Kerschen",
-    "two masses": "Two masses, cubic springs",
-    "beam with a slider": "Cantilever, Jenkins element",
-    "flat": "Flat beam, four modes",
-    "curved": "Curved beam, one mode",
+    "pair": "Pair",
+    "two masses": "Two masses",
+    "beam with a slider": "Beam with a slider",
+    "flat": "Flat beam",
+    "curved": "Curved beam",
 }
 
 

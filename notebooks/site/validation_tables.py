@@ -6,16 +6,19 @@ from itertools import groupby
 
 import numpy as np
 import validation_results as of
-from mkdocs.exceptions import PluginError
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """A number as it is read: 0.0123, 1.2·10⁻⁶."""
+    """A number as it is read: 0.0123, 1.2·10⁻⁶, and counts as they are."""
     if value is None:
         return "–"
+    if isinstance(value, int):
+        return str(value)
     text = f"{value:.{digits}g}"
+    if "e+" in text:
+        text = f"{float(text):.0f}"
     if "e" in text:
         mantissa, power = text.split("e")
         text = f"{mantissa}·10{str(int(power)).translate(_RAISED)}"
@@ -31,7 +34,7 @@ def table(head: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
     """A table; its first column is text, the others are on the right."""
     head, rows = list(head), [[str(c).replace("|", "\\|") for c in row] for row in rows]
     if not rows:
-        raise PluginError(f"A table of validation is empty: {', '.join(head)}.")
+        raise ValueError(f"A table of validation is empty: {', '.join(head)}.")
     lines = [head, ["---", *["--:"] * (len(head) - 1)], *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
@@ -144,8 +147,8 @@ def faster() -> str:
             bare, full = r[f"{key}_over_no_stability"], r[f"{key}_over_snrmjax"]
             if full < 1:
                 found.append(
-                    f"{of.PROBLEMS[r['beam']]}: {of.PROGRAMS[key]} takes {number(full, 2)} of our "
-                    f"time with stability, {number(bare, 2)} of it without"
+                    f"{of.PROBLEMS[r['beam']]}: {of.PROGRAMS[key]} takes {full:.2f} of our "
+                    f"time with stability, {bare:.2f} of it without"
                 )
     for r in of.chosen("simulator_speed", measurement="batch_of_forces"):
         ours, theirs = r["batch_seconds_a_curve"], r["jaxcont_one_by_one_seconds_a_curve"]
