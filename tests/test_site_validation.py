@@ -1,4 +1,4 @@
-"""The site's pages on validation: nothing typed in, no empty table, numbers that are found again."""
+"""The site's pages on validation: nothing typed in, no empty table, numbers found again."""
 
 import importlib
 import re

@@ -16,6 +16,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import validation_results as of
 import validation_tables as tables
 from validation_figures import FIGURES, drawn
@@ -70,8 +71,7 @@ def _of_programs() -> dict[str, str]:
     events = of.chosen("simulator_accuracy", measurement="events")
     kinds = ("fold", "peak", "phase_resonance")
     stability = of.chosen("simulator_accuracy", measurement="stability")
-    closure = of.chosen("simulator_accuracy", measurement="closure", harmonics=9)
-    worst = max(closure, key=lambda r: r["largest"])
+    worst = tables.worst_closure()
     rom = of.only("rom_load_scale", structure="flat_clamped")
     return {
         "unanswered": tables.unanswered(),
@@ -130,6 +130,7 @@ def _of_blind() -> dict[str, str]:
     bars, latest, kinds = of.bars(), of.latest_half(), [tables.kind(r) for r in of.diagnosed()]
     sure = [r for r in of.diagnosed() if r["probability"] >= of.SURE and r["verdict"] != "drawn"]
     wrong = [r for r in sure if not of.named_rightly(r)]
+    refused = [r for r in wrong if tables.kind(r) == "unknown"]
     return {
         "half": of.latest()["record"],
         "with a bar": str(sum(b.met is not None for b in bars)),
@@ -141,7 +142,8 @@ def _of_blind() -> dict[str, str]:
         "regime wrong": str(kinds.count("wrong")),
         "sure": str(len(sure)),
         "sure wrong": str(len(wrong)),
-        "sure refused": str(sum(tables.kind(r) == "unknown" for r in wrong)),
+        "sure refused": str(len(refused)),
+        "sure shift": number(float(np.median([r["share"] for r in refused])), 2),
         "coupled": f"{coupled['right']} of {coupled['sets']}",
         "coupled responses": f"{coupled['within_1_percent']} of {coupled['responses']}",
         "coupled coefficients": f"{coupled['inside']} of {coupled['coefficients']}",

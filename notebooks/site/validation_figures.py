@@ -2,6 +2,7 @@
 
 import io
 from collections.abc import Callable
+from itertools import groupby
 from typing import Any
 
 import matplotlib as mpl
@@ -12,7 +13,9 @@ from matplotlib.figure import Figure
 
 from snrmjax.report.style import SERIES
 
-ORANGE, BLUE, GREEN, PINK, AMBER, SKY = SERIES
+_, _, GREEN, PINK, AMBER, SKY = SERIES
+ORANGE = {"light": SERIES[0], "dark": "#f0803c"}
+BLUE = {"light": SERIES[1], "dark": "#4ba3e3"}
 INK = {"light": "#1a1a1a", "dark": "#e4e4e4"}
 FAINT = {"light": "#9a9a9a", "dark": "#8a8a8a"}
 GRID = {"light": "#e3e3e3", "dark": "#3d3f4a"}
@@ -31,7 +34,7 @@ def drawn(draw: Callable[["Pen"], Figure], mode: str) -> str:
         **{"figure.constrained_layout.use": True, "lines.linewidth": 1.3, "grid.linewidth": 0.7},
     }
     with mpl.rc_context(settings):
-        figure = draw(Pen(ink, FAINT[mode]))
+        figure = draw(Pen(ink, FAINT[mode], ORANGE[mode], BLUE[mode]))
         text = io.StringIO()
         figure.savefig(text, format="svg", metadata={"Date": None})
     return text.getvalue()
@@ -40,8 +43,8 @@ def drawn(draw: Callable[["Pen"], Figure], mode: str) -> str:
 class Pen:
     """The colours that differ between a light and a dark page."""
 
-    def __init__(self, ink: str, faint: str) -> None:
-        self.ink, self.faint = ink, faint
+    def __init__(self, ink: str, faint: str, orange: str, blue: str) -> None:
+        self.ink, self.faint, self.orange, self.blue = ink, faint, orange, blue
 
 
 def _panels(rows: int, columns: int, height: float, **kwargs: Any) -> tuple[Figure, np.ndarray]:
@@ -69,8 +72,8 @@ def identified(beam: str) -> Callable[[Pen], Figure]:
         figure, ((a, b, c),) = _panels(1, 3, 3.5)
         states, points = _curve(beam, "states"), _curve(beam, "points")
         mode = _curve(beam, "mode")
-        dot = {"color": BLUE, "linestyle": "none", "marker": "o", "markersize": 3}
-        star = {"color": ORANGE, "linestyle": "none", "marker": "*", "markersize": 5}
+        dot = {"color": pen.blue, "linestyle": "none", "marker": "o", "markersize": 3}
+        star = {"color": pen.orange, "linestyle": "none", "marker": "*", "markersize": 5}
         a.plot(mode["frequency_hz"], mode["velocity"], "--", color=pen.ink, label="true mode")
         a.plot(states["frequency_hz"], states["velocity"], **dot, label="recorded state")
         a.plot(points["natural_frequency_hz"], points["velocity"], **star, label="identified")
@@ -115,12 +118,14 @@ def responses(beam: str) -> Callable[[Pen], Figure]:
                 for kept, line, name in ((stable, "-", "predicted"), (~stable, ":", "unstable")):
                     # With the neighbours, so that no gap is where a branch turns unstable.
                     near = kept | np.roll(kept, 1) & (np.arange(len(kept)) > 0)
-                    style = {"color": ORANGE, "linestyle": line, "label": None if k else name}
+                    style = {"color": pen.orange, "linestyle": line, "label": None if k else name}
                     left.plot(hertz, np.where(near, row["velocity"], np.nan), **style)
                     phase = np.where(near, np.asarray(row["phase_deg"]) - 90, np.nan)
                     right.plot(hertz, phase, **style)
             peak = of.only("paper_figures", beam=beam, resonance=force)
-            left.plot(peak["frequency_hz"][0], peak["velocity"][0], "*", color=BLUE, markersize=9)
+            left.plot(
+                peak["frequency_hz"][0], peak["velocity"][0], "*", color=pen.blue, markersize=9
+            )
             for rest in of.chosen("paper_figures", beam=beam, from_rest=force):
                 hollow = {"marker": "o", "markersize": 6, "color": pen.ink, "fillstyle": "none"}
                 left.plot(rest["frequency_hz"], rest["velocity"][0], **hollow)
@@ -147,10 +152,12 @@ def curved_beam(pen: Pen) -> Figure:
     length, thickness, radius = (paper[k] for k in ("length_mm", "thickness_mm", "radius_m"))
     x = np.linspace(-length / 2, length / 2, 101)
     y = np.sqrt((1e3 * radius) ** 2 - x**2) - np.sqrt((1e3 * radius) ** 2 - (length / 2) ** 2)
-    axes.fill_between(x, y - thickness / 2, y + thickness / 2, color=BLUE, alpha=0.5, linewidth=0)
+    axes.fill_between(
+        x, y - thickness / 2, y + thickness / 2, color=pen.blue, alpha=0.5, linewidth=0
+    )
     axes.plot(x, np.zeros_like(x), ":", color=pen.faint)
     for place in np.linspace(-length / 2, length / 2, 13)[1:-1]:
-        arrow = {"arrowstyle": "->", "color": ORANGE}
+        arrow = {"arrowstyle": "->", "color": pen.orange}
         axes.annotate("", (place, np.interp(place, x, y) + 0.35), (place, 2.1), arrowprops=arrow)
     for end in (-1, 1):
         axes.plot([end * length / 2] * 2, [-0.7, 0.7], color=pen.ink, linewidth=4)
@@ -166,9 +173,9 @@ def programs(pen: Pen) -> Figure:
     figure, ((axes,),) = _panels(1, 1, 3.6)
     problems = of.speeds()
     look = {
-        "snrmjax": (ORANGE, "o"),
-        "snrmjax, bare": (ORANGE, "|"),
-        "pyHarm-os": (BLUE, "s"),
+        "snrmjax": (pen.orange, "o"),
+        "snrmjax, bare": (pen.orange, "|"),
+        "pyHarm-os": (pen.blue, "s"),
         "NLvib-py": (GREEN, "D"),
         "tmdsimpy": (PINK, "^"),
         "jaxcont": (AMBER, "v"),
@@ -203,9 +210,9 @@ def measured(pen: Pen) -> Figure:
             (right, "damping_per_cent", "damping_std_per_cent"),
         ):
             middle, error = np.asarray(row[value]), of.BAND * np.asarray(row[std])
-            band = {"color": ORANGE, "alpha": 0.25, "linewidth": 0, "label": "95 % band"}
+            band = {"color": pen.orange, "alpha": 0.25, "linewidth": 0, "label": "95 % band"}
             axes.fill_between(velocity, middle - error, middle + error, **band)
-            axes.plot(velocity, middle, "o-", color=ORANGE, markersize=3.5, label="joint fit")
+            axes.plot(velocity, middle, "o-", color=pen.orange, markersize=3.5, label="joint fit")
         name = {"brake_reuss": "Brake-Reuss beam", "suspended": "Suspended beam"}[beam]
         _name(left, name, "Velocity amplitude (mm/s)", "Natural frequency (Hz)")
         _name(right, "", "Velocity amplitude (mm/s)", "Damping ratio (%)")
@@ -217,8 +224,9 @@ def measured(pen: Pen) -> Figure:
 def reliability(pen: Pen) -> Figure:
     """Share of right answers over the probability that they stated."""
     sets = of.reliability()
+    series = (pen.orange, pen.blue, GREEN, PINK, AMBER)
     figure, grid = _panels(2, 3, 5.4, sharex=True, sharey=True)
-    for axes, (name, bins), colour in zip(grid.flat, sets.items(), SERIES, strict=False):
+    for axes, (name, bins), colour in zip(grid.flat, sets.items(), series, strict=False):
         axes.plot([0, 1], [0, 1], "--", color=pen.faint, linewidth=1)
         for one in bins:
             share = one.right / one.answers
@@ -245,17 +253,25 @@ def reliability(pen: Pen) -> Figure:
 
 def coverage(pen: Pen) -> Figure:
     """Share of tests whose 95 % band holds the truth, with binomial intervals."""
-    rows = of.coverages()
-    figure, ((axes,),) = _panels(1, 1, 0.27 * len(rows) + 0.9)
+    groups = {k: list(rows) for k, rows in groupby(of.coverages(), key=lambda row: row.what)}
+    lines = sum(len(rows) + 1 for rows in groups.values())
+    figure, ((axes,),) = _panels(1, 1, 0.21 * lines + 0.8)
     axes.axvline(95, color=pen.ink, linestyle="--", linewidth=1)
-    for height, row in enumerate(reversed(rows)):
-        low, high = row.interval
-        colour = ORANGE if row.says == "too narrow" else BLUE
-        colour = colour if row.ours else pen.faint
-        axes.plot([100 * low, 100 * high], [height] * 2, color=colour)
-        axes.plot(100 * row.share, height, "o", color=colour, markersize=4.5)
-    axes.set_yticks(range(len(rows)), [f"{r.what}: {r.about}" for r in reversed(rows)], fontsize=8)
-    axes.set_ylim(-0.7, len(rows) - 0.3)
+    height, ticks = 0, {}
+    for title, rows in groups.items():
+        axes.text(15, height, title, fontsize=9, va="center", weight="bold", color=pen.ink)
+        for row in rows:
+            height -= 1
+            ticks[height] = row.about
+            low, high = row.interval
+            colour = pen.orange if row.says == "too narrow" else pen.blue
+            colour = colour if row.ours else pen.faint
+            axes.plot([100 * low, 100 * high], [height] * 2, color=colour)
+            axes.plot(100 * row.share, height, "o", color=colour, markersize=4.5)
+        height -= 1
+    axes.set_yticks(list(ticks), list(ticks.values()), fontsize=9)
+    axes.set_ylim(height + 0.3, 0.7)
+    axes.set_xlim(14, 101)
     axes.set_xlabel("Bands that hold the truth (%)")
     return figure
 

@@ -134,17 +134,17 @@ def coverages() -> list[Coverage]:
     for key, about, most in (
         ("frequency", "natural frequency", BAND),
         ("damping", "damping", BAND),
-        ("next", "resonance of a level not measured, frequency", 1.0),
-        ("next speed", "resonance of a level not measured, velocity", 1.0),
+        ("next", "frequency of a new level", 1.0),
+        ("next speed", "velocity of a new level", 1.0),
     ):
         add(title, about, _inside(fits, key, most))
     tests = [r for r in results("low_level_tests") if "seed" in r]
     for key in ("frequency", "damping"):
         low = _inside(tests, f"{key}_error_stds")
-        add("Low-level test that already hardens or softens", f"{key} at no amplitude", low)
+        add("Low-level test that already hardens or softens, at no amplitude", key, low)
     for key in ("frequency", "damping"):
         linear = _inside(tests, f"linear_{key}_error_stds")
-        add("The same, lowest level read as linear", f"{key} at no amplitude", linear, False)
+        add("The same, lowest level read as linear", key, linear, False)
     for row in results("linear_modes"):
         for key in ("frequency", "damping", "shape"):
             held = row["seeds"] * row[f"{key}_coverage_%"] / 100

@@ -36,7 +36,8 @@ def table(head: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
     if not rows:
         raise ValueError(f"A table of validation is empty: {', '.join(head)}.")
     lines = [head, ["---", *["--:"] * (len(head) - 1)], *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    text = "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    return f'<div class="results" markdown>\n\n{text}\n\n</div>'
 
 
 # Published problems
@@ -212,6 +213,12 @@ def methods() -> str:
 def _median(rows: list[of.Row], key: str) -> float | None:
     values = [r[key] for r in rows if r.get(key) is not None]
     return float(np.median(values)) if values else None
+
+
+def worst_closure() -> of.Row:
+    """The motion that the default number of harmonics describes worst."""
+    kept = of.chosen("simulator_accuracy", measurement="closure", harmonics=9)
+    return max(kept, key=lambda r: r["largest"])
 
 
 def closure() -> str:
@@ -478,11 +485,12 @@ def narrow() -> list[of.Coverage]:
 
 def misses() -> str:
     """All that these results miss, in one list."""
-    worst = printed_misses()
+    printed = printed_misses()
+    most = printed[0]
     found = [
-        f"[Published problems](problems.md): {len(worst)} numbers that a source prints are not "
-        f"found to the last digit; the largest difference is {per_cent(abs(worst[0].difference))} "
-        f"({worst[0].problem}: {worst[0].quantity})"
+        f"[Published problems](problems.md): {len(printed)} numbers that a source prints are not "
+        f"found to the last digit; the largest difference is {per_cent(abs(most.difference))} "
+        f"({most.problem}: {most.quantity})"
     ]
     found += [
         f"[Error bars](coverage.md): {c.what.lower()}, {c.about}: {per_cent(c.share, 3)} of "
@@ -490,7 +498,7 @@ def misses() -> str:
         for c in narrow()
     ]
     found += [
-        f"[Blind sets](blind.md): {b.score}: {b.value}, where the bar is {b.bar}"
+        f"[Blind sets](blind.md): {b.score}: {b.value} (bar: {b.bar})"
         for b in of.bars()
         if b.met is False
     ]
@@ -500,6 +508,18 @@ def misses() -> str:
         for r in of.results("rom_load_scale")
         if not r["default_inside"]
     ]
+    found += [
+        f"[Stated probabilities](blind.md): {name.lower()}: of answers with {number(b.low)} to "
+        f"{number(b.high)}, {b.right} of {b.answers} are right"
+        for name, bins in of.reliability().items()
+        for b in bins
+        if of.binomial(b.right, b.answers)[1] < b.low
+    ]
+    worst = worst_closure()
+    found.append(
+        f"[Forced responses](programs.md#accuracy-of-forced-responses): nine harmonics, the "
+        f"default, leave a motion of the {worst['beam']} beam {per_cent(worst['largest'])} open"
+    )
     return "\n".join(f"- {one}." for one in found)
 
 
