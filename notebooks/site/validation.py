@@ -125,8 +125,9 @@ def _of_beams() -> dict[str, str]:
 
 
 def _of_blind() -> dict[str, str]:
-    coupled, checked = of.results("coupled_sets")[-1], of.only("blind_checks")
-    several, single = (of.only("location_sets", one_sensor=one) for one in (False, True))
+    checked = of.only("blind_checks")
+    coupled = [r for r in of.results("coupled_sets") if "sets" in r][-1]
+    several, single = (of.last("location_sets", one_sensor=one) for one in (False, True))
     bars, latest, kinds = of.bars(), of.latest_half(), [tables.kind(r) for r in of.diagnosed()]
     sure = [r for r in of.diagnosed() if r["probability"] >= of.SURE and r["verdict"] != "drawn"]
     wrong = [r for r in sure if not of.named_rightly(r)]

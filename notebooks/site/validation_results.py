@@ -40,6 +40,11 @@ def only(name: str, **wanted: Any) -> Row:
     return row
 
 
+def last(name: str, **wanted: Any) -> Row:
+    """The newest line with these values, of results that are appended."""
+    return chosen(name, **wanted)[-1]
+
+
 @cache
 def sources() -> Row:
     """Who has the published numbers, and the paper's."""
@@ -266,8 +271,8 @@ def reliability() -> dict[str, list[Stated]]:
         "What is missing (220 structures)": taken(half["bins"]),
         "What is missing (one mode)": _binned(one_mode, edges),
         "Which modes interact": _binned(coupled, edges),
-        "Where it acts, several sensors": taken(only("location_sets", one_sensor=False)["bins"]),
-        "Where it acts, one sensor": taken(only("location_sets", one_sensor=True)["bins"]),
+        "Where it acts, several sensors": taken(last("location_sets", one_sensor=False)["bins"]),
+        "Where it acts, one sensor": taken(last("location_sets", one_sensor=True)["bins"]),
     }
 
 
