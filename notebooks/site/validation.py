@@ -141,6 +141,8 @@ def _of_blind() -> dict[str, str]:
         "regime sets": str(len(kinds)),
         "regime right": str(kinds.count("right")),
         "regime wrong": str(kinds.count("wrong")),
+        "regime beside": str(kinds.count("beside")),
+        "regime unknown": str(kinds.count("unknown") + kinds.count("drawn")),
         "sure": str(len(sure)),
         "sure wrong": str(len(wrong)),
         "sure refused": str(len(refused)),

@@ -27,7 +27,7 @@ def number(value: float | None, digits: int = 3) -> str:
 
 def per_cent(share: float | None, digits: int = 2) -> str:
     """A share or a relative error in per cent."""
-    return "–" if share is None else f"{number(100 * share, digits)} %"
+    return "–" if share is None else f"{number(100 * share, digits)}\N{NO-BREAK SPACE}%"
 
 
 def table(head: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
