@@ -5,9 +5,9 @@ A hook of MkDocs, and a command of its own that writes the pages with all that i
     python notebooks/site/validation.py FOLDER
 
 A page under `pages/validation` holds no number of its own. It names what it shows in double braces:
-a figure, a table, or a number of `numbers`. They are computed from `benchmarks/*.jsonl` and
-`benchmarks/published_sources.toml` alone (`validation_results.py`, `validation_tables.py`), and
-drawn by `validation_figures.py`.
+a figure, a table, or one number. They are computed from `benchmarks/*.jsonl` and
+`benchmarks/published_sources.toml` alone (`validation_results.py`), written as tables
+(`validation_tables.py`, `validation_programs.py`) and drawn (`validation_figures.py`).
 """
 
 import re
@@ -17,10 +17,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import validation_programs as programs
 import validation_results as of
 import validation_tables as tables
 from validation_figures import FIGURES, drawn
-from validation_tables import number, per_cent
+from validation_writing import number, per_cent
 
 PAGES = Path(__file__).parent / "pages" / "validation"
 NAMED = re.compile(r"\{\{ *(.+?) *\}\}")
@@ -71,10 +72,10 @@ def _of_programs() -> dict[str, str]:
     events = of.chosen("simulator_accuracy", measurement="events")
     kinds = ("fold", "peak", "phase_resonance")
     stability = of.chosen("simulator_accuracy", measurement="stability")
-    worst = tables.worst_closure()
+    worst = programs.worst_closure()
     rom = of.only("rom_load_scale", structure="flat_clamped")
     return {
-        "unanswered": tables.unanswered(),
+        "unanswered": programs.unanswered(),
         "events": str(sum(r[kind] for r in events for kind in kinds)),
         "lost": str(sum(r["lost"] for r in events)),
         "event error": number(max(r.get(f"{kind}_error", 0) for r in events for kind in kinds), 2),
