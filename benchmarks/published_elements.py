@@ -5,9 +5,11 @@ Run: OMP_NUM_THREADS=1 python benchmarks/published_elements.py
 Sources: NLvib's examples 1 to 5 and 8 to 11 (Krack and Gross; their numbers, or those of an
 independent harmonic balance where none are printed), SSMTool's three oscillators, cantilevers,
 Timoshenko and von Karman beams (spectral submanifolds of order 3, 7 and 11, collocation), closed
-forms of a Jenkins element and of Segalman's four-parameter Iwan joint. `published` is what the
-source has, to its digits; `difference` is relative. Seconds are those of the second run, programs
-compiled; of problem 11 the source has less than two minutes for its first curve.
+forms of a Jenkins element and of Segalman's four-parameter Iwan joint. `published` is what it is
+held against, to the digits that are known (`published_sources.toml` says whether a source prints
+it, a closed form or an independent program has it); `difference` is relative. Seconds are those of
+the second run, programs compiled; of problem 11 the source has less than two minutes for its first
+curve.
 
 Problem 21, the Brake-Reuss beam, is left out: its contacts are rough surfaces, whose stiffness
 grows with the pressure as asperities close, for which there is no element here.
