@@ -409,7 +409,9 @@ def test_every_option_of_identify_is_joined_to_the_others_or_tried_here(files, t
     both |= {"axis", "day_std", "self_excited", "predict_at", "modes"}
     points = {"amplitude", "measure", "knots"}
     joint = {"fit", "free", "robust", "further"}
-    assert {one.name for one in command.params} - {"help"} == (both | points | joint) - {"help"}
+    assert {one.name for one in command.params} - {"help", "help_all"} == (
+        both | points | joint
+    ) - {"help"}
 
 
 @pytest.mark.parametrize("command", COMMANDS)

@@ -109,8 +109,9 @@ def cell(text: str) -> str:
 
 
 def commands_page() -> str:
-    """Every command with its options, as `--help` says them."""
-    blocks = ["# Commands", "Each command says the same with `--help`."]
+    """Every command with its options, as `--help-all` says them."""
+    said = "`--help` says the main options of a command, `--help-all` the same as this page."
+    blocks = ["# Commands", said]
 
     def add(command: Any, name: str) -> None:
         if hasattr(command, "commands"):
@@ -119,7 +120,7 @@ def commands_page() -> str:
             return
         rows = ["| option | what it is |", "|---|---|"]
         for option in command.params:
-            if option.hidden or option.name == "help":
+            if option.hidden or option.name in ("help", "help_all"):
                 continue
             if option.param_type_name == "option":
                 words = [f"`{word}`" for word in (*option.opts, *option.secondary_opts)]
@@ -129,7 +130,9 @@ def commands_page() -> str:
             if option.required:
                 words.append("(required)")
             rows.append(f"| {' '.join(filter(None, words))} | {cell(option.help or '')} |")
-        blocks.extend([f"## {name}", command.help or "", "\n".join(rows), command.epilog or ""])
+        blocks.extend([f"## {name}", command.help or "", "\n".join(rows)])
+        examples = command.epilog.replace("\n\n", "\n")
+        blocks.append(f"```sh\n{examples}\n```")
 
     add(typer.main.get_command(app), "snrmjax")
     return "\n\n".join(blocks) + "\n"

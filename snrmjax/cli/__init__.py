@@ -4,7 +4,6 @@ Each imports what it needs by itself: none waits for the imports of another.
 """
 
 import gc
-import inspect
 import sys
 from collections.abc import Callable
 
@@ -18,6 +17,7 @@ from snrmjax.cli.diagnose_command import diagnose
 from snrmjax.cli.identify_command import identify
 from snrmjax.cli.import_command import import_
 from snrmjax.cli.modes_command import modes
+from snrmjax.cli.options import add_command
 from snrmjax.cli.rom_command import rom
 from snrmjax.cli.simulate_commands import nnm, simulate
 from snrmjax.cli.study_commands import study_app
@@ -28,52 +28,58 @@ app = typer.Typer(
     help="Backbones and damping of nonlinear normal modes from near-resonant steady states.",
     epilog="Try it: snrmjax demo --out demo. Each command has its own --help with an example.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
 )
 
-_EXAMPLES: dict[Callable[..., None], str] = {
-    demo: "Example: snrmjax demo --out demo, then open demo/report.html.",
-    whole_test: "Example: snrmjax test measurements --out report, then open report/report.html.",
-    import_: "Examples: snrmjax import test.uff\n\n"
-    "snrmjax import test.mat --force CH1 --force-unit N --response CH2:acceleration --unit g "
-    "--out imported\n\n"
-    "snrmjax import next.mat --map imported/map.toml --out next",
-    check: "Example: snrmjax check measured.csv --model model.toml --out checked",
-    modes: "Examples: snrmjax modes frf.uff --out model.toml\n\n"
-    "snrmjax modes low_level.csv --drive-point tip --out model.toml\n\n"
-    "snrmjax modes decay.mat --to-hz 200 --unscaled --out model.toml",
-    identify: "Examples: snrmjax identify measured.csv --model model.toml --predict-force 0.5 "
-    "--out result\n\nsnrmjax identify driven.csv --model model.toml --fit auto --free force_gain "
-    "--next 5 --out result",
-    compare: "Examples: snrmjax compare measured.csv --model model.toml --out compared\n\n"
-    "snrmjax compare measured.csv decay.csv --model model.toml --out compared",
-    diagnose: "Examples: snrmjax diagnose measured.csv --model model.toml --out result\n\n"
-    "snrmjax diagnose sets/*.csv --model model.toml --out results",
-    simulate: "Example: snrmjax simulate beam.toml --force 0.5 --force 1 --from-hz 60 --to-hz 110 "
-    "--out result",
-    nnm: "Example: snrmjax nnm beam.toml --to-hz 110 --out result",
-    rom: "Examples: snrmjax rom beam.toml --out reduced\n\n"
-    "snrmjax rom --tables load_cases --out reduced\n\n"
-    "snrmjax rom --calculix deck.inp --modes 1,3,5 --out reduced",
+# The first of each runs in the tests, on files that they make.
+_EXAMPLES: dict[Callable[..., None], tuple[str, ...]] = {
+    demo: ("snrmjax demo --out demo",),
+    whole_test: ("snrmjax test measurements --out report",),
+    import_: (
+        "snrmjax import test.csv",
+        "snrmjax import test.mat --force CH1 --force-unit N --response CH2:acceleration --unit g "
+        "--out imported",
+        "snrmjax import next.mat --map imported/map.toml --out next",
+    ),
+    check: ("snrmjax check measured.csv --model model.toml --out checked",),
+    modes: (
+        "snrmjax modes frf.uff --out model.toml",
+        "snrmjax modes low_level.csv --drive-point tip --out model.toml",
+        "snrmjax modes decay.mat --to-hz 200 --unscaled --out model.toml",
+    ),
+    identify: (
+        "snrmjax identify measured.csv --model model.toml --out result",
+        "snrmjax identify measured.csv --model model.toml --predict-force 0.5 --out result",
+        "snrmjax identify driven.csv --model model.toml --fit auto --free force_gain --next 5 "
+        "--out result",
+    ),
+    compare: (
+        "snrmjax compare measured.csv --model model.toml --out compared",
+        "snrmjax compare measured.csv decay.csv --model model.toml --out compared",
+    ),
+    diagnose: (
+        "snrmjax diagnose measured.csv --model model.toml --out result",
+        "snrmjax diagnose sets/*.csv --model model.toml --out results",
+    ),
+    simulate: (
+        "snrmjax simulate model.toml --force 0.5 --from-hz 60 --to-hz 110 --out result",
+        "snrmjax simulate model.toml --force 0.5 --force 1 --from-hz 60 --to-hz 110 --out result",
+    ),
+    nnm: ("snrmjax nnm model.toml --to-hz 110 --out result",),
+    rom: (
+        "snrmjax rom beam.toml --out reduced",
+        "snrmjax rom --tables load_cases --out reduced",
+        "snrmjax rom --calculix deck.inp --modes 1,3,5 --out reduced",
+    ),
 }
 _OBJECTS = 100_000  # made between two collections of rubbish, some 10 MB
 # What Python has another use for, or pytest.
 _NAMES = {whole_test: "test", import_: "import"}
 
 
-def _unwrapped(text: str) -> str:
-    """Paragraphs on one line each: the width of the terminal wraps them."""
-    return "\n\n".join(" ".join(paragraph.split()) for paragraph in text.split("\n\n"))
-
-
 for _command, _examples in _EXAMPLES.items():
-    app.command(
-        _NAMES.get(_command, _command.__name__),
-        help=_unwrapped(inspect.getdoc(_command) or ""),
-        epilog=_examples,
-    )(_command)
+    add_command(app, _command, _NAMES.get(_command, _command.__name__), _examples)
 
 app.add_typer(study_app)
 
@@ -82,12 +88,14 @@ def main() -> None:
     """Run the commands; wrong input ends with exit code 2 and one sentence."""
     # Imports and programs stay to the end: to look for rubbish in them takes a tenth of a command.
     gc.set_threshold(_OBJECTS)
-    if sys.argv[1:] and "--help" not in sys.argv:  # help does not wait for the import of JAX
+    if sys.argv[1:] and not {"--help", "--help-all"} & {
+        *sys.argv
+    }:  # help does not wait for the import of JAX
         from snrmjax.io.programs.compilation_cache import use_compilation_cache
 
         use_compilation_cache()
     try:
-        app()
+        app(prog_name="snrmjax")
     except ValueError as error:
         refuse(str(error))
         sys.exit(2)

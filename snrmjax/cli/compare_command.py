@@ -14,11 +14,8 @@ def compare(
     data: Annotated[
         list[Path],
         typer.Argument(
-            help="Measured steady states (CSV), as for identify, and time records: CSV with "
-            "time_s, force_n or drive_v (neither for a free decay) and velocity_m_s, "
-            "acceleration_m_s2 or displacement_m (of several sensors tip.velocity_m_s, …), or "
-            "a laboratory's file (UFF, MATLAB, HDF5, TDMS). Several files of one structure are one "
-            "test.",
+            help="Measured steady states (CSV), as for identify, and time records (CSV, UFF, "
+            "MATLAB, HDF5, TDMS); several files of one structure are one test.",
             metavar="DATA…",
             show_default=False,
         ),
@@ -39,7 +36,9 @@ def compare(
     """Run other methods beside the inverse SNRM on the same data.
 
     A time record is sorted by what it is: free decay, stepped sine, slow sweep or broadband; the
-    rule that decided is printed. Stepped sines and sweeps become steady states.
+    rule that decided is printed. Stepped sines and sweeps become steady states. A record's CSV has
+    time_s, force_n or drive_v (neither for a free decay) and velocity_m_s, acceleration_m_s2 or
+    displacement_m (of several sensors tip.velocity_m_s, …).
 
     A method that the data do not allow is named with the reason, and the others still run.
 

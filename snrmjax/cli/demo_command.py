@@ -7,10 +7,11 @@ from snrmjax.report.writing import staged
 
 
 def demo(out: Out) -> None:
-    """Run the whole chain on the built-in flat beam: simulate, test, identify, predict.
+    """Run the whole chain on the built-in flat beam.
 
-    Writes the model, simulated responses, the nonlinear normal mode, a virtual test with noise,
-    all that `identify` makes of it, figures and report.html. Takes about a minute.
+    Simulates, tests, identifies and predicts. Writes the model, simulated responses, the nonlinear
+    normal mode, a virtual test with noise, all that `identify` makes of it, figures and
+    report.html. Takes about a minute.
     """
     import numpy as np
 

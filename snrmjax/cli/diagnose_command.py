@@ -37,7 +37,10 @@ def diagnose(
     out: Out,
     **options: Any,
 ) -> None:
-    """Find the physics that a model lacks: where it disagrees with the data, and what that is.
+    """Find the physics that a model lacks, with probabilities.
+
+    Where model and data disagree, the effects of the library that would explain it, and what to
+    measure where several would.
 
     Writes diagnosis.json, figures, report.html and model.toml, the completed model; of several
     files each into a folder of its own name.

@@ -28,15 +28,22 @@ def identify(
         typer.Option(
             help="Amplitude over which backbone, damping, the joint fit's curves and residuals are "
             "drawn; responses over frequency stay velocities. Displacement and acceleration also "
-            "add a column to points.csv and backbone.csv."
+            "add a column to points.csv and backbone.csv.",
+            rich_help_panel="Drawing",
         ),
     ] = "velocity",
     **options: Any,
 ) -> None:
-    """Identify backbone and damping from measured steady states, and predict responses.
+    """Identify backbone and damping from steady states, and predict responses.
 
     State by state with curves through the points, or by one joint fit of all states, which knows
     errors that the states of a level share (asked for by --fit, --free or --next).
+
+    Families of --fit: auto, polynomial:2, power_law, spline:5, smoothing_spline; for damping also
+    constant, viscous_quadratic, viscous_coulomb, viscous_microslip. :2 is the size (left out: the
+    simplest in the smooth curve's band), @velocity the amplitude. Where only --free or --next asks
+    for a joint fit, the families are auto,auto. The force_gain of --free is in N per V for data
+    with drive_v.
 
     Writes points.csv, backbone.csv, summary.json, figures and report.html; with predictions
     also prediction.csv, with a joint fit fit.json, with --next also next.csv.

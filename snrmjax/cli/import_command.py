@@ -26,8 +26,7 @@ def import_(
     out: Annotated[
         Path | None,
         typer.Option(
-            help="Folder for measured.csv (or record.csv) and map.toml; without channels and map "
-            "nothing is written.",
+            help="Folder for measured.csv (or record.csv) and map.toml.",
             metavar="DIR",
             rich_help_panel=FILES,
         ),
@@ -43,11 +42,12 @@ def import_(
     ] = None,
     **options: Any,
 ) -> None:
-    """Read a laboratory's files and write steady states as identify takes them.
+    """List what a laboratory's files hold, or write measured.csv of them.
 
-    Without channels and map it prints what the files hold, and a command that imports them. With
-    them it writes measured.csv, and map.toml with all that was stated, found and assumed, for the
-    next test. Records of free decays and broadband tests are written as record.csv.
+    Without channels and map it writes nothing: it prints what the files hold, and a command that
+    imports them. With them it writes measured.csv, steady states as identify takes them, and
+    map.toml with all that was stated, found and assumed, for the next test. Records of free decays
+    and broadband tests are written as record.csv.
     """
     from snrmjax.io.exchange.import_map import map_of_options
     from snrmjax.pipelines.imports import import_test, list_contents
@@ -67,7 +67,7 @@ def import_(
 
 _RESPONSE = MapKey(
     "channel or column of a response, as CH2:acceleration or CH2:acceleration:g; one a sensor",
-    "NAME[:KIND[:UNIT]]",
+    *("NAME[:KIND[:UNIT]]", None),
 )
 
 

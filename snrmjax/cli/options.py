@@ -1,16 +1,25 @@
-"""Options and arguments that several commands have, and the panels of their help."""
+"""Options and arguments that several commands have, and a help that fits a screen.
 
+`--help` shows the options that have no panel of their own or stand in that of files: those that
+most tests need. Options of a topic stand in its panel, which `--help-all` shows.
+"""
+
+import copy
 import dataclasses
+import functools
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
 import typer
+from typer.core import TyperCommand
 
 from snrmjax.pipelines.options import FILES, checked, flag_of
 
 Asked = TypeVar("Asked")
+
+_ALL = "help_all"
 
 Model = Annotated[
     Path,
@@ -25,7 +34,7 @@ Out = Annotated[
     Path,
     typer.Option(
         "--out",
-        help="Folder for the results, made if missing; files of the same names are replaced.",
+        help="Folder for the results; files of the same names are replaced.",
         metavar="DIR",
         rich_help_panel=FILES,
         show_default=False,
@@ -35,8 +44,8 @@ Linear = Annotated[
     Path,
     typer.Option(
         "--model",
-        help="Linear model of the structure (TOML): frequencies, damping ratios, mass-normalised "
-        "shapes, participations.",
+        help="Linear model (TOML): frequencies, damping ratios, mass-normalised shapes, "
+        "participations.",
         metavar="MODEL",
         rich_help_panel=FILES,
         show_default=False,
@@ -46,6 +55,86 @@ Harmonics = Annotated[
     int,
     typer.Option(help="Harmonics of the motion that are balanced, beside its mean.", min=1, max=99),
 ]
+
+
+class Command(TyperCommand):
+    """A command whose `--help` has the main options, and `--help-all` all of them."""
+
+    def collect_usage_pieces(self, ctx: Any) -> list[str]:
+        """What must be stated, then `[OPTIONS]`."""
+        every: list[Any] = ctx.command.params
+        arguments = [one for one in every if one.param_type_name == "argument"]
+        stated = [one.metavar if one.required else f"[{one.metavar}]" for one in arguments]
+        needed = [one for one in every if one.required and one not in arguments]
+        return [*stated, *(f"{one.opts[0]} {one.metavar}" for one in needed), "[OPTIONS]"]
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """The sentence that says what the command gives, its main options and an example."""
+        (sentence, *_), (first, *_) = (
+            (text or "").split("\n\n") for text in (self.help, self.epilog)
+        )
+        shown = copy.copy(self)
+        if ctx.meta.get(_ALL):
+            shown.epilog = f"Examples:\n\n{self.epilog}"
+        else:
+            panels = {one: one.rich_help_panel for one in self.params}  # type: ignore[attr-defined]
+            further = [panel for panel in panels.values() if panel not in (None, FILES)]
+            shown.params = [_unpanelled(one) for one in panels if panels[one] in (None, FILES)]
+            shown.help = sentence
+            shown.epilog = f"Example:\n\n{first}"
+            if further:
+                topics = "; ".join(dict.fromkeys(further))
+                shown.epilog += (
+                    f"\n\n{len(further)} more options ({topics}): {ctx.command_path} --help-all"
+                )
+        super(Command, shown).format_help(ctx, formatter)
+
+
+def _unpanelled(parameter: Any) -> Any:
+    """The same without its panel, and without the line that repeats what the usage says."""
+    same = copy.copy(parameter)
+    same.required, same.rich_help_panel = False, None
+    return same
+
+
+def _show_all(context: typer.Context, asked: bool) -> None:
+    if asked:
+        context.meta[_ALL] = True
+        typer.echo(context.get_help())
+        raise typer.Exit
+
+
+def add_command(
+    app: typer.Typer, command: Callable[..., None], name: str, examples: Sequence[str]
+) -> None:
+    """Give an app a command; its first example stands in `--help`, all in `--help-all`."""
+
+    @functools.wraps(command)
+    def run(**stated: Any) -> None:
+        del stated[_ALL]
+        command(**stated)
+
+    signature = inspect.signature(command)
+    every = inspect.Parameter(
+        *(_ALL, inspect.Parameter.KEYWORD_ONLY),
+        default=False,
+        annotation=Annotated[
+            bool,
+            typer.Option(
+                "--help-all",
+                help="Show all options and exit.",
+                is_eager=True,
+                callback=_show_all,
+                show_default=False,
+            ),
+        ],
+    )
+    run.__signature__ = signature.replace(  # type: ignore[attr-defined]
+        parameters=[*signature.parameters.values(), every]
+    )
+    text = inspect.getdoc(command) or ""
+    paragraphs = (" ".join(one.split()) for one in text.split("\n\n"))  # the terminal wraps them
+    app.command(name, cls=Command, help="\n\n".join(paragraphs), epilog="\n\n".join(examples))(run)
 
 
 def require_positive(option: str, values: Sequence[float], unit: str) -> None:

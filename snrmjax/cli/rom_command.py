@@ -26,7 +26,7 @@ def rom(
     ] = None,
     **options: Any,
 ) -> None:
-    """Condense static load cases of finite elements to a reduced-order model.
+    """Condense static load cases of finite elements to a reduced model.
 
     Writes model.toml (ready for simulate and nnm), load_cases.csv, summary.json, figures (PNG)
     and report.html.

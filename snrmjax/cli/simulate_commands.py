@@ -9,6 +9,7 @@ from snrmjax.cli.options import Harmonics, Model, Out, require_positive
 from snrmjax.report.writing import staged
 
 EventKind = Literal["fold", "peak", "phase_resonance", "period_doubling", "neimark_sacker"]
+_MOTIONS = "Further motions"
 _FOLLOWED = "Events over a parameter"
 
 
@@ -41,6 +42,7 @@ def simulate(
             "--isolated",
             help="Also search for responses that are not connected to those of small motion "
             "(takes longer).",
+            rich_help_panel=_MOTIONS,
         ),
     ] = False,
     quasi_periodic: Annotated[
@@ -49,6 +51,7 @@ def simulate(
             "--quasi-periodic",
             help="Also follow the motions with a second frequency from every Neimark-Sacker "
             "bifurcation of the responses (quasi_periodic.csv and quasi_periodic.png).",
+            rich_help_panel=_MOTIONS,
         ),
     ] = False,
     follow: Annotated[
@@ -79,10 +82,10 @@ def simulate(
         ),
     ] = None,
 ) -> None:
-    """Simulate responses to a harmonic force, around their folds and with unstable parts.
+    """Simulate responses to a harmonic force, unstable parts included.
 
-    Harmonic balance with arclength continuation. Writes response.csv, response.png, summary.json
-    and report.html.
+    Harmonic balance with arclength continuation around folds. Writes response.csv, response.png,
+    summary.json and report.html.
     """
     from snrmjax.io.models import read_model
     from snrmjax.pipelines.simulate import simulate_responses
@@ -136,9 +139,10 @@ def nnm(
         ),
     ] = "follow",
 ) -> None:
-    """Follow the undamped nonlinear normal mode of interest from its linear frequency.
+    """Follow the undamped nonlinear normal mode from its linear frequency.
 
-    Writes nnm.csv (frequency, velocity, energy, stability, internal resonances, shape) and nnm.png.
+    The mode is the model's mode of interest. Writes nnm.csv (frequency, velocity, energy,
+    stability, internal resonances, shape) and nnm.png.
     """
     from snrmjax.io.models import read_model
     from snrmjax.pipelines.simulate import simulate_mode

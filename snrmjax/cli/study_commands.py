@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from snrmjax.cli.console import console, say, warn
-from snrmjax.cli.options import FILES, Out, asked_for, with_options
+from snrmjax.cli.options import FILES, Out, add_command, asked_for, with_options
 from snrmjax.pipelines.options import option
 from snrmjax.report.writing import staged
 
@@ -26,7 +26,7 @@ _ROWS_SAID = 12  # of the summary on the screen
 
 study_app = typer.Typer(
     name="study",
-    help="Sweeps and uncertainty studies: many members of one model in one data set.",
+    help="Sweeps and uncertainty studies of one model, in one data set.",
     no_args_is_help=True,
     rich_markup_mode="rich",
 )
@@ -39,8 +39,7 @@ StudyOut = Annotated[
     Path,
     typer.Option(
         "--out",
-        help="The data set: a Zarr store that xarray opens. While it is not complete, and to mend "
-        "it, its parts are kept beside it in OUT.parts; remove them to save disk.",
+        help="The data set: a Zarr store that xarray opens.",
         metavar="OUT",
         rich_help_panel=FILES,
         show_default=False,
@@ -85,6 +84,8 @@ def run(
     """Run a study, or continue one that was stopped: the same command again.
 
     Writes the data set OUT. Stopped at any moment, it loses only what was being computed then.
+    While the data set is not complete, and to mend it, its parts are kept beside it in OUT.parts;
+    remove them to save disk.
     """
     from snrmjax.study.execution import ClusterGone
     from snrmjax.study.run import run_study
@@ -116,18 +117,20 @@ def run(
 
 
 with_options(run, StudyOptions)
-study_app.command(
-    epilog="Example: snrmjax study run study.toml --out study.zarr. On a batch queue, one task of "
-    "four: snrmjax study run study.toml --out study.zarr --shard 3/4"
-)(run)
+add_command(
+    *(study_app, run, "run"),
+    (
+        "snrmjax study run study.toml --out study.zarr",
+        "snrmjax study run study.toml --out study.zarr --shard 3/4",
+    ),
+)
 
 
-@study_app.command(epilog="Example: snrmjax study report study.zarr --out report")
 def report(
     store: Store,
     out: Out,
 ) -> None:
-    """Draw a study: distributions, main effects, response bands, where members failed.
+    """Draw a study: distributions, main effects, response bands, failures.
 
     Writes summary.csv, main_effects.csv, figures (PNG) and report.html.
     """
@@ -140,6 +143,9 @@ def report(
     say(members_ended(found))
     _say_summary(found.summaries)
     say(f"written to {out}")
+
+
+add_command(study_app, report, "report", ("snrmjax study report study.zarr --out report",))
 
 
 def _shard(text: str) -> tuple[int, int]:

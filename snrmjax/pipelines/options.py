@@ -19,7 +19,7 @@ class Option(NamedTuple):
 
     help: str
     metavar: str | None = None
-    panel: str | None = None  # of the command's help
+    panel: str | None = None  # its topic; without one it stands in the command's short help
     least: float | None = None  # that a number may be
     flag: str = ""  # how it is written, where that is not the name
     positive: str = ""  # unit of numbers that must be above zero
@@ -108,7 +108,6 @@ class IdentifyOptions:
         "Predict resonance and response under this force in N; give it again for more.",
         "N",
         positive="N",
-        panel=_PREDICTED,
     )
     predict_drive: tuple[float, ...] = option(
         (),
@@ -174,20 +173,15 @@ class IdentifyOptions:
     )
     fit: str | None = option(
         None,
-        "Family of the backbone and, after a comma, of the damping: auto (a smooth curve that "
-        "bends as much as the data ask for), polynomial:2, power_law, spline:5, smoothing_spline; "
-        "for damping also constant, viscous_quadratic, viscous_coulomb, viscous_microslip. :2 is "
-        "its size (left out: the simplest in the smooth curve's band), @velocity its amplitude. "
-        "Default: auto,auto where another option asks for a joint fit.",
-        "BACKBONE[,DAMPING]",
-        panel=_JOINT,
+        "Fit all states jointly: auto (curves as smooth as the data ask for), or families of "
+        "backbone and damping, as polynomial:2,constant.",
+        "FAMILIES",
     )
     free: tuple[str, ...] = option(
         (),
-        "Errors of the instruments to be found with the curves: force_gain (N per V for data with "
-        "drive_v), force_offset, instrument_phase; several with commas.",
-        "NAME[,NAME]",
-        panel=_JOINT,
+        "Errors of the instruments to be found with the curves: force_gain, force_offset, "
+        "instrument_phase; several with commas.",
+        "NAMES",
     )
     robust: bool = option(
         False,
@@ -202,13 +196,15 @@ class IdentifyOptions:
         "COUNT",
         least=1,
         flag="--next",
-        panel=_JOINT,
     )
 
     @property
     def is_joint(self) -> bool:
         """Whether a joint fit of all states is asked for."""
         return self.fit is not None or bool(self.free) or self.further is not None
+
+
+_AFTER = "After a first diagnosis"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -219,6 +215,7 @@ class DiagnoseOptions:
         None,
         "Simulate the responses of the model as given and as completed, for comparison with the "
         "data. Default: for a single file.",
+        panel="Drawing",
     )
     where: str = option(
         "",
@@ -231,14 +228,13 @@ class DiagnoseOptions:
         "Write the measurement that would decide an open answer: a CSV of steady states to be "
         "filled in.",
         "FILE",
-        panel=FILES,
     )
     add: tuple[Path, ...] = option(
         (),
         "Further steady states of the same structure, such as a plan that was filled in: one "
         "diagnosis of all states (repeatable).",
         "FILE",
-        panel=FILES,
+        panel=_AFTER,
     )
     former: Path | None = option(
         None,
@@ -246,10 +242,13 @@ class DiagnoseOptions:
         "the notes say what the further states changed.",
         "FILE",
         flag="--continue",
-        panel=FILES,
+        panel=_AFTER,
         needs=("add",),
         why_needed="needs further states: name their file with `--add`",
     )
+
+
+_ANSWERS = "Answers to its questions"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -263,7 +262,7 @@ class WholeTestOptions:
         panel=FILES,
     )
     drive_point: str | None = option(
-        None, "Sensor at the force, by which mode shapes are scaled.", "NAME"
+        *(None, "Sensor at the force, by which mode shapes are scaled.", "NAME"), panel=_ANSWERS
     )
     map_file: Path | None = option(
         None,
@@ -278,16 +277,18 @@ class WholeTestOptions:
         "Sampling rate of the records in Hz, where files state it with few digits.",
         "HZ",
         positive="Hz",
+        panel=_ANSWERS,
     )
     base: Literal["absolute", "relative"] | None = option(
         None,
         "What the sensors record of a structure whose base moves: their own motion (absolute) or "
         "that relative to the base. A model.toml says it itself.",
         "KIND",
+        panel=_ANSWERS,
         alone=("drive_point", "model"),
         why_alone="a base has no drive point, and a model says itself what its sensors record",
     )
-    go_on: bool = option(False, "Go on in spite of errors that the check finds.")
+    go_on: bool = option(False, "Go on in spite of errors that the check finds.", panel=_ANSWERS)
     diagnose: bool = option(True, "Look for what the model lacks, too (a minute or more).")
 
 
@@ -325,11 +326,13 @@ _ONE_SCALE = "Scale of the shapes"
 class ModesOptions:
     """What `modes` may be asked for."""
 
-    reference: str | None = option(None, "Reference channel where there are several.", "NAME")
-    level: int | None = option(None, "Level of steady states (default: the lowest).")
-    from_hz: float | None = option(None, "Lower end of the band.", panel="Fit")
+    reference: str | None = option(
+        *(None, "Reference channel where there are several.", "NAME"), panel="Fit"
+    )
+    level: int | None = option(None, "Level of steady states (default: the lowest).", panel="Fit")
+    from_hz: float | None = option(None, "Lower end of the band in Hz.", "HZ")
     to_hz: float | None = option(
-        None, "Upper end of the band; decays are thinned to it.", panel="Fit"
+        None, "Upper end of the band in Hz; decays are thinned to it.", "HZ"
     )
     poles: str | None = option(
         None, "Natural frequencies in Hz by hand, as 79.0,427.5.", "HZ,…", panel="Fit"
@@ -352,10 +355,9 @@ class ModesOptions:
         None,
         "The reference is the motion of a base, the responses are: absolute, relative.",
         "KIND",
-        panel="Fit",
     )
     drive_point: str | None = option(
-        None, "Sensor at the force (default: by point and axis).", "NAME", panel=_ONE_SCALE
+        None, "Sensor at the force (default: by point and axis).", "NAME"
     )
     turned: bool = option(
         False,
@@ -394,7 +396,7 @@ class ModesOptions:
         "NAME=VALUE",
         panel=_ONE_SCALE,
     )
-    unscaled: bool = option(False, "Relative shapes: frequency and damping only.", panel=_ONE_SCALE)
+    unscaled: bool = option(False, "Relative shapes: frequency and damping only.")
     newtons_per_volt: float | None = option(
         None, "Calibration of a drive voltage.", panel=_ONE_SCALE
     )

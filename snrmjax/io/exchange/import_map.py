@@ -30,7 +30,7 @@ class MapKey(NamedTuple):
 
     meaning: str
     metavar: str = "NAME"
-    group: str = _CHANNELS
+    group: str | None = _CHANNELS  # None: what most imports state
     choices: tuple[str, ...] = ()
 
 
@@ -46,17 +46,17 @@ KEYS = {
     ),
     "frequency": MapKey("column of the forcing frequency"),
     "frequency_unit": MapKey("unit of the frequency: Hz or rad/s", "UNIT", _NUMBERS),
-    "force": MapKey("channel or column of the force (or of the voltage that drives it)"),
+    "force": MapKey(
+        "channel or column of the force (or of the voltage that drives it)", group=None
+    ),
     "force_unit": MapKey(
-        "unit of the force: N, lbf, …; V: known as a drive voltage only", "UNIT", _NUMBERS
+        "unit of the force: N, lbf, …; V: known as a drive voltage only", "UNIT", None
     ),
     "base": MapKey(
         "motion of a base in place of a force: as CH1:acceleration:g, 0.5:acceleration:g",
-        "NAME:KIND[:UNIT]",
+        *("NAME:KIND[:UNIT]", None),
     ),
-    "unit": MapKey(
-        "unit of the responses; of our own table, what its velocity columns are", "UNIT", _NUMBERS
-    ),
+    "unit": MapKey("unit of the responses, or of our own table's velocity columns", "UNIT", None),
     "force_phase": MapKey("column of the force's own phase; empty: phases are relative to it"),
     "force_amplitude": MapKey(
         "force in N: one for all, one a set or file, z: the z axis, name: file names",
@@ -87,7 +87,7 @@ KEYS = {
 
 RESPONSE_KEYS = {
     "sensor": MapKey("name of the sensor as the model has it"),
-    "phase": MapKey("column of the phase"),
+    "phase": MapKey("column of the phase", group=None),
     "imaginary": MapKey("column of the imaginary part (lock-in Y)"),
     "amplitude_std": MapKey("column of the amplitude's 1σ (default: by name, as R_std beside R)"),
     "phase_std": MapKey("column of the phase's 1σ, in its unit (default: by name)"),

@@ -1,0 +1,188 @@
+"""Help that fits a screen, with an example that runs; completion; where to read more."""
+
+import re
+import shlex
+import shutil
+import sys
+from unittest import mock
+
+import numpy as np
+import pytest
+import typer
+from truths.uff_writing import write_uff
+
+import snrmjax as sj
+from snrmjax.cli import app, main
+from snrmjax.measure.recordings.channels import Channel
+from snrmjax.measure.recordings.frequency_responses import frequency_responses
+
+LINES, COLUMNS = 40, 80
+HERTZ = 2 * np.pi
+MODEL = """name = "one mode"
+[[mode]]
+frequency_hz = 79.02
+damping_ratio = 0.05
+shape = { tip = 11.84338 }
+participation = 247.841
+[potential]
+"1111" = 3.4375e12
+"""
+BEAM = """name = "beam"
+[material]
+young_pa = 70e9
+density_kg_m3 = 2700
+poisson = 0.3
+[section]
+width_m = 0.02
+thickness_m = 0.002
+[geometry]
+length_m = 0.4
+elements = 8
+[supports]
+left = "clamped"
+right = "clamped"
+[condense]
+modes = [1]
+[sensors]
+midspan = 0.5
+[force]
+distribution = "uniform"
+"""
+STUDY = """name = "damping"
+model = "model.toml"
+compute = "peaks"
+forces_n = [0.001]
+from_hz = 60
+to_hz = 110
+harmonics = 1
+vary = [{ parameter = "mode_1.damping_ratio", values = [0.04, 0.05] }]
+"""
+
+
+def leaves(command, words=()):
+    """Every command that does something, with the words that call it."""
+    if not hasattr(command, "commands"):
+        return {words: command}
+    return {
+        key: leaf
+        for name, one in command.commands.items()
+        for key, leaf in leaves(one, (*words, name)).items()
+    }
+
+
+COMMANDS = leaves(typer.main.get_command(app))
+GROUPS = [(), ("study",)]
+# The chain on a whole beam, and all that a test has, take half a minute.
+SLOW = {("demo",), ("test",)}
+
+
+def run(*words):
+    with (
+        mock.patch.object(sys, "argv", ["snrmjax", *words]),
+        pytest.raises(SystemExit) as ended,
+    ):
+        main()
+    return ended.value.code or 0
+
+
+@pytest.fixture
+def printed(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", str(COLUMNS))
+    monkeypatch.setenv("NO_COLOR", "1")
+
+    def text(*words):
+        assert run(*words) == 0
+        return capsys.readouterr().out
+
+    return text
+
+
+def options_of(text):
+    return set(re.findall(r"(?<![\w-])--[a-z][a-z-]*", text))
+
+
+@pytest.mark.parametrize("words", [*GROUPS, *COMMANDS], ids=" ".join)
+def test_help_fits_a_screen(words, printed):
+    lines = printed(*words, "--help").splitlines()
+    assert len(lines) <= LINES
+    assert max(map(len, lines)) <= COLUMNS
+
+
+@pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
+def test_every_option_is_in_the_long_help_and_what_must_be_stated_in_the_usage(words, printed):
+    short, long = (printed(*words, option) for option in ("--help", "--help-all"))
+    parameters = COMMANDS[words].params
+    every = {flag for one in parameters for flag in (*one.opts, *one.secondary_opts)}
+    assert options_of(long) >= {flag for flag in every if flag.startswith("--")}
+    (usage,) = re.findall(r"Usage: (snrmjax [^\n]*\n?[^\n]*?)\s*\n\s*\n", short)
+    for one in parameters:
+        if one.required:
+            assert (one.opts[0] if one.opts[0].startswith("--") else one.metavar) in usage
+    shown = options_of(short.replace("help-all", ""))
+    left = [one for one in parameters if one.opts[0] in every and not {*one.opts} & shown]
+    hidden = [one for one in left if one.opts[0].startswith("--") and one.name != "help_all"]
+    assert re.findall(r"(\d+) more options", short) == ([str(len(hidden))] if hidden else [])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """What the examples name: a model and a test of it, a record, responses, a beam, a study."""
+    folder = tmp_path_factory.mktemp("examples")
+    (folder / "model.toml").write_text(MODEL)
+    (folder / "beam.toml").write_text(BEAM)
+    (folder / "study.toml").write_text(STUDY)
+    modes = sj.read_model(folder / "model.toml").modes
+    force = np.repeat([1e-4, 2e-4, 3e-4], 8)
+    hertz = np.tile(np.linspace(75.0, 83.0, 8), 3)
+    velocity = sj.model.linear_response(modes, HERTZ * hertz, force)[:, 0]
+    rows = zip(np.repeat([1, 2, 3], 8), hertz, force, velocity.real, velocity.imag, strict=True)
+    lines = ["level,frequency_hz,force_n,velocity_re_m_s,velocity_im_m_s"]
+    table = "\n".join(lines + [",".join(map(str, row)) for row in rows])
+    (folder / "measured.csv").write_text(table)
+    (folder / "measurements").mkdir()
+    for name in ("measured.csv", "model.toml"):
+        (folder / "measurements" / name).write_text((folder / name).read_text())
+    acceleration = 1j * HERTZ * hertz * velocity / 9.80665
+    lines = ["frequency_Hz,force_N,acc,phase_deg"]
+    columns = (hertz, force, abs(acceleration), np.degrees(np.angle(acceleration)))
+    lines += [",".join(map(str, row)) for row in zip(*columns, strict=True)]
+    (folder / "test.csv").write_text("\n".join(lines))
+    force, sensor = (
+        Channel(*of, point="1", direction="+z")
+        for of in (("F", "force", "N"), ("A", "acceleration", "m/s^2"))
+    )
+    lines = HERTZ * np.arange(60.0, 100.0, 0.25)
+    mobility = sj.model.linear_response(modes, lines, np.ones(lines.size))[:, 0]
+    found = frequency_responses(lines, (1j * lines * mobility)[None, None], [sensor], [force])
+    write_uff(folder / "frf.uff", responses=[found])
+    return folder
+
+
+@pytest.mark.parametrize(
+    "words",
+    [pytest.param(one, marks=pytest.mark.long) if one in SLOW else one for one in COMMANDS],
+    ids=" ".join,
+)
+def test_the_example_of_the_help_runs(words, printed, folder, tmp_path, monkeypatch, capsys):
+    (example,) = re.findall(r"Example:\s*\n\s*\n (snrmjax .*)", printed(*words, "--help"))
+    work = tmp_path / "work"
+    shutil.copytree(folder, work)
+    monkeypatch.chdir(work)
+    if words == ("study", "report"):
+        assert run("study", "run", "study.toml", "--out", "study.zarr") == 0
+    program, *arguments = shlex.split(example)
+    before = {*work.rglob("*")} - {work / arguments[-1]}
+    assert program == "snrmjax"
+    assert arguments[: len(words)] == [*words]
+    assert run(*arguments) == 0
+    assert {*work.rglob("*")} > before
+    if words == ("import",):  # which lists what the file holds, and how it becomes measured.csv
+        assert "snrmjax import test.csv --force force_N" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
+def test_further_examples_are_commands_with_all_that_is_needed(words, printed):
+    command = COMMANDS[words]
+    for example in command.epilog.split("\n\n"):
+        arguments = shlex.split(example)[1 + len(words) :]
+        command.make_context(words[-1], arguments, resilient_parsing=False).close()
