@@ -1,9 +1,13 @@
 """Help that fits a screen, with an example that runs; completion; where to read more."""
 
+import dataclasses
+import os
 import re
 import shlex
 import shutil
+import subprocess
 import sys
+from typing import get_args
 from unittest import mock
 
 import numpy as np
@@ -13,8 +17,14 @@ from truths.uff_writing import write_uff
 
 import snrmjax as sj
 from snrmjax.cli import app, main
+from snrmjax.cli.compare_command import METHOD_NAMES
+from snrmjax.identify.joint.free_unknowns import FREE
+from snrmjax.identify.modal.linear_fit import ResidualTerms
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.frequency_responses import frequency_responses
+from snrmjax.methods.comparison import METHODS, RECORD_METHODS
+from snrmjax.model.base_motion import SensorMotion
+from snrmjax.pipelines.options import FAMILY_NAMES, IdentifyOptions, ModesOptions
 
 LINES, COLUMNS = 40, 80
 HERTZ = 2 * np.pi
@@ -186,3 +196,70 @@ def test_further_examples_are_commands_with_all_that_is_needed(words, printed):
     for example in command.epilog.split("\n\n"):
         arguments = shlex.split(example)[1 + len(words) :]
         command.make_context(words[-1], arguments, resilient_parsing=False).close()
+
+
+# ------------------------------------------------------------------------------ completion
+
+
+def completed(*words):
+    """What a shell gets for the last of these words."""
+    line = {"COMP_WORDS": shlex.join(["snrmjax", *words]), "COMP_CWORD": str(len(words))}
+    done = subprocess.run(
+        [sys.executable, "-m", "snrmjax"],
+        env=os.environ | line | {"_SNRMJAX_COMPLETE": "complete_bash"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return done.stdout.split()
+
+
+def test_a_shell_completes_commands_options_and_words():
+    assert completed("dia") == ["diagnose"]
+    assert completed("study", "re") == ["report"]
+    assert completed("identify", "--predict-f") == ["--predict-force"]
+    assert completed("simulate", "--follow", "p") == [
+        *("peak", "phase_resonance", "period_doubling"),
+    ]
+    assert completed("identify", "--fit", "polynomial,visc") == [
+        f"polynomial,viscous_{name}" for name in ("quadratic", "coulomb", "microslip")
+    ]
+    assert completed("compare", "--method", "con") == ["concerto"]
+    assert completed("import", "--phase-sign", "l") == ["lead", "lag"]
+
+
+def test_the_words_to_complete_are_those_that_are_taken():
+    assert {*FAMILY_NAMES} == {"auto", *sj.identify.FAMILIES}
+    assert (*METHODS, *RECORD_METHODS) == METHOD_NAMES
+    choices = {
+        (kind, field.name): field.metadata["option"].choices
+        for kind in (IdentifyOptions, ModesOptions)
+        for field in dataclasses.fields(kind)
+    }
+    assert choices[IdentifyOptions, "free"] == FREE
+    assert choices[ModesOptions, "residual_terms"] == get_args(ResidualTerms)
+    assert choices[ModesOptions, "base"] == get_args(SensorMotion)
+
+
+@pytest.mark.parametrize(
+    ("shell", "file"),
+    [
+        ("bash", ".bash_completions/snrmjax.sh"),
+        ("zsh", ".zfunc/_snrmjax"),
+        ("fish", ".config/fish/completions/snrmjax.fish"),
+    ],
+)
+def test_completion_is_installed_in_a_fresh_home(shell, file, tmp_path):
+    words = [sys.executable, "-m", "snrmjax", "--install-completion", shell]
+    # Of typer: a shell is named in place of that which started the program.
+    named = {"HOME": str(tmp_path), "_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1"}
+    subprocess.run(words, env=os.environ | named, check=True, capture_output=True)
+    shown = subprocess.run(
+        [*words[:3], "--show-completion", shell],
+        env=os.environ | named,
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    assert shown.stdout.strip() == (tmp_path / file).read_text().strip()
+    assert f"_SNRMJAX_COMPLETE=complete_{shell}" in shown.stdout

@@ -6,8 +6,13 @@ from typing import Annotated
 import typer
 
 from snrmjax.cli.console import tell, written
-from snrmjax.cli.options import Linear, Out
+from snrmjax.cli.options import Linear, Out, completion
 from snrmjax.report.writing import staged
+
+METHOD_NAMES = (
+    *("snrm", "concerto", "arslan_ozguven", "rct", "harmonic_force_surface", "phase_resonance"),
+    *("resonant_decay", "restoring_force", "ssm", "pnlss"),
+)
 
 
 def compare(
@@ -29,6 +34,7 @@ def compare(
             "harmonic_force_surface, phase_resonance (steady states), resonant_decay, "
             "restoring_force, ssm (free decays), pnlss (multisines). Default: all of them.",
             metavar="NAME",
+            autocompletion=completion(METHOD_NAMES),
             show_default=False,
         ),
     ] = None,

@@ -79,7 +79,10 @@ def _field(name: str, key: MapKey) -> tuple[str, Any, Any]:
     kind = tuple[str, ...] if several else type(default)
     least = 0 if kind is int else None
     made = option(
-        *(() if several else default, said, key.metavar or None), panel=key.group, least=least
+        *(() if several else default, said, key.metavar or None),
+        panel=key.group,
+        least=least,
+        choices=key.choices,
     )
     return name, kind, made
 

@@ -137,6 +137,16 @@ def add_command(
     app.command(name, cls=Command, help="\n\n".join(paragraphs), epilog="\n\n".join(examples))(run)
 
 
+def completion(choices: Sequence[str]) -> Callable[[str], list[str]]:
+    """What a shell completes an option with: one of these words, or several with commas."""
+
+    def complete(incomplete: str) -> list[str]:
+        stated, comma, begun = incomplete.rpartition(",")
+        return [f"{stated}{comma}{word}" for word in choices if word.startswith(begun)]
+
+    return complete
+
+
 def require_positive(option: str, values: Sequence[float], unit: str) -> None:
     """Raise `ValueError` where a number that an option was given is not above zero."""
     for value in values:
@@ -179,6 +189,7 @@ def _parameter(of: Any, field: dataclasses.Field) -> inspect.Parameter:
         metavar=about.metavar,
         rich_help_panel=about.panel,
         min=about.least,
+        autocompletion=completion(about.choices) if about.choices else None,
         show_default=isinstance(default, float) or bool(default),
     )
     return inspect.Parameter(

@@ -21,6 +21,7 @@ class Option(NamedTuple):
     metavar: str | None = None
     panel: str | None = None  # its topic; without one it stands in the command's short help
     least: float | None = None  # that a number may be
+    choices: tuple[str, ...] = ()  # words that it may have, for a shell to complete
     flag: str = ""  # how it is written, where that is not the name
     positive: str = ""  # unit of numbers that must be above zero
     needs: tuple[str, ...] = ()  # options of which one must be stated beside it
@@ -81,6 +82,12 @@ _FOR_PREDICTIONS: dict[str, Any] = {
     "panel": _PREDICTED,
 }
 
+
+# Of the two curves together; a shell completes them without the import of what they are.
+FAMILY_NAMES = (
+    *("auto", "polynomial", "spline", "smoothing_spline", "power_law", "constant"),
+    *("viscous_quadratic", "viscous_coulomb", "viscous_microslip"),
+)
 
 COUPLED_MODES = 2
 """Of `IdentifyOptions.modes`: a mode and the one that it exchanges energy with."""
@@ -176,12 +183,14 @@ class IdentifyOptions:
         "Fit all states jointly: auto (curves as smooth as the data ask for), or families of "
         "backbone and damping, as polynomial:2,constant.",
         "FAMILIES",
+        choices=FAMILY_NAMES,
     )
     free: tuple[str, ...] = option(
         (),
         "Errors of the instruments to be found with the curves: force_gain, force_offset, "
         "instrument_phase; several with commas.",
         "NAMES",
+        choices=("force_gain", "force_offset", "instrument_phase"),
     )
     robust: bool = option(
         False,
@@ -344,9 +353,13 @@ class ModesOptions:
         "Residual terms of modes outside the band: auto, both, lower, upper, none.",
         flag="--residuals",
         panel="Fit",
+        choices=("auto", "both", "lower", "upper", "none"),
     )
     window: str | None = option(
-        None, "hann: model the leakage of averages of random excitation.", panel="Fit"
+        None,
+        "hann: model the leakage of averages of random excitation.",
+        panel="Fit",
+        choices=("hann",),
     )
     instrument_phase: bool | None = option(
         None, "Free a phase of the instruments (default: over a voltage only).", panel="Fit"
@@ -355,6 +368,7 @@ class ModesOptions:
         None,
         "The reference is the motion of a base, the responses are: absolute, relative.",
         "KIND",
+        choices=("absolute", "relative"),
     )
     drive_point: str | None = option(
         None, "Sensor at the force (default: by point and axis).", "NAME"
