@@ -2,11 +2,13 @@
 
 import dataclasses
 import os
+import pkgutil
 import re
 import shlex
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 from typing import get_args
 from unittest import mock
 
@@ -18,6 +20,7 @@ from truths.uff_writing import write_uff
 import snrmjax as sj
 from snrmjax.cli import app, main
 from snrmjax.cli.compare_command import METHOD_NAMES
+from snrmjax.cli.console import PAGES, SITE_PAGES
 from snrmjax.identify.joint.free_unknowns import FREE
 from snrmjax.identify.modal.linear_fit import ResidualTerms
 from snrmjax.measure.recordings.channels import Channel
@@ -26,6 +29,9 @@ from snrmjax.methods.comparison import METHODS, RECORD_METHODS
 from snrmjax.model.base_motion import SensorMotion
 from snrmjax.pipelines.options import FAMILY_NAMES, IdentifyOptions, ModesOptions
 
+ROOT = Path(__file__).resolve().parents[1]
+NAVIGATION = (ROOT / "notebooks/site/mkdocs.yml").read_text("utf-8").partition("\nnav:")[2]
+TITLES = {path: title for title, path in re.findall(r"- (.+): (\S+)\.md", NAVIGATION)}
 LINES, COLUMNS = 40, 80
 HERTZ = 2 * np.pi
 MODEL = """name = "one mode"
@@ -263,3 +269,48 @@ def test_completion_is_installed_in_a_fresh_home(shell, file, tmp_path):
     )
     assert shown.stdout.strip() == (tmp_path / file).read_text().strip()
     assert f"_SNRMJAX_COMPLETE=complete_{shell}" in shown.stdout
+
+
+# ------------------------------------------------------------------------------ read more
+
+REFUSED = {
+    "formats": "identify lacking.csv --model model.toml --out out",
+    "how-to/import": "import test.csv --force force_N --response acc:acceleration:g --out out",
+    "how-to/element": "nnm matrices.toml --to-hz 90 --out out",
+    "how-to/shaker-table": "identify measured.csv --model base.toml --out out",
+    "how-to/uncertain-force": "identify peaks.csv --model model.toml --free force_gain --out out",
+    "how-to/diagnose": "diagnose few.csv --model model.toml --out out",
+    "how-to/reduced-model": "rom model.toml --out out",
+    "how-to/study": "study run model.toml --out out",
+    "": "identify absent.csv --model model.toml --out out",
+}
+
+
+@pytest.mark.parametrize("page", REFUSED, ids=str)
+def test_a_refusal_names_the_page_that_says_more(page, folder, tmp_path, monkeypatch, capsys):
+    work = tmp_path / "work"
+    shutil.copytree(folder, work)
+    monkeypatch.chdir(work)
+    header, *rows = (work / "measured.csv").read_text().splitlines()
+    (work / "lacking.csv").write_text("\n".join(row.rpartition(",")[0] for row in (header, *rows)))
+    (work / "few.csv").write_text("\n".join((header, *rows[:2])))
+    peaks = [row for row in rows if 78.5 < float(row.split(",")[1]) < 80.0]
+    (work / "peaks.csv").write_text("\n".join((header, *peaks)))
+    (work / "base.toml").write_text(f'{MODEL}[base]\nmotion = "absolute"\n')
+    (work / "matrices.toml").write_text('name = "m"\n[structure]\npoints = ["a"]\nmass = [[1.0]]\n')
+    before = {*work.rglob("*")}
+    assert run(*REFUSED[page].split()) == 2
+    first, *others = capsys.readouterr().err.splitlines()
+    assert first.startswith("error: ")
+    assert others == (
+        [f'read more: the page "{TITLES[page]}" ({SITE_PAGES}/{page}.md)'] if page else []
+    )
+    assert {*work.rglob("*")} == before
+
+
+def test_every_page_that_refusals_name_is_in_the_navigation():
+    named = {page for page in PAGES.values() if page is not None}
+    assert named <= {(title, path) for path, title in TITLES.items()}
+    assert all((ROOT / SITE_PAGES / f"{path}.md").is_file() for _, path in named)
+    for part in PAGES:  # none is left over from a part that has moved
+        pkgutil.resolve_name(f"snrmjax.{part}")

@@ -11,7 +11,7 @@ import typer
 
 from snrmjax.cli.check_command import check
 from snrmjax.cli.compare_command import compare
-from snrmjax.cli.console import refuse
+from snrmjax.cli.console import read_more, refuse, say
 from snrmjax.cli.demo_command import demo
 from snrmjax.cli.diagnose_command import diagnose
 from snrmjax.cli.identify_command import identify
@@ -98,4 +98,7 @@ def main() -> None:
         app(prog_name="snrmjax")
     except ValueError as error:
         refuse(str(error))
+        more = read_more(error)
+        if more:
+            say(more)
         sys.exit(2)

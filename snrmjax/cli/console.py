@@ -1,5 +1,6 @@
 """What the commands say on standard error, and how they end."""
 
+import traceback
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -7,6 +8,30 @@ from typing import Any
 from rich.console import Console
 
 from snrmjax.report.writing import page_of
+
+SITE_PAGES = "notebooks/site/pages"  # of the repository; the site has no public address yet
+_FORMATS, _IMPORT = ("File formats", "formats"), ("Import a laboratory's files", "how-to/import")
+_ELEMENT = ("Place an element at a point", "how-to/element")
+_REDUCED = ("Make a reduced model", "how-to/reduced-model")
+# By the part of the package that refused an input, where a page helps: title and path.
+PAGES = {
+    "io.files": None,  # no such file, or no text
+    "io.tables.check_driven_alike": ("Use a shaker table", "how-to/shaker-table"),
+    "io.structure_matrices.moving_base": ("Use a shaker table", "how-to/shaker-table"),
+    "model.base_motion": ("Use a shaker table", "how-to/shaker-table"),
+    "io.tables": _FORMATS,
+    "io.models": _FORMATS,
+    "io.exchange": _IMPORT,
+    "io.laboratory": _IMPORT,
+    "pipelines.folder_contents": _IMPORT,
+    "io.structure_matrices": _ELEMENT,
+    "model.builders": _ELEMENT,
+    "identify.checks.instruments": ("Work with an uncertain force", "how-to/uncertain-force"),
+    "diagnose": ("Find the missing physics", "how-to/diagnose"),
+    "io.reduction": _REDUCED,
+    "io.calculix": _REDUCED,
+    "study": ("Run a study of 1 000 members", "how-to/study"),
+}
 
 console = Console(stderr=True, highlight=False, soft_wrap=True)
 
@@ -24,6 +49,21 @@ def warn(message: object) -> None:
 def refuse(message: str) -> None:
     """What is wrong with the input."""
     console.print(f"error: {message}", style="red", markup=False)
+
+
+def read_more(error: Exception) -> str | None:
+    """Where the site says more of why an input was refused, if it does.
+
+    The innermost call that `PAGES` knows decides, by its longest entry.
+    """
+    for frame, _ in reversed(list(traceback.walk_tb(error.__traceback__))):
+        package, _, module = frame.f_globals.get("__name__", "").partition(".")
+        name = f"{module}.{frame.f_code.co_qualname}."
+        known = [part for part in PAGES if package == "snrmjax" and name.startswith(f"{part}.")]
+        if known:
+            page = PAGES[max(known, key=len)]
+            return page and f'read more: the page "{page[0]}" ({SITE_PAGES}/{page[1]}.md)'
+    return None
 
 
 def tell(result: Any, notes: Iterable[object] | None = None) -> None:
