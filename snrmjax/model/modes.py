@@ -12,6 +12,7 @@ from jaxtyping import Array, Complex, Float, Shaped
 from snrmjax.model.base_motion import BaseMotion
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.names import suggestion
+from snrmjax.numerics.result import AbstractShown
 from snrmjax.numerics.rules import BELOW_ONE, POSITIVE, require
 from snrmjax.numerics.units import HERTZ
 
@@ -25,7 +26,7 @@ An assumption: careful modal tests of one structure agree to some per cent in th
 """
 
 
-class LinearModes(eqx.Module):
+class LinearModes(AbstractShown):
     """Mass-normalised linear modes, seen at some sensors and driven by one force pattern.
 
     `mode_of_interest` counts from zero; files count from one.
@@ -53,10 +54,12 @@ class LinearModes(eqx.Module):
     # Where the acceleration of a base drives it: participations are then −Γ, kg^1/2 per m/s².
     base: BaseMotion | None = eqx.field(static=True, default=None)
 
-    def __repr__(self) -> str:
-        """A line for every mode; within `jax.jit` and for a batch, the fields' shapes."""
-        if not have_values(self) or self.natural_frequency.ndim != 1:
-            return eqx.tree_pformat(self)
+    def has_screen(self) -> bool:
+        """Whether these are the modes of one structure, with values."""
+        return have_values(self) and self.natural_frequency.ndim == 1
+
+    def summary(self) -> tuple[str, ...]:
+        """A line for every mode."""
         rigid = self.rigid_body_participation.shape[0]
         beside = f" and {rigid} rigid-body mode{'s' if rigid > 1 else ''}" if rigid else ""
         count = f"{self.n_modes} mode{'s' if self.n_modes > 1 else ''}"
@@ -69,7 +72,7 @@ class LinearModes(eqx.Module):
             lines.append(f"… and {self.n_modes - _SHOWN} more")
         if self.base is not None:
             lines.append(f"driven by the acceleration of its base, {self.base.motion} motion")
-        return "\n  ".join(lines)
+        return tuple(lines)
 
     @property
     def n_modes(self) -> int:

@@ -26,6 +26,7 @@ from snrmjax.model.modes import LinearModes, have_values
 from snrmjax.model.places import row_text, unit_at
 from snrmjax.model.potential import PolynomialPotential, polynomial_potential
 from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.result import AbstractShown
 
 
 def _number(value: float = 0.0) -> Array:
@@ -51,7 +52,7 @@ class LinearTerms(NamedTuple):
         return own if self.coupling is None else own + self.coupling
 
 
-class Structure(eqx.Module):
+class Structure(AbstractShown):
     """q̈ + 2ζωq̇ + ω²q + ∂V/∂q + Σ effects = Φᵀb F(t), in modal coordinates q (kg^1/2 m).
 
     A force f at points acts on x = (bΦ)q and adds (bΦ)ᵀ f(x, ẋ); one on the mode of interest adds
@@ -74,13 +75,16 @@ class Structure(eqx.Module):
     test_order: Float[Array, ""] = eqx.field(default_factory=_number)
     name: str = eqx.field(static=True, default="structure")
 
-    def __repr__(self) -> str:
-        """Name, modes, potential, effects, errors; within `jax.jit` and of a batch the shapes."""
-        if not have_values(self) or self.test_order.ndim:
-            return eqx.tree_pformat(self)
+    def has_screen(self) -> bool:
+        """Whether this is one structure, with values."""
+        return have_values(self) and not self.test_order.ndim
+
+    def summary(self) -> tuple[str, ...]:
+        """Name, modes, potential, effects, errors."""
         monomials = self.potential.monomials
         terms = f"{len(monomials)} terms to degree {self.potential.degree}" if monomials else "none"
-        lines = [f"Structure {self.name!r}", *repr(self.modes).splitlines()]
+        of_modes, *modes = self.modes.summary()
+        lines = [f"Structure {self.name!r}", of_modes, *(f"  {mode}" for mode in modes)]
         lines.append(f"polynomial potential: {terms}")
         for effect in self.effects:
             rows = effect.rows if isinstance(effect, AbstractForce) else (None,)
@@ -96,7 +100,7 @@ class Structure(eqx.Module):
         stated = [f"{n} {s:.3g}" for n, s in zip(names, self.level_stds, strict=True) if s > 0]
         if stated:
             lines.append(f"1σ between levels: {', '.join(stated)}")
-        return "\n  ".join(lines)
+        return tuple(lines)
 
     @property
     def level_stds(self) -> tuple[float, float, float, float]:

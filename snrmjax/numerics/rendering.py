@@ -25,6 +25,11 @@ def on_one_screen(result: Any) -> str:
     return _module("printed").screen_of(result)
 
 
+def in_a_notebook(result: Any) -> str:
+    """A result as the HTML that notebooks show."""
+    return _module("printed").html_of(result)
+
+
 def drawn(result: Any, **settings: Any) -> Any:
     """The figure that shows a result."""
     return _module("figures").plot_result(result, **settings)

@@ -92,8 +92,24 @@ def setting(**settings: Any) -> Any:
     return eqx.field(static=True, metadata={"setting": True}, **settings)
 
 
+class AbstractShown(eqx.Module):
+    """Base of what says itself: on one screen by `print`, and as a table in a notebook."""
+
+    def has_screen(self) -> bool:
+        """Whether there are values to show: within `jax.jit` there are none yet."""
+        valueless = (jax.core.Tracer, jax.ShapeDtypeStruct)
+        return not any(isinstance(leaf, valueless) for leaf in jax.tree.leaves(self))
+
+    def __repr__(self) -> str:
+        """One screen; within `jax.jit`, where nothing has a value yet, the fields' shapes."""
+        return rendering.on_one_screen(self) if self.has_screen() else eqx.tree_pformat(self)
+
+    def _repr_html_(self) -> str | None:
+        return rendering.in_a_notebook(self) if self.has_screen() else None
+
+
 @dataclass_transform(field_specifiers=(eqx.field, quantity, setting))
-class AbstractResult(eqx.Module):
+class AbstractResult(AbstractShown):
     """Base of results: a repr of one screen, `to_xarray()`, `to_pandas()` and `plot()`.
 
     Fields say by `quantity` and `setting` what a data set has of them; a result with computed
@@ -119,13 +135,6 @@ class AbstractResult(eqx.Module):
             for field in dataclasses.fields(self)
             if "setting" in field.metadata
         }
-
-    def __repr__(self) -> str:
-        """One screen; within `jax.jit`, where nothing has a value yet, the fields' shapes."""
-        valueless = (jax.core.Tracer, jax.ShapeDtypeStruct)
-        if any(isinstance(leaf, valueless) for leaf in jax.tree.leaves(self)):
-            return eqx.tree_pformat(self)
-        return rendering.on_one_screen(self)
 
     def to_xarray(self) -> "xarray.Dataset":
         """The result as an `xarray.Dataset`, with a unit and a meaning on every variable."""
