@@ -11,7 +11,7 @@ from snrmjax.model.effects import EFFECTS
 
 README = (Path(__file__).resolve().parents[1] / "README.md").read_text(encoding="utf-8")
 EXAMPLES = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
-LINES = 150
+LINES = 120
 
 
 @pytest.fixture

@@ -65,6 +65,8 @@ _EXAMPLES: dict[Callable[..., None], tuple[str, ...]] = {
     simulate: (
         "snrmjax simulate model.toml --force 0.5 --from-hz 60 --to-hz 110 --out result",
         "snrmjax simulate model.toml --force 0.5 --force 1 --from-hz 60 --to-hz 110 --out result",
+        "snrmjax simulate model.toml --force 0.5 --from-hz 60 --to-hz 110 --follow fold "
+        "--parameter mode_1.damping_ratio --to 0.01 --out result",
     ),
     nnm: ("snrmjax nnm model.toml --to-hz 110 --out result",),
     rom: (

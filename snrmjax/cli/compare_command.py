@@ -46,7 +46,8 @@ def compare(
     time_s, force_n or drive_v (neither for a free decay) and velocity_m_s, acceleration_m_s2 or
     displacement_m (of several sensors tip.velocity_m_s, …).
 
-    A method that the data do not allow is named with the reason, and the others still run.
+    A method that the data do not allow is named with the reason, and the others still run. The
+    repository's benchmarks/methods_sources.py holds them against their sources.
 
     Writes compare.csv, summary.json, compare.png and report.html.
     """

@@ -28,6 +28,7 @@ PAGES = {
     "model.builders": _ELEMENT,
     "identify.checks.instruments": ("Work with an uncertain force", "how-to/uncertain-force"),
     "diagnose": ("Find the missing physics", "how-to/diagnose"),
+    "condense": _REDUCED,
     "io.reduction": _REDUCED,
     "io.calculix": _REDUCED,
     "study": ("Run a study of 1 000 members", "how-to/study"),

@@ -36,8 +36,10 @@ def modes(
 ) -> None:
     """Find linear modes with their errors and write them as a model.
 
-    Poles of all model orders are fitted to all responses together; shapes are mass-normalised by
-    the drive point, an added mass, masses at the sensors or a known shape, or refused.
+    Poles of all model orders are fitted to all responses together. Low-level stepped sines that
+    harden or soften already are taken at no amplitude, by a joint fit of their levels. Shapes are
+    mass-normalised by the drive point, an added mass, masses at the sensors or a known shape, or
+    refused.
 
     Writes the model (TOML), modes.csv and report.html.
     """

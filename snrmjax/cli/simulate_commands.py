@@ -84,7 +84,8 @@ def simulate(
 ) -> None:
     """Simulate responses to a harmonic force, unstable parts included.
 
-    Harmonic balance with arclength continuation around folds. Writes response.csv, response.png,
+    Harmonic balance with arclength continuation around folds. Events are followed over the force or
+    any number of the model, with cusps and isolas on the way. Writes response.csv, response.png,
     summary.json and report.html.
     """
     from snrmjax.io.models import read_model

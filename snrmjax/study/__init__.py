@@ -1,6 +1,6 @@
 """Sweeps and uncertainty studies: many members of one model, stored as one labelled data set.
 
-A study is a TOML file (README has one), run on this machine by
+A study is a TOML file (the how-to on studies has one), run on this machine by
 `snrmjax study run study.toml --out study.zarr` and drawn by
 `snrmjax study report study.zarr --out report`.
 
