@@ -88,8 +88,8 @@ def leaves(command, words=()):
 
 COMMANDS = leaves(typer.main.get_command(app))
 GROUPS = [(), ("study",)]
-# The chain on a whole beam, and all that a test has, take half a minute.
-SLOW = {("demo",), ("test",)}
+# The chain on a whole beam, and a diagnosis, take half a minute.
+SLOW = {("demo",), ("test",), ("diagnose",)}
 
 
 def run(*words):
