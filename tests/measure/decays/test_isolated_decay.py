@@ -116,3 +116,15 @@ def test_records_without_the_mode_are_refused(mode):
         sj.measure.isolate_decay(TIME[:400], mode[:400], REST)
     with pytest.raises(ValueError, match="8 samples a cycle are needed"):
         sj.measure.isolate_decay(TIME[::10], mode[::10], REST)
+
+
+def test_a_beat_whose_phase_runs_backwards_is_refused(capfd):
+    """Before, numbers that are not finite reached LAPACK, which printed a complaint."""
+    rng = np.random.default_rng(0)
+    time, omega = np.arange(0, 5.8, 1 / 1500), 2 * np.pi * 39.9
+    one = np.exp(-0.0025 * omega * time) * np.cos(omega * time + 0.3)
+    other = np.exp(-0.0011 * 0.89 * omega * time) * np.cos(0.89 * omega * time + 1.5)
+    signal = one + 0.6 * other + 0.003 * rng.standard_normal(len(time))
+    with pytest.raises(ValueError, match="phase of its motion runs backwards"):
+        sj.measure.isolate_decay(time, signal, omega)
+    assert capfd.readouterr() == ("", "")
