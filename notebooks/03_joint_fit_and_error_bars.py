@@ -30,7 +30,6 @@
 # `JAX_COMPILATION_CACHE_DIR` set to a folder, programs are kept for the next time.
 
 # %%
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -40,20 +39,8 @@ from snrmjax import plot
 from snrmjax.plot import style as drawing
 
 HERTZ = 2 * np.pi
-FIGURES = Path(sys.argv[1]) if len(sys.argv) > 1 and sys.argv[0].endswith(".py") else None
-HERE = Path(sys.argv[0]).resolve() if FIGURES else Path.cwd()
-MEASURED = next(
-    (up / "shared" / "data" for up in HERE.parents if (up / "shared/data").is_dir()), None
-)
+DATA = Path(os.environ.get("MEASURED_DATA", "../../shared/data"))
 headline = {}
-
-
-def show(figure, name):
-    """Return the figure to the notebook; as a script, write it into the folder given."""
-    if FIGURES is not None:
-        FIGURES.mkdir(parents=True, exist_ok=True)
-        plot.save_figure(FIGURES / f"{name}.png", figure, dots_per_inch=150)
-    return figure
 
 
 # %% [markdown]
@@ -92,12 +79,7 @@ for name, fit in fits.items():
 # notebook 01; with damping little of it is left.)
 
 # %%
-show(
-    plot.fitted_curves_figure(
-        [plot.FitSeries(name, fit) for name, fit in fits.items()], truth=truth
-    ),
-    "few_and_many",
-)
+plot.fitted_curves_figure([plot.FitSeries(name, fit) for name, fit in fits.items()], truth=truth)
 
 
 # %%
@@ -150,7 +132,7 @@ amplitude = "Velocity amplitude (m/s)"
 drawing.name_axes(left, "(a) natural frequency", amplitude, "Fitted less true (Hz)")
 drawing.name_axes(right, "(b) damping ratio", amplitude, "Fitted less true (% of critical)")
 drawing.legend(figure)
-show(figure, "less_the_truth")
+figure
 
 # %%
 few, many = fits.values()
@@ -211,7 +193,7 @@ for name, fit in fits.items():
 shares = sj.identify.contributions(with_levels)
 for row in shares.by_kind():
     print(f"{row.source:26s} {100 * row.frequency_share:5.1f} % {100 * row.damping_share:5.1f} %")
-show(shares.plot(), "contributions")
+shares.plot()
 
 # %% [markdown]
 # Are these widths right? Refits to states drawn with replacement within their levels (bootstrap)
@@ -240,7 +222,7 @@ for one in advice:
         f"{one.rank}. {1e3 * one.force:.2f} mN at {one.frequency / HERTZ:.2f} Hz, bands at "
         f"{100 * one.expected_band_ratio:.1f} %: {one.reason}"
     )
-show(advice.plot(), "next_measurements")
+advice.plot()
 
 # %%
 headline |= {
@@ -353,5 +335,4 @@ else:
 
 # %%
 print("\n".join(f"{'yes' if holds else 'NO '}  {claim}" for claim, holds in headline.items()))
-if not all(headline.values()):
-    raise SystemExit("a headline of this notebook does not hold")
+assert all(headline.values())

@@ -24,9 +24,8 @@
 #    identified by mistake?
 
 # %%
+# %matplotlib inline
 import dataclasses
-import sys
-from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -37,17 +36,8 @@ from snrmjax import plot
 from snrmjax.plot import style as drawing
 
 HERTZ = 2 * np.pi
-FIGURES = Path(sys.argv[1]) if len(sys.argv) > 1 and sys.argv[0].endswith(".py") else None
 AMPLITUDE, PHASE, FORCE = 0.01, np.radians(0.7), 0.003  # 1σ of a state
 headline = {}
-
-
-def show(figure, name):
-    """Return the figure to the notebook; as a script, write it into the folder given."""
-    if FIGURES is not None:
-        FIGURES.mkdir(parents=True, exist_ok=True)
-        plot.save_figure(FIGURES / f"{name}.png", figure, dots_per_inch=150)
-    return figure
 
 
 def report(found):
@@ -131,7 +121,7 @@ for axes, (name, (volts, tenths, used)) in zip(grid[0], PRINTED.items(), strict=
     drawing.name_axes(axes, f"printed values, {name} beam", "Force by the line (mN)", "")
     axes.set_ylabel("Damping over linear damping", fontsize=drawing.TEXT)
 drawing.legend(figure)
-show(figure, "force_lines")
+figure
 headline["printed intercepts are 6 % and 15 % of the lowest forces"] = (
     abs(shares["curved"] - 0.063) < 2e-3 and abs(shares["flat"] - 0.146) < 2e-3
 )
@@ -241,7 +231,7 @@ for number, share in enumerate(rise):
     # 2ζω = A F cos φ / v, here of the error of F, in the middle of the phases
     line = linear + share * forces[0] * modal * np.cos(np.radians(26)) / speed
     axes.plot(speed, line, color=drawing.SERIES[number], linewidth=0.9)
-show(figure, "damping_with_offset")
+figure
 headline["damping at the lowest level errs by the share left out, within 2 %"] = all(
     abs(ratio - (1 + share)) < 0.02 for share, ratio in rise.items()
 )
@@ -344,7 +334,7 @@ axes.set_xticks(range(len(BINS)), [f"{a}° to {b}°" for a, b in BINS])
 axes.set_xlim(-0.4, len(BINS) - 0.6)
 drawing.name_axes(axes, "", "Phase of the states from resonance", "Gain: offset less friction")
 drawing.legend(figure)
-show(figure, "offset_or_friction")
+figure
 
 # %% [markdown]
 # With states on one side of resonance only, the stable one, the answer depends on the linear test.
@@ -498,7 +488,7 @@ figure.axes[0].set(xscale="log", xlim=(0.02, 4.0))
 marks = [0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0]
 figure.axes[0].set_xticks(marks, [f"{one:g}" for one in marks])
 figure.axes[0].minorticks_off()
-show(figure, "peak_damping")
+figure
 for (name, quantity), value in apparent.items():
     print(f"{name}, top level, {quantity}: {value:.2f} 1/s, {value / linear:.3f} of {linear:.2f}")
 headline["stiffening tends to the limits 1.165 (peak) and 1.018 (fundamental)"] = (
@@ -532,7 +522,7 @@ headline["both: held-out and top level predicted to within their noise"] = all(
 )
 
 # %%
-show(soft.plot(), "peak_residuals")
+soft.plot()
 
 # %% [markdown]
 # No damping law is identified. The true stiffness does not fit amplitudes that were misread, which
@@ -552,7 +542,7 @@ free = stated(
 )
 misled = sj.diagnose_model(free, read(full["softening"], "peak"))
 report(misled)
-show(plot.candidates_figure(misled), "peak_candidates")
+plot.candidates_figure(misled)
 by_kind = gains(misled)
 law = next(row for row in misled.table[0] if row.kind.endswith("_damping"))
 print(f"best damping law: {law.kind}, gain {law.gain:.0f}", law.parameters)
@@ -572,5 +562,4 @@ headline["it is damping that falls with amplitude"] = min(law.parameters.values(
 
 # %%
 print("\n".join(f"{'yes' if holds else 'NO '}  {claim}" for claim, holds in headline.items()))
-if not all(headline.values()):
-    raise SystemExit("a headline of this notebook does not hold")
+assert all(headline.values())

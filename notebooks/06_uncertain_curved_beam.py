@@ -31,9 +31,9 @@
 # continues a study that was stopped, or opens one that is finished.
 
 # %%
+# %matplotlib inline
 import dataclasses
 import os
-import sys
 import tempfile
 from pathlib import Path
 
@@ -45,21 +45,12 @@ from snrmjax.plot import style as drawing
 from snrmjax.study.uncertainty.sensitivity import main_effect
 
 HERTZ = 2 * np.pi
-FIGURES = Path(sys.argv[1]) if len(sys.argv) > 1 and sys.argv[0].endswith(".py") else None
 MEMBERS = int(os.environ.get("STUDY_MEMBERS", "10000"))
 SCALED_DOWN = MEMBERS < 1000  # for a quick look; bands and indices are coarse then
 FOLDER = Path(os.environ.get("STUDY_FOLDER") or tempfile.mkdtemp())
 BLUE, ORANGE, GREEN = drawing.MEASURED, drawing.IDENTIFIED, drawing.SERIES[2]
 HZ, VELOCITY = "Frequency (Hz)", "Velocity amplitude (m/s)"
 headline = {}
-
-
-def show(figure, name):
-    """Return the figure to the notebook; as a script, write it into the folder given."""
-    if FIGURES is not None:
-        FIGURES.mkdir(parents=True, exist_ok=True)
-        plot.save_figure(FIGURES / f"{name}.png", figure, dots_per_inch=150)
-    return figure
 
 
 # %% [markdown]
@@ -123,7 +114,7 @@ panels[0, 0].axvline(third, color="0.5", linestyle=":", linewidth=1.0, label="se
 drawing.name_axes(panels[0, 0], "", HZ, VELOCITY)
 panels[0, 0].set(xlim=(38, 75), ylim=(0, 0.2))
 drawing.legend(figure)
-show(figure, "beam_batch_two_beams")
+figure
 print({f"{1e3 * less:.1f} mm less": f"peak at {at:.2f} Hz" for less, at in highest.items()})
 headline["0.1 mm less rise moves the peak past the internal resonance, by more than 10 Hz"] = (
     highest[0.0] > third and highest[0.1e-3] < third and highest[0.0] - highest[0.1e-3] > 10
@@ -195,7 +186,7 @@ for axes, name, title, colour in zip(
     drawing.name_axes(axes, title, HZ, VELOCITY if name == "upper" else "")
     axes.set(xlim=(40, 75), ylim=(0, 0.25))
 drawing.legend(figure)
-show(figure, "beam_batch_bands")
+figure
 
 # %% [markdown]
 # What one quantity does by itself: the mean over the others (line, with its 95 % band) among some
@@ -223,7 +214,7 @@ for row, (text, output) in zip(panels, OUTPUTS, strict=True):
         title = f"{100 * effect.share:.0f} % of the variance"
         drawing.name_axes(axes, title, LABEL[name], text if column == 0 else "")
 drawing.legend(figure)
-show(figure, "beam_batch_main_effects")
+figure
 print({f"{text}, {name}": f"{share:.3f}" for (text, name), share in shares.items()})
 
 # %% [markdown]
@@ -241,7 +232,7 @@ paired = dataclasses.replace(
 )
 indices = sj.study.sobol_indices(sj.study.run_study(paired, FOLDER / "indices.zarr").open())
 print(indices)
-show(plot.sensitivity_figure(indices), "beam_batch_indices")
+plot.sensitivity_figure(indices)
 
 # %% [markdown]
 # The rise decides: by it the beam is stiff, and by it the stiffness falls with amplitude. Thickness
@@ -260,7 +251,7 @@ quantities = sj.study.response_quantities(
 )
 propagated = sj.study.propagate_uncertainty(quantities)
 print(propagated)
-show(propagated.plot(), "beam_batch_propagation")
+propagated.plot()
 
 # %% [markdown]
 # From which scatter on is first order off by 10 % (of its standard deviation or of its 95 % range)?
@@ -288,7 +279,7 @@ bell = np.exp(-0.5 * ((x - nominal_peak) / by_first) ** 2) / (by_first * np.sqrt
 panels[0, 0].plot(x, bell, color=BLUE, label="first order")
 drawing.name_axes(panels[0, 0], "", "Peak frequency (Hz)", "Density (1/Hz)")
 drawing.legend(figure)
-show(figure, "beam_batch_peaks")
+figure
 print(
     f"1σ of the peak's frequency: first order {by_first:.2f} Hz, highest peaks"
     f" {np.std(peak_hz):.2f} Hz"

@@ -29,8 +29,8 @@
 # mass-normalised shapes, q in kg^1/2 m; the force's coefficients of mode 1 are α of q² and β of q³.
 
 # %%
+# %matplotlib inline
 import shutil
-import sys
 import tempfile
 from pathlib import Path
 
@@ -39,21 +39,11 @@ import numpy as np
 
 import snrmjax as sj
 from snrmjax import condense as fe
-from snrmjax import plot
 from snrmjax.plot import style as drawing
 
 HERTZ = 2 * np.pi
-FIGURES = Path(sys.argv[1]) if len(sys.argv) > 1 and sys.argv[0].endswith(".py") else None
 BLUE, ORANGE, GREEN = drawing.MEASURED, drawing.IDENTIFIED, drawing.SERIES[2]
 headline = {}
-
-
-def show(figure, name):
-    """Return the figure to the notebook; as a script, write it into the folder given."""
-    if FIGURES is not None:
-        FIGURES.mkdir(parents=True, exist_ok=True)
-        plot.save_figure(FIGURES / f"{name}.png", figure, dots_per_inch=150)
-    return figure
 
 
 # %% [markdown]
@@ -116,7 +106,7 @@ axes.loglog(ends, ends, ":", color="0.4", label="as printed")
 axes.loglog(ends, 3 * ends, "-", color=ORANGE, label="three times the print")
 drawing.name_axes(axes, "", "Printed (kg⁻² m⁻² s⁻²)", "Finite elements (kg⁻² m⁻² s⁻²)")
 drawing.legend(figure)
-show(figure, "flat_beam_coefficients")
+figure
 
 # %% [markdown]
 # They lie on one line, three times the print, but for one (1134, small, of the wrong sign). So the
@@ -189,7 +179,7 @@ axes.axhline(0.0, color="0.8", linewidth=0.8, zorder=0)
 axes.set(ylim=(-1.8, 1.2))
 drawing.name_axes(axes, "", "Inward displacement (thicknesses)", "Load f/ω² (thicknesses)")
 drawing.legend(figure)
-show(figure, "curved_beam_readings")
+figure
 
 # %% [markdown]
 # The finite elements lose their stability at an inward load of about 0.38 and jump. All three
@@ -339,7 +329,7 @@ axes.plot(fitted, velocity, "-", color=ORANGE, linewidth=drawing.LINE, label="ca
 axes.plot(noisy, velocity, "o", ms=3.5, color=BLUE, label="measured points")
 drawing.name_axes(axes, "", "Natural frequency (Hz)", "Velocity at midspan (m/s)")
 drawing.legend(figure)
-show(figure, "beam_of_unknown_thickness")
+figure
 
 # %% [markdown]
 # The same numbers vary in a study: `snrmjax study run study.toml` with `model = "beam.toml"` and

@@ -22,9 +22,10 @@
 # backbone, and at the end what no check can see.
 
 # %%
-import contextlib
+# %matplotlib inline
 import json
 import shlex
+import subprocess
 import sys
 import tempfile
 from pathlib import Path
@@ -34,31 +35,20 @@ import pyuff
 import scipy.io
 
 import snrmjax as sj
-from snrmjax import plot
-from snrmjax.cli import app
 from snrmjax.io.laboratory import read_laboratory_file
 from snrmjax.plot import style as drawing
 
 HERTZ, GRAVITY = 2 * np.pi, 9.80665
-FIGURES = Path(sys.argv[1]).resolve() if sys.argv[0].endswith(".py") and sys.argv[1:] else None
 headline = {}
 folder = tempfile.TemporaryDirectory()
 LAB = Path(folder.name)
 
 
-def show(figure, name):
-    """Return the figure to the notebook; as a script, write it into the folder given."""
-    if FIGURES is not None:
-        FIGURES.mkdir(parents=True, exist_ok=True)
-        plot.save_figure(FIGURES / f"{name}.png", figure, dots_per_inch=150)
-    return figure
-
-
 def typed(line):
     """A command as it is typed in the laboratory's folder, with all that it says."""
-    print(f"$ {line}")
-    with contextlib.chdir(LAB), contextlib.redirect_stderr(sys.stdout):
-        app(shlex.split(line)[1:], standalone_mode=False)
+    command = [sys.executable, "-m", *shlex.split(line)]
+    said = subprocess.run(command, cwd=LAB, check=True, capture_output=True, text=True)
+    print(f"$ {line}\n{said.stderr}{said.stdout}")
 
 
 # %% [markdown]
@@ -191,7 +181,7 @@ for level, colour in zip((1, 2, 3), drawing.SERIES, strict=False):
     size, label = table["acc"][at] / table["force"][at], f"{table['force'][at][0]:g} N"
     right.plot(table["freq"][at], size, ".-", color=colour, label=label)
 right.legend(frameon=False, fontsize=drawing.SMALL)
-show(figure, "what_is_in_the_files")
+figure
 
 # %% [markdown]
 # Over the force, the three levels part at resonance: it moves up, and is damped more. That is what
@@ -284,7 +274,7 @@ for axes, truth, seen in ((left, stiffer / HERTZ, natural / HERTZ), (right, damp
     )
     axes.plot(velocity, factor * seen, ".", color=drawing.IDENTIFIED, label="identified")
 drawing.legend(figure)
-show(figure, "backbone_of_the_files")
+figure
 
 # %%
 as_seen = np.interp(velocity, GAIN * moved, stiffer)
@@ -327,5 +317,4 @@ headline["the spring is too stiff by the gain three times over, within 2 %"] = b
 # %%
 folder.cleanup()
 print("\n".join(f"{'yes' if holds else 'NO '}  {claim}" for claim, holds in headline.items()))
-if not all(headline.values()):
-    raise SystemExit("a headline of this notebook does not hold")
+assert all(headline.values())

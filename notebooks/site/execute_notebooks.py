@@ -1,0 +1,81 @@
+"""Run the notebooks and keep them with their outputs, for the site's tutorials.
+
+    python notebooks/site/execute_notebooks.py [--only 03]
+
+Writes `executed/NAME.ipynb` beside this file. A notebook is run again only after a change of its
+script or of the package. Measured data are looked for as the notebooks do: in the folder that
+the environment variable MEASURED_DATA names, else in `shared/data` beside the project.
+"""
+
+import argparse
+import hashlib
+import os
+import sys
+import time
+from pathlib import Path
+
+import jupytext
+import nbclient
+import nbformat
+
+SITE = Path(__file__).resolve().parent
+NOTEBOOKS = SITE.parent
+EXECUTED = SITE / "executed"
+FIGURES = "--InlineBackend.print_figure_kwargs={'dpi': 150}"
+
+
+def scripts() -> list[Path]:
+    """Every notebook, in the order of its number."""
+    return sorted(NOTEBOOKS.glob("[0-9]*.py"))
+
+
+def key(script: Path) -> str:
+    """What the outputs of a notebook depend on: its script and the package's source."""
+    package = NOTEBOOKS.parent / "snrmjax"
+    source = sorted(p for p in package.rglob("*") if p.suffix in (".py", ".pyi", ".html"))
+    digest = hashlib.sha256()
+    for path in (script, *source):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def execute(script: Path) -> nbformat.NotebookNode:
+    """The notebook with its outputs. A cell that fails raises `nbclient`'s CellExecutionError."""
+    notebook = jupytext.read(script)
+    client = nbclient.NotebookClient(
+        notebook, kernel_name="python3", timeout=None, extra_arguments=[FIGURES]
+    )
+    project = os.pathsep.join(filter(None, (str(NOTEBOOKS.parent), os.environ.get("PYTHONPATH"))))
+    client.execute(cwd=str(NOTEBOOKS), env={**os.environ, "PYTHONPATH": project})
+    notebook.metadata["snrmjax"] = {"key": key(script)}
+    return notebook
+
+
+def is_fresh(script: Path) -> bool:
+    """Whether the kept outputs are those of this script and this package."""
+    path = EXECUTED / f"{script.stem}.ipynb"
+    if not path.is_file():
+        return False
+    return nbformat.read(path, 4).metadata.get("snrmjax", {}).get("key") == key(script)
+
+
+def main() -> None:
+    """Run what is not fresh."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--only", metavar="NUMBER", help="such as 03")
+    only = parser.parse_args().only
+    chosen = [script for script in scripts() if only is None or script.stem.startswith(only)]
+    if not chosen:
+        sys.exit(f"there is no notebook {only} in {NOTEBOOKS}")
+    EXECUTED.mkdir(exist_ok=True)
+    for script in chosen:
+        if is_fresh(script):
+            print(f"{script.stem}: unchanged")
+            continue
+        start = time.perf_counter()
+        nbformat.write(execute(script), EXECUTED / f"{script.stem}.ipynb")
+        print(f"{script.stem}: {time.perf_counter() - start:.0f} s", flush=True)
+
+
+if __name__ == "__main__":
+    main()
