@@ -10,28 +10,29 @@
 # ---
 
 # %% [markdown]
-# # Curves with error bars: the joint fit, on two computed tests and two measured beams
+# # Curves with error bars: the joint fit, on two computed tests
 #
 # Notebook 01 computes one point of the backbone from every measured state. Here all states together
 # give two smooth curves, natural frequency and damping against amplitude, with 95 % bands:
 #
 # 1. 32 near-resonant states of eight force levels against 85 states along one response: what each
 #    test determines, and how well;
-# 2. what a band is made of, whether its width is right, and which state to measure next;
-# 3. a suspended beam, measured: the force is known only as a voltage;
-# 4. the Brake–Reuss beam, measured: levels that contradict one another, and levels left out.
+# 2. what a band is made of, whether its width is right, and which state to measure next.
 #
-# The residual of a state is that of its force balance: (ω̃² − Ω²) + iΩ·2ζ̃ω̃ times displacement
-# over modal constant should equal the force, at the motion as it was measured. No response is
-# computed, so folds and unstable parts do no harm. Residuals are divided by their noise and made
-# independent ("whitened"). Errors that all states of a level have in common are unknowns too.
+# Notebook 11 does the same with a measured beam. The residual of a state is that of its force
+# balance, at the motion as it was measured,
+#
+# $$\left(\tilde\omega^2 - \Omega^2 + 2i\tilde\zeta\tilde\omega\Omega\right) X / A - F ,$$
+#
+# with the displacement $X$, the modal constant $A$ and the force $F$. No response is computed, so
+# folds and unstable parts do no harm. Residuals are divided by their noise and made independent
+# ("whitened"). Errors that all states of a level have in common are unknowns too.
 #
 # The first call of a kind compiles its program, which takes seconds. With
 # `JAX_COMPILATION_CACHE_DIR` set to a folder, programs are kept for the next time.
 
 # %%
-from pathlib import Path
-
+# %matplotlib inline
 import numpy as np
 
 import snrmjax as sj
@@ -39,7 +40,6 @@ from snrmjax import plot
 from snrmjax.plot import style as drawing
 
 HERTZ = 2 * np.pi
-DATA = Path(os.environ.get("MEASURED_DATA", "../../shared/data"))
 headline = {}
 
 
@@ -79,6 +79,7 @@ for name, fit in fits.items():
 # notebook 01; with damping little of it is left.)
 
 # %%
+# Natural frequency and damping against amplitude by both tests, with bands, and the true curves.
 plot.fitted_curves_figure([plot.FitSeries(name, fit) for name, fit in fits.items()], truth=truth)
 
 
@@ -118,7 +119,9 @@ for name, (values, bands) in rows.items():
 # %% [markdown]
 # The curves are too close together to compare. Their differences from the truth show more.
 
-# %%
+# %% tags=["hide-input"]
+# Fitted less true natural frequency and damping against amplitude, with 95 % bands: that of eight
+# levels is narrow at small amplitudes, that of one response at its tip.
 figure, ((left, right),) = drawing.panels(drawing.PAGE, 3.2, 1, 2)
 colours = drawing.SERIES[:2]
 for (name, (values, bands)), colour in zip(rows.items(), colours, strict=True):
@@ -190,6 +193,7 @@ for name, fit in fits.items():
 # squares, times the variances, add up to the band's: the shares below.
 
 # %%
+# Bars: the share of every kind of measured number in the variance of both curves.
 shares = sj.identify.contributions(with_levels)
 for row in shares.by_kind():
     print(f"{row.source:26s} {100 * row.frequency_share:5.1f} % {100 * row.damping_share:5.1f} %")
@@ -216,6 +220,7 @@ for name in knots[3::4]:
 # (optimal design).
 
 # %%
+# The five advised states among the candidates, in frequency and force.
 advice = sj.next_measurements(with_levels, 5)
 for one in advice:
     print(
@@ -233,105 +238,6 @@ headline |= {
     "shares sum to the whole variance": abs(sum(s.frequency_share for s in shares) - 1) < 1e-9
     and abs(sum(s.damping_share for s in shares) - 1) < 1e-9,
 }
-
-# %% [markdown]
-# ## 3. A suspended beam whose force is a voltage
-#
-# Measured by Brack and colleagues (Nature Physics 18 (2022) 952): a beam hung in vacuum, 42.8 Hz,
-# four drive levels of 40 states each. The gain from voltage to force and the phase shift of the
-# instruments are unknowns of the fit. The stated noise is the scatter of ten readings at one
-# setting. The residuals are sixteen times as large, and those of neighbouring states are
-# correlated: the bands are widened for both, as the notes say.
-#
-# The measurements of sections 3 and 4 are not part of this project. Without them, in a folder
-# `shared/data` beside it, these sections are skipped and say so.
-
-
-# %%
-def measured(name, table):
-    """Data and model of a measured beam."""
-    model = sj.read_model(MEASURED / name / "model.toml")
-    return sj.read_steady_states(MEASURED / name / table, model), model
-
-
-if MEASURED is None:
-    print("skipped: no measured data in shared/data")
-else:
-    data, model = measured("suspended_beam", "lock_in_stepped_sine.csv")
-    hung = sj.fit_jointly(data, model.modes, free=("force_gain", "instrument_phase"))
-    std = np.sqrt(np.diag(hung.covariance))
-    place = hung.names().index("instrument_phase")
-    turn = np.degrees([hung.unknowns.instrument_phase, std[place]])
-    gain = np.exp(float(hung.unknowns.log_force_gain))
-    print(hung)
-    print(f"gain {gain:.4f} N/V, phase {turn[0]:.2f} ± {turn[1]:.2f}°")
-    points = sj.identify.identify_points(sj.identify.corrected_states(data, hung), model.modes)
-    series = [plot.FitSeries("fit", hung, points)]
-    show(plot.fitted_curves_figure(series), "suspended_beam")
-    show(plot.residuals_figure(hung), "suspended_residuals")
-
-# %% [markdown]
-# ## 4. The Brake–Reuss beam
-#
-# A bolted lap joint near 80 Hz (Chen et al., MSSP 166 (2022) 108401): stepped sines at eight held
-# amplitudes. The joint dissipates more the more it slips, and levels repeat only to 0.1 Hz or so.
-# No noise is stated: the fit estimates it. The single states of a level disagree, in damping by up
-# to a factor of two. A phase error of 5° for a whole level would explain that, and the fit
-# estimates such an error; but its residuals still vary with the phase, so this is not the whole
-# explanation.
-
-# %%
-if MEASURED is None:
-    print("skipped: no measured data in shared/data")
-else:
-    data, model = measured("brake_reuss_beam", "response_controlled.csv")
-    bolted = sj.fit_jointly(data, model.modes)
-    print(bolted)
-    points = sj.identify.identify_points(data, model.modes)
-    series = [plot.FitSeries("fit", bolted, points)]
-    show(plot.fitted_curves_figure(series), "brake_reuss_beam")
-    show(plot.residuals_figure(bolted), "brake_reuss_residuals")
-
-# %% [markdown]
-# Levels 4 and 7 are now left out, and predicted by the other six (cross-validation). Dots are their
-# single states.
-#
-# Note the bands of this fit. Six levels are too few to estimate the level-to-level variance of the
-# natural frequency: its notes name gain and phase only, and its bands are far too narrow. With all
-# eight levels it is 0.04 %, by which the predictions are judged below (in brackets). Where levels
-# are few, a band without level-to-level variance is too narrow.
-
-# %%
-if MEASURED is None:
-    print("skipped: no measured data in shared/data")
-else:
-    out = np.isin(np.asarray(data.level), (4, 7))
-    six = sj.fit_jointly(data.select(~out), model.modes)
-    print(six)
-    unseen = sj.identify.identify_points(data.select(out), model.modes)
-    series = [plot.FitSeries("fit of the other six levels", six, unseen)]
-    show(plot.fitted_curves_figure(series), "levels_held_out")
-    close = np.abs(np.angle(np.asarray(unseen.mode_velocity))) < np.radians(45)
-    at = np.asarray(unseen.backbone_velocity)
-    predicted = sj.identify.fitted_values(six, at)
-    yardstick = sj.identify.fitted_values(bolted, at, of_a_new_level=True)
-    for level in (4, 7):
-        rows = close & (np.asarray(unseen.level) == level)
-
-        def typical(values, rows=rows):
-            return float(np.median(np.asarray(values)[rows]))
-
-        hertz = typical(unseen.natural_frequency - predicted.natural_frequency) / HERTZ
-        ratio = typical(unseen.damping_ratio / predicted.damping_ratio) - 1
-        scatter = typical(yardstick.natural_frequency_std) / HERTZ
-        relative = typical(yardstick.damping_ratio_std / yardstick.damping_ratio)
-        print(
-            f"level {level}: frequency off by {hertz:+.3f} Hz (1σ of a level: {scatter:.3f}), "
-            f"damping by {100 * ratio:+.1f} % ({100 * relative:.1f})"
-        )
-        headline[f"level {level} predicted within 0.15 Hz and 15 % of damping"] = (
-            abs(hertz) < 0.15 and abs(ratio) < 0.15
-        )
 
 # %%
 print("\n".join(f"{'yes' if holds else 'NO '}  {claim}" for claim, holds in headline.items()))

@@ -17,23 +17,22 @@
 # checks the completed model on a level that was left out of the fit:
 #
 # 1. an effect that the model lacks, from the first disagreement to the completed model;
-# 2. two effects that the fundamental cannot distinguish, and the measurement that does;
-# 3. a bolted beam, measured: what the linear model of the Brake–Reuss beam lacks.
+# 2. two effects that the fundamental cannot distinguish, and the measurement that does.
+#
+# Notebook 11 does this with a measured beam.
 #
 # Forces are compared, not responses: the measured motion is prescribed to the model, and the force
 # that it needs is compared with the one that acted (inverse harmonic balance). This force is
 # unique, also where the response folds.
 
 # %%
-from pathlib import Path
-
+# %matplotlib inline
 import numpy as np
 
 import snrmjax as sj
 from snrmjax import plot
 
 HERTZ = 2 * np.pi
-DATA = Path(os.environ.get("MEASURED_DATA", "../../shared/data"))
 headline = {}
 
 
@@ -99,11 +98,17 @@ headline["the level left out is predicted to within its noise"] = found.gap.inte
 # effect would explain by itself.
 
 # %%
+# The misfit of every state in units of its noise, before and after the stop is added: from tens
+# to about one.
 found.plot()
 
 # %%
+# Responses of the model as given and as completed over the measured states of five levels: only
+# the completed one follows them.
 predicted = sj.diagnose.predict_levels(found, model)
 plot.comparison_figure(predicted.before, predicted.after, test.steady_states)
+
+# %%
 for row in predicted.levels:
     print(
         f"level {row.level}{', left out' if row.held_out else ''}: resonance measured "
@@ -119,6 +124,7 @@ headline["resonances of levels left out predicted within 0.1 Hz and 2 %"] = all(
 )
 
 # %%
+# Bars: how much each effect of the library explains by itself; the one-sided stop the most.
 plot.candidates_figure(found)
 
 # %% [markdown]
@@ -160,40 +166,6 @@ headline["without harmonics it is ambiguous, the truth in the class"] = (
     blurred.verdict == "ambiguous" and "one_sided_stop" in rivals and "gap_stiffness" in rivals
 )
 headline["the diagnosis asks for harmonics"] = "harmonic" in (blurred.decide_by or "")
-
-# %% [markdown]
-# With the harmonics, as in part 1, one effect of the class is left.
-
-# %% [markdown]
-# ## 3. The Brake–Reuss beam, measured
-#
-# Two beams bolted at a lap joint; eight levels of constant response, 41 states each. The model is
-# the linear test's: 80.37 Hz and 0.15 %. Neither noise nor errors of levels are stated: both are
-# estimated. The levels vary, as the joint fit of notebook 03 finds too, by 3 % in gain and 5° in
-# phase, and natural frequency and damping vary from level to level.
-
-# %%
-if MEASURED is None:
-    print("skipped: no measured data in shared/data")
-else:
-    linear = sj.read_model(MEASURED / "brake_reuss_beam" / "model.toml")
-    table = MEASURED / "brake_reuss_beam" / "response_controlled.csv"
-    data = sj.read_steady_states(table, linear)
-    joint = sj.diagnose_model(linear, data)
-    report(joint)
-    show(joint.plot(), "brake_reuss_residuals")
-    headline["damping is located to grow"] = any(p.part == "damping" for p in joint.located)
-    headline["level left out: misfit reduced by two thirds or more"] = (
-        joint.gap.interpolated.after < 0.33 * joint.gap.interpolated.before
-    )
-
-# %% [markdown]
-# Is this plausible? The first effect found is not a nonlinearity: a residual receptance of −6.0
-# µm/N at the drive point, of the sign and size of a free beam's rigid-body motion, which a linear
-# model of one mode leaves out. It is visible in the raw data: apparent damping falls along every
-# level, by 0.2 to 0.3 of itself per hertz at 0.17 % and at 0.73 % alike. A residual receptance does
-# that, an error of phase does not. Beside it damping grows with amplitude. With one mode and no
-# harmonics several laws fit that, so the answer is marked ambiguous.
 
 # %%
 print("\n".join(f"{'yes' if holds else 'NO '}  {claim}" for claim, holds in headline.items()))

@@ -40,15 +40,10 @@ AMPLITUDE, PHASE, FORCE = 0.01, np.radians(0.7), 0.003  # 1σ of a state
 headline = {}
 
 
-def report(found):
-    """A diagnosis, with the parts of the model that disagree and the notes."""
-    print(found)
-    for part in found.located:
-        power = f", power {part.exponent:.2f} ± {part.exponent_std:.2f}" if part.exponent else ""
-        low, high = part.velocity_range
-        print(f"  located: {part.part}, {low:.3g} to {high:.3g} m/s{power}")
-    for note in found.notes:
-        print("  note:", note)
+def verdict(found):
+    """The answer of a diagnosis in a line: what is named, with rivals where they cannot be told."""
+    named = " and ".join(" or ".join(rivals) for rivals in found.candidates)
+    return f"{found.verdict} {named}".replace("_", " ")
 
 
 def stated(model, potential):
@@ -61,11 +56,6 @@ def stated(model, potential):
     return dataclasses.replace(model, modes=modes, potential=potential)
 
 
-def gains(found):
-    """What each effect by itself gains, by kind."""
-    return {row.kind: row.gain for row in found.table[0]}
-
-
 # %% [markdown]
 # ## 1. Low-amplitude damping: is it the force?
 #
@@ -75,7 +65,10 @@ def gains(found):
 # responses with the *linear* damping, and draws a line through them. The lines miss the origin by
 # far more than their errors, and the lowest forces of the validation are small:
 
-# %%
+# %% tags=["hide-input"]
+# Damping over linear damping against force for both beams: an intercept left out lets it rise
+# towards low forces, one subtracted by mistake lets it fall, both far outside the error of the
+# line.
 PRINTED = {  # drive in V and force in N of section 4.1, forces of the validation in section 4.2
     "curved": ([0.01, 0.02, 0.03], [1.9138, 4.6678, 7.3752], [1.279e-3, 4.000e-3, 6.719e-3]),
     "flat": (
@@ -122,6 +115,8 @@ for axes, (name, (volts, tenths, used)) in zip(grid[0], PRINTED.items(), strict=
     axes.set_ylabel("Damping over linear damping", fontsize=drawing.TEXT)
 drawing.legend(figure)
 figure
+
+# %%
 headline["printed intercepts are 6 % and 15 % of the lowest forces"] = (
     abs(shares["curved"] - 0.063) < 2e-3 and abs(shares["flat"] - 0.146) < 2e-3
 )
@@ -212,7 +207,9 @@ def recorded(states, nearest, farthest, *, missing=0.0, seed=1, per_level=6, sid
 # method finds from such states when an intercept of 6, 10 and 15 % of the lowest force is left out
 # of the force, and with the opposite error (lines: the prediction by 1/F):
 
-# %%
+# %% tags=["hide-input"]
+# Damping against velocity with intercepts of 0, 6, 10 and 15 % left out and 15 % subtracted: the
+# points follow the lines of 1/F.
 linear = float(2 * first.damping_ratio[0] * first.natural_frequency[0])
 series, rise = [], {}
 for share in (0.0, 0.06, 0.10, 0.15, -0.15):
@@ -232,6 +229,8 @@ for number, share in enumerate(rise):
     line = linear + share * forces[0] * modal * np.cos(np.radians(26)) / speed
     axes.plot(speed, line, color=drawing.SERIES[number], linewidth=0.9)
 figure
+
+# %%
 headline["damping at the lowest level errs by the share left out, within 2 %"] = all(
     abs(ratio - (1 + share)) < 0.02 for share, ratio in rise.items()
 )
@@ -254,12 +253,11 @@ for window, (nearest, farthest) in WINDOWS.items():
     for share in (0.06, 0.10, 0.15):
         data = recorded(motions["beam"], nearest, farthest, missing=share * forces[0])
         found[window, share] = sj.diagnose_model(model, data)
-        print(f"\n{100 * share:.0f} % left out, {window}, {data.n_states} states")
-        report(found[window, share])
+        print(f"{window}, {100 * share:.0f} % left out: {verdict(found[window, share])}")
     data = recorded(motions["beam with friction"], nearest, farthest)
     found[window, "friction"] = sj.diagnose_model(model, data)
-    print(f"\nfriction, {window}, {data.n_states} states")
-    report(found[window, "friction"])
+    print(f"{window}, friction: {verdict(found[window, 'friction'])}")
+print(found["as the paper's flat beam", 0.1])
 
 # %%
 BOTH = {"coulomb_friction", "force_offset_error"}
@@ -294,79 +292,6 @@ nothing = sj.diagnose_model(model, recorded(motions["beam"], 18, 34))
 headline["a right force: nothing is missing"] = nothing.verdict == "none"
 
 # %% [markdown]
-# How far off resonance is enough? Below is the gain of Schwarz's criterion by the offset less that
-# by friction, for three draws of the noise each; inside the grey band the diagnosis does not
-# decide. (There are fewer states tuned to resonance: the frequency steps leave no more of them.)
-
-# %%
-figure, grid = drawing.panels(drawing.COLUMN, 3.4, 1, 1)
-axes = grid[0, 0]
-BINS = ((0, 4), (6, 14), (18, 34), (30, 60))
-SEPARATED = (("10 % left out", "beam", 0.1), ("friction of that size", "beam with friction", 0.0))
-for number, (label, motion, share) in enumerate(SEPARATED):
-    for place, (nearest, farthest) in enumerate(BINS):
-        differences = []
-        for seed in range(2, 5):
-            states = recorded(
-                motions[motion], nearest, farthest, missing=share * forces[0], seed=seed
-            )
-            gain = gains(sj.diagnose_model(model, states))
-            # One that is not fitted at all is behind the best of the others.
-            others = max(value for kind, value in gain.items() if kind not in BOTH)
-            offset, slip = (gain.get(kind, others) for kind in (*OFFSET[0], *FRICTION[0]))
-            differences.append(offset - slip)
-        axes.plot(
-            np.full(3, place + 0.12 * number - 0.06),
-            differences,
-            **{"marker": "o", "linestyle": "none", "color": drawing.SERIES[number]},
-            label=label if place == 0 else None,
-        )
-        ends = f"{min(differences):.1f} to {max(differences):.1f}"
-        print(f"{label}, {nearest}° to {farthest}°: {ends}")
-        if nearest >= 18:
-            headline[
-                f"{label}, {nearest}° to {farthest}°: identified under every draw of the noise"
-            ] = min(differences) > 6 if share else max(differences) < -6
-axes.axhspan(-6, 6, color="0.88", zorder=0, label="not decided")
-axes.set_yscale("symlog", linthresh=10)
-axes.set_yticks([-100, -10, 0, 10, 100], ["−100", "−10", "0", "10", "100"])
-axes.set_xticks(range(len(BINS)), [f"{a}° to {b}°" for a, b in BINS])
-axes.set_xlim(-0.4, len(BINS) - 0.6)
-drawing.name_axes(axes, "", "Phase of the states from resonance", "Gain: offset less friction")
-drawing.legend(figure)
-figure
-
-# %% [markdown]
-# With states on one side of resonance only, the stable one, the answer depends on the linear test.
-# If the natural frequency is known to 1.2 % only, the difference of the paper's two values for the
-# flat beam (97.45 Hz in Tab. 6; 35.79 Hz are "37.16 %" of 96.3 Hz), the small offset cannot be
-# distinguished from friction.
-
-# %%
-print(f"linear frequency by the shift: {35.79 / 0.3716:.2f} Hz")
-vague = dataclasses.replace(
-    model,
-    modes=dataclasses.replace(
-        model.modes, natural_frequency_std=0.012 * model.modes.natural_frequency
-    ),
-)
-one_sided = {
-    share: [
-        sj.diagnose_model(
-            vague,
-            recorded(motions["beam"], 18, 34, missing=share * forces[0], seed=seed, sides=(1,)),
-        )
-        for seed in range(1, 3)
-    ]
-    for share in (0.06, 0.15)
-}
-for share, several in one_sided.items():
-    print(f"{100 * share:.0f} % left out, one side:", [one.candidates for one in several])
-headline["one side, frequency uncertain: the offset is a candidate"] = all(
-    "force_offset_error" in one.candidates[0] for several in one_sided.values() for one in several
-)
-
-# %% [markdown]
 # ### Which intercept would explain the paper's damping?
 #
 # Appendix B prints its sign for the flat beam: without the adjustment there is "a noticeable *drop*
@@ -376,7 +301,7 @@ headline["one side, frequency uncertain: the offset is a candidate"] = all(
 
 # %%
 opposite = sj.diagnose_model(model, recorded(motions["beam"], 0, 4, missing=-0.15 * forces[0]))
-report(opposite)
+print(verdict(opposite))
 headline["a drop: the offset is identified even at resonance"] = (
     opposite.verdict == "named" and opposite.candidates == OFFSET
 )
@@ -471,7 +396,9 @@ def read(states, quantity):
     )
 
 
-# %%
+# %% tags=["hide-input"]
+# Modal damping against velocity, softening and stiffening: by fundamentals on the linear value,
+# by peaks below it in softening and a sixth above it in stiffening.
 linear = float(2 * curved.modes.damping_ratio[0] * curved.modes.natural_frequency[0])
 series, apparent, ratios = [], {}, {}
 for name, states in full.items():
@@ -489,6 +416,8 @@ marks = [0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0]
 figure.axes[0].set_xticks(marks, [f"{one:g}" for one in marks])
 figure.axes[0].minorticks_off()
 figure
+
+# %%
 for (name, quantity), value in apparent.items():
     print(f"{name}, top level, {quantity}: {value:.2f} 1/s, {value / linear:.3f} of {linear:.2f}")
 headline["stiffening tends to the limits 1.165 (peak) and 1.018 (fundamental)"] = (
@@ -500,9 +429,8 @@ headline["stiffening tends to the limits 1.165 (peak) and 1.018 (fundamental)"] 
 read_as = {}
 for name, states in full.items():
     for quantity in ("fundamental", "peak"):
-        print(f"\n{name}, {quantity}")
         read_as[name, quantity] = sj.diagnose_model(right, read(states, quantity))
-        report(read_as[name, quantity])
+        print(f"{name}, {quantity}: {verdict(read_as[name, quantity])}")
 soft, stiff = (read_as[name, "peak"] for name in LEVELS)
 headline["the fundamental: nothing to find"] = all(
     read_as[name, "fundamental"].verdict == "none" for name in LEVELS
@@ -522,6 +450,7 @@ headline["both: held-out and top level predicted to within their noise"] = all(
 )
 
 # %%
+# The misfit of every state of the softening test before and after the answer.
 soft.plot()
 
 # %% [markdown]
@@ -534,6 +463,7 @@ soft.plot()
 # a model, a damping law is nearly as good:
 
 # %%
+# Bars: what each effect explains by itself; a damping law is nearly as good as the best.
 square, cube = (float(value) for value in curved.potential.coefficient)
 free_std = {"111": 0.3 * abs(square), "1111": 0.3 * abs(cube)}
 free = stated(
@@ -541,9 +471,10 @@ free = stated(
     sj.model.polynomial_potential({"111": square, "1111": cube}, 1, coefficient_std=free_std),
 )
 misled = sj.diagnose_model(free, read(full["softening"], "peak"))
-report(misled)
+print(verdict(misled))
 plot.candidates_figure(misled)
-by_kind = gains(misled)
+
+# %%
 law = next(row for row in misled.table[0] if row.kind.endswith("_damping"))
 print(f"best damping law: {law.kind}, gain {law.gain:.0f}", law.parameters)
 headline["stiffness free: a damping law gains nine tenths of what the best explanation does"] = (

@@ -95,7 +95,9 @@ headline["first natural frequency within 0.5 % of the published beam"] = (
 # harmonic of the motion drives the second mode (a 1:3 internal resonance) and takes energy from
 # the first. The nominal beam's peak stops short of it. A beam with 0.1 mm less rise gets past:
 
-# %%
+# %% tags=["hide-input"]
+# Two responses against frequency: the nominal beam peaks near 55 Hz, above a third of its second
+# frequency; a beam with 0.1 mm less rise peaks far below it.
 figure, panels = drawing.panels(drawing.COLUMN, 3.2, 1, 1)
 highest = {}
 for less, colour in ((0.0, BLUE), (0.1e-3, ORANGE)):
@@ -115,6 +117,8 @@ drawing.name_axes(panels[0, 0], "", HZ, VELOCITY)
 panels[0, 0].set(xlim=(38, 75), ylim=(0, 0.2))
 drawing.legend(figure)
 figure
+
+# %%
 print({f"{1e3 * less:.1f} mm less": f"peak at {at:.2f} Hz" for less, at in highest.items()})
 headline["0.1 mm less rise moves the peak past the internal resonance, by more than 10 Hz"] = (
     highest[0.0] > third and highest[0.1e-3] < third and highest[0.0] - highest[0.1e-3] > 10
@@ -166,7 +170,9 @@ headline["every member has its whole response"] = bool(np.all(ended))
 # the highest motion and of the lowest; where they part, it depends on the way there which of the
 # two a test meets.
 
-# %%
+# %% tags=["hide-input"]
+# Bands of the highest and of the lowest motion against frequency: 95 % and half of all beams, and
+# the median.
 grid = members.frequency_hz.values
 figure, panels = drawing.panels(drawing.PAGE, 3.3, 1, 2)
 for axes, name, title, colour in zip(
@@ -193,7 +199,9 @@ figure
 # of the members, and the share of the variance that it explains. Over the rise the peak is not a
 # curve but a step, at about 0.95 mm, which the mean (a spline) rounds off.
 
-# %%
+# %% tags=["hide-input"]
+# Peak frequency and peak velocity of every beam against thickness, rise and damping, with the
+# mean over the others.
 LABEL = {"thickness_m": "Thickness (mm)", "rise_m": "Rise (mm)", "damping_ratio": "Damping (%)"}
 UNIT = {"thickness_m": 1e3, "rise_m": 1e3, "damping_ratio": 1e2}
 OUTPUTS = (("Peak frequency (Hz)", peak_hz), ("Peak velocity (m/s)", peak))
@@ -215,6 +223,8 @@ for row, (text, output) in zip(panels, OUTPUTS, strict=True):
         drawing.name_axes(axes, title, LABEL[name], text if column == 0 else "")
 drawing.legend(figure)
 figure
+
+# %%
 print({f"{text}, {name}": f"{share:.3f}" for (text, name), share in shares.items()})
 
 # %% [markdown]
@@ -224,6 +234,7 @@ print({f"{text}, {name}": f"{share:.3f}" for (text, name), share in shares.items
 # does together with others. Both come from the members of Saltelli's scheme, another study:
 
 # %%
+# Bars: first-order and total indices of thickness, rise and damping for every output.
 rows = 16 if SCALED_DOWN else 512
 paired = dataclasses.replace(
     study,
@@ -245,6 +256,7 @@ plot.sensitivity_figure(indices)
 # `model_of` their derivatives reach the dimensions.
 
 # %%
+# Distributions of peak and folds by first order, second order and members, over growing scatter.
 quantities = sj.study.response_quantities(
     *(nominal, study.variations, *ENDS),
     **{"force": FORCE, "kinds": ("peak", "fold"), "harmonic_order": 7, "model_of": beam_of},
@@ -269,7 +281,8 @@ print({name: f"{value:.3g}" for name, value in limit.items()})
 # And neither knows of the beams that get past the internal resonance. Against the *highest* peak of
 # all members of the study:
 
-# %%
+# %% tags=["hide-input"]
+# Histogram of the peak frequency with two humps, and the single bell of first order.
 at = list(quantities.names).index("peak_frequency_hz")
 nominal_peak, by_first = quantities.value[at], propagated.statistics[0, 1, at]
 figure, panels = drawing.panels(drawing.COLUMN, 3.2, 1, 1)
@@ -280,6 +293,8 @@ panels[0, 0].plot(x, bell, color=BLUE, label="first order")
 drawing.name_axes(panels[0, 0], "", "Peak frequency (Hz)", "Density (1/Hz)")
 drawing.legend(figure)
 figure
+
+# %%
 print(
     f"1σ of the peak's frequency: first order {by_first:.2f} Hz, highest peaks"
     f" {np.std(peak_hz):.2f} Hz"

@@ -97,7 +97,9 @@ for m, a, b in zip(quartic, old_values, new_values, strict=True):
     print("".join(str(k + 1) for k in m), f"{a:11.4g} printed, {b:11.4g} here, ratio {b / a:6.2f}")
 print(f"median ratio {np.median(ratio):.3f}")
 
-# %%
+# %% tags=["hide-input"]
+# Every coefficient of the finite elements against the printed one: the points lie on the line of
+# three times the print.
 figure, panels = drawing.panels(drawing.COLUMN, 3.2, 1, 1)
 axes = panels[0, 0]
 axes.loglog(np.abs(old_values), np.abs(new_values), "o", ms=3.5, color=BLUE, label="coefficients")
@@ -153,7 +155,9 @@ headline["curved beam: β is about twice the print"] = bool(1.9 < beta / BETA < 
 # times. What does that mean for the text, which says that the beam softens and then stiffens? The
 # finite elements are loaded along mode 1, inwards and outwards, as far as they go.
 
-# %%
+# %% tags=["hide-input"]
+# Load against inward displacement: finite elements, and three cubic polynomials of which two come
+# back below zero.
 squared = float(arch.frequency[0]) ** 2
 one = THICKNESS / float(arch.largest[0])  # q at one thickness
 levels = np.array([-0.37, -0.35, -0.32, -0.28, -0.2, -0.1, 0.1, 0.3, 0.6, 1.0, 1.6])
@@ -315,7 +319,9 @@ headline["the thickness to better than 0.5 %"] = bool(
     calibrated.std[0] / calibrated.values[0] < 5e-3
 )
 
-# %%
+# %% tags=["hide-input"]
+# Velocity against natural frequency: the wide band of a thickness known to 2 %, and inside it the
+# measured points with the narrow band of the calibrated beam.
 figure, panels = drawing.panels(drawing.COLUMN, 3.2, 1, 1)
 axes = panels[0, 0]
 axes.fill_betweenx(

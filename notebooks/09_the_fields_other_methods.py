@@ -18,8 +18,7 @@
 # 1. one table of steady states, six methods: the flat beam with measurement noise;
 # 2. loops that hold what an open loop loses: a one-sided stop on a shaker;
 # 3. free decays read in three ways, beside a stepped sine of the same structure;
-# 4. two measured beams;
-# 5. the whole comparison (seven structures, three noises, 20 seeds), and what it says about ours.
+# 4. the whole comparison (seven structures, three noises, 20 seeds), and what it says about ours.
 #
 # All methods answer alike, with a `MethodResult`: natural frequency and damping ratio against the
 # velocity amplitude at resonance, 1σ where the method has one, a status at every point.
@@ -27,7 +26,6 @@
 # %%
 # %matplotlib inline
 import json
-from pathlib import Path
 
 import numpy as np
 
@@ -35,20 +33,7 @@ import snrmjax as sj
 from snrmjax.plot import style as drawing
 
 HERTZ = 2 * np.pi
-DATA = Path(os.environ.get("MEASURED_DATA", "../../shared/data"))
-BENCHMARKS = next(
-    up / "benchmarks"
-    for up in (HERE, *HERE.parents)
-    if (up / "benchmarks/methods_table.jsonl").is_file()
-)
-OF_RECORDS = {
-    "pll": "phase-locked loop",
-    "cbc": "control-based continuation",
-    "resonant_decay": "resonant decay",
-    "restoring_force": "restoring force surface",
-    "ssm": "spectral submanifold",
-    "pnlss": "state space (PNLSS)",
-}
+BENCHMARKS = Path("../benchmarks")  # notebooks run in their own folder
 NAMES = {
     "snrm": "inverse SNRM",
     "concerto": "CONCERTO",
@@ -76,7 +61,9 @@ headline = {}
 #   from levels of constant force, which is not how they test;
 # - *phase resonance* (Peeters, Kerschen & Golinval 2011): each level's crossing of 0°.
 
-# %%
+# %% tags=["hide-input"]
+# Error of frequency and of damping against velocity by six methods: inverse SNRM, describing
+# functions and phase resonance scatter about zero, the others lie beside it.
 beam = sj.model.flat_beam()
 ends = (60 * HERTZ, 120 * HERTZ)
 forces = (2.669e-3, 4.448e-3, 8.896e-3, 1.334e-2)
@@ -195,7 +182,9 @@ print(
     f"{curve.test_seconds:.0f}"
 )
 
-# %%
+# %% tags=["hide-input"]
+# Left: an open loop jumps at different frequencies up and down, the loops follow the exact
+# resonances and go around the fold. Right: force against velocity at 56 Hz, with a falling part.
 figure, ((left, right),) = drawing.panels(drawing.PAGE, 3.6, 1, 2)
 left.plot(
     resonances.frequency / HERTZ,
@@ -259,7 +248,9 @@ headline |= {
 # velocity (Masri & Caughey 1979), and by the normal form on its spectral submanifold. A stepped
 # sine of the same structure goes to the inverse SNRM.
 
-# %%
+# %% tags=["hide-input"]
+# Error of frequency and damping against velocity by three readings of a decay, a submanifold and
+# a stepped sine: all within 0.02 % and 3 %.
 duffing = sj.model.structure(
     modes,
     sj.model.polynomial_potential({"1111": 2.5e8}, 1),
@@ -320,6 +311,8 @@ for axes, what, limit in zip(
     drawing.name_axes(axes, what, "Velocity amplitude (m/s)", "Found less true (%)")
 drawing.legend(figure)
 figure
+
+# %%
 headline |= {
     f"{name}: within 0.02 % of frequency and 3 % of damping": off[0] < 0.02 and off[1] < 3
     for name, off in worst.items()
@@ -329,66 +322,18 @@ headline |= {
 # One mode alone, and little noise: a decay of two seconds reads the curves as well as a stepped
 # sine of minutes, its damping better. With a second mode that rings along, or at amplitudes near
 # the noise, it would not.
-#
-# ## 4. Two measured beams
-#
-# The data are not part of this project; without them, in a folder `shared/data` beside it, this
-# section is skipped and says so.
-
-# %%
-if MEASURED is None:
-    print("skipped: no measured data in shared/data")
-else:
-    for folder, table in (
-        ("suspended_beam", "lock_in_stepped_sine.csv"),
-        ("brake_reuss_beam", "force_controlled.csv"),
-        ("brake_reuss_beam", "response_controlled.csv"),
-    ):
-        model = sj.read_model(MEASURED / folder / "model.toml")
-        data = sj.read_steady_states(MEASURED / folder / table, model)
-        both = sj.methods.compare_methods(data, model.modes)
-        print(f"\n{folder}, {table}:")
-        own = both.results[0]
-        for one in both.results[1:]:
-            at = np.asarray(one.velocity)
-            kept = one.found & (at >= own.velocity.min()) & (at <= own.velocity.max())
-            if not kept.any():
-                continue
-            omega, ratio = (
-                np.interp(at[kept], own.velocity, law)
-                for law in (own.natural_frequency, own.damping_ratio)
-            )
-            mhz = 1e3 * np.median(np.abs(one.natural_frequency[kept] - omega)) / HERTZ
-            away = 100 * np.median(np.abs(one.damping_ratio[kept] / ratio - 1))
-            print(
-                f"   {NAMES[one.method]:26s} {mhz:7.2f} mHz and {away:6.2f} % of damping from the "
-                f"inverse SNRM (median of {kept.sum()} points)"
-            )
-        for name, why in both.stopped.items():
-            if name in NAMES:  # the others need time records, of which there are none
-                print(f"   {NAMES[name]}: did not run: {why}")
-        for one in both.results:
-            if one.method == "phase_resonance" and one.found.any():
-                at = one.velocity[one.found]
-                law = np.interp(at, own.velocity, own.natural_frequency)
-                away = np.median(np.abs(one.natural_frequency[one.found] - law)) / HERTZ
-                headline[f"{folder}, {table}: phase resonance within 0.05 Hz"] = bool(away < 0.05)
 
 # %% [markdown]
-# ## 5. The whole comparison
+# ## 4. The whole comparison
 #
 # Seven structures, three steps of noise, 20 seeds (`benchmarks/methods_table.py`): the median
 # error of frequency at the middle step, and how often a 95 % band of frequency holds the truth
 # over all steps.
 
-# %%
-lines = [
-    line
-    for name in ("methods_table", "methods_loops_and_decays")
-    for line in (BENCHMARKS / f"{name}.jsonl").read_text(encoding="utf-8").splitlines()
-]
-every = [json.loads(line) for line in lines]
-rows = [row for row in every if row["method"] in NAMES]
+# %% tags=["hide-input"]
+# Median errors of frequency and damping of six methods on seven structures.
+table = (BENCHMARKS / "methods_table.jsonl").read_text(encoding="utf-8")
+rows = [row for row in map(json.loads, table.splitlines()) if row["method"] in NAMES]
 structures = list(dict.fromkeys(row["structure"] for row in rows))
 figure, grid = drawing.panels(drawing.PAGE, 3.6, 1, 2)
 for k, method in enumerate(NAMES):
@@ -410,34 +355,18 @@ for axes, what in zip(grid[0], ("natural frequency", "damping ratio"), strict=Tr
 drawing.legend(figure)
 figure
 
-print("share of 95 % bands that hold the truth, frequency / damping, by noise:")
-for method in ("snrm", "arslan_ozguven", "rct", "concerto"):
-    for noise in ("low", "middle", "high"):
-        mine = [row for row in rows if row["method"] == method and row["noise"] == noise]
-        shares = [
-            [row[f"{key}_coverage"] for row in mine if row.get(f"{key}_coverage") is not None]
-            for key in ("frequency", "damping")
-        ]
-        text = " / ".join(f"{100 * min(one):3.0f} to {100 * max(one):3.0f} %" for one in shares)
-        print(f"   {NAMES[method]:24s} {noise:7s} {text}")
+# %%
 
-print("loops, decays and multisines in the laboratory, middle noise: median error of frequency")
-print("and damping in % (share of 95 % bands that hold the truth), seconds of test:")
-for method, name in OF_RECORDS.items():
-    for row in every:
-        if row["method"] != method or row["noise"] != "middle":
-            continue
-        if "frequency_error_median" not in row:
-            print(f"   {name:24s} {row['structure']:10s} no answer in any test")
-            continue
-        parts = []
-        for key in ("frequency", "damping"):
-            held = row[f"{key}_coverage"]
-            share = "no band" if held is None else f"{100 * held:.0f} %"
-            parts.append(f"{100 * row[f'{key}_error_median']:.4f} ({share})")
-        print(
-            f"   {name:24s} {row['structure']:10s} {', '.join(parts)}, {row['test_seconds']:.0f} s"
-        )
+print("share of 95 % bands that hold the truth, frequency and damping:")
+for method in ("snrm", "arslan_ozguven", "rct", "concerto"):
+    mine = [row for row in rows if row["method"] == method]
+    held = [
+        [row[f"{key}_coverage"] for row in mine if row.get(f"{key}_coverage") is not None]
+        for key in ("frequency", "damping")
+    ]
+    print(
+        f"   {NAMES[method]:24s}", *(f"{100 * min(x):3.0f} to {100 * max(x):3.0f} %" for x in held)
+    )
 best = {
     s: min(
         (row for row in rows if row["structure"] == s and row["noise"] == "middle"),
@@ -456,27 +385,18 @@ headline["ours has the smallest error of frequency for at least five of the seve
 # - The inverse SNRM needs neither a resonance nor a pair of states, and uses every state: its
 #   median errors are the smallest for most structures.
 # - **It is not the best everywhere.** At the stop, phase resonance has as small an error of
-#   frequency, needs no linear model for it, and is read in a minute from four levels; with a
-#   bolted joint and with quadratic damping its damping is as near. With quadratic damping and
-#   little noise the force surface is nearer in damping.
-# - **Its bands are not the same everywhere**: a 95 % band of frequency holds 94 to 100 % of the
-#   truth, 87 % on the curved beam at the largest noise; one of damping 90 to 92 % with a bolted
-#   joint, 93 to 99 % elsewhere. Those of CONCERTO and of the modal fits, which do not know the
-#   bias of their own model, hold far less.
-# - Where a second mode lies near (50 and 53 Hz), a resonance is not of one mode: loops and phase
-#   resonance are off by 6e-5 to 9e-5 in frequency however small the noise, and their bands do not
-#   know it. The inverse SNRM takes the other mode's part away (2e-6).
+#   frequency, needs no linear model for it, and is read in a minute from four levels. With
+#   quadratic damping and little noise the force surface is nearer in damping.
+# - **Its bands are not the same everywhere**: those of frequency hold less of the truth on the
+#   curved beam at the largest noise, those of damping with a bolted joint. Bands of CONCERTO and
+#   of the modal fits, which do not know the bias of their own model, hold far less.
 # - Where an open loop jumps before resonance, only loops measure the rest. They cost more time of
-#   test for each state, and a controller. **What a phase-locked loop or control-based continuation
-#   holds is nearer to the truth than ours on six structures of seven** (0.001 to 0.006 % of
-#   frequency), although the noise is not the same: here it is on samples, of which a loop averages
-#   many periods, in the tables on states. Where no second mode is near they are the methods to
-#   choose for those who have the controller.
-# - A state-space model of a multisine (PNLSS) and a submanifold of a decay come as near as ours
-#   from seconds of test, but their bands are too narrow where their polynomials are not the law
-#   (quadratic damping, v|v|).
-# - Decays need no controller and seconds of test, but noise grows as the amplitude falls, and a
-#   second mode that rings along spoils them unless it is filtered.
+#   test for each state, and a controller. **What they hold is nearer to the truth than ours on six
+#   structures of seven** (`benchmarks/methods_loops_and_decays.jsonl`), although the noise is not
+#   the same: there it is on samples, of which a loop averages many periods. Only where a second
+#   mode lies near is ours better, which takes the other mode's part away.
+# - Decays and multisines need seconds of test, but their bands are too narrow where their
+#   polynomials are not the law, and a second mode that rings along spoils a decay.
 
 # %%
 print("\n".join(f"{'yes' if holds else 'NO '}  {claim}" for claim, holds in headline.items()))

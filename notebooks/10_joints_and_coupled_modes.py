@@ -128,7 +128,9 @@ headline["the joint's four parameters within 2.6 of their 1σ"] = bool(
 # Neither has seen a force at the other point. The truth is the harmonic balance of the true beam,
 # forced there.
 
-# %%
+# %% tags=["hide-input"]
+# Velocity of the tip against frequency at 3 N and 10 N at another point: the fitted joint lies on
+# the truth, one mode a little beside it.
 moved = dataclasses.replace(fitted.model, modes=fitted.model.modes.forced_at(OTHER))
 FORCES = [3.0, 10.0]
 answers = sj.forced_response(cantilever(OTHER, PARAMETERS), FORCES, *SPAN)
@@ -156,6 +158,8 @@ for axes, force, answer, joint, mode in zip(
     )
 drawing.legend(figure)
 figure
+
+# %%
 for (name, force), error in off.items():
     print(f"{force:g} N, {name}: largest velocity off by {100 * error:+.2f} %")
 
@@ -171,7 +175,7 @@ headline["one mode: within 8 %, and farther off than the joint"] = all(
 # per cent: as the joint slips, the mode changes its shape, and the identification says so (levels
 # that differ in gain and damping). Who needs more than that must know where the joint is.
 #
-# # Two coupled modes: from data to prediction
+# ## Two coupled modes: from data to prediction
 #
 # Two modes at 100 and 103 rad/s share a hardening stiffness. Two sensors watch; the force excites
 # both. Is one mode enough? Plain `identify` looks when the sensors show a second mode that moves
@@ -208,7 +212,9 @@ for note in coupled.notes:
 # It does, and says by how much the backbone of one mode is wrong at the largest amplitude. With
 # `modes=2` (`snrmjax identify --modes 2`) the responses come from the fitted model of both:
 
-# %%
+# %% tags=["hide-input"]
+# Velocity against frequency at two sensors: the fit of two modes lies on the truth, one mode does
+# not.
 both = sj.pipelines.identify_test(measured, known, modes=2, predict_force=(2.2,))
 print(both.coupled.modes)
 predicted = both.coupled.responses[0]
@@ -239,6 +245,8 @@ for k, axes in enumerate(grid[0]):
     drawing.name_axes(axes, f"sensor {LINEAR.sensors[k]}", "Frequency (Hz)", "Velocity (m/s)")
 drawing.legend(figure)
 figure
+
+# %%
 size = np.abs(answer.velocity[:, 1]).max(axis=0)
 inside = (predicted.frequency > 98.0) & (predicted.frequency < 104.0)
 largest = np.abs(predicted.velocity[inside, 1]).max(axis=0)

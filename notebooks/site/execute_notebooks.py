@@ -41,13 +41,13 @@ def key(script: Path) -> str:
 
 def execute(script: Path) -> nbformat.NotebookNode:
     """The notebook with its outputs. A cell that fails raises `nbclient`'s CellExecutionError."""
-    notebook = jupytext.read(script)
+    depends_on, notebook = key(script), jupytext.read(script)
     client = nbclient.NotebookClient(
         notebook, kernel_name="python3", timeout=None, extra_arguments=[FIGURES]
     )
     project = os.pathsep.join(filter(None, (str(NOTEBOOKS.parent), os.environ.get("PYTHONPATH"))))
     client.execute(cwd=str(NOTEBOOKS), env={**os.environ, "PYTHONPATH": project})
-    notebook.metadata["snrmjax"] = {"key": key(script)}
+    notebook.metadata["snrmjax"] = {"key": depends_on}
     return notebook
 
 
