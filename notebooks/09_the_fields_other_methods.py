@@ -26,6 +26,7 @@
 # %%
 # %matplotlib inline
 import json
+from pathlib import Path
 
 import numpy as np
 

@@ -40,23 +40,34 @@ def key(script: Path) -> str:
 
 
 def execute(script: Path) -> nbformat.NotebookNode:
-    """The notebook with its outputs. A cell that fails raises `nbclient`'s CellExecutionError."""
+    """The notebook with its outputs.
+
+    A cell that raises SystemExit ends it, as where measured data are not there; a cell that fails
+    raises `nbclient.exceptions.CellExecutionError`.
+    """
     depends_on, notebook = key(script), jupytext.read(script)
     client = nbclient.NotebookClient(
         notebook, kernel_name="python3", timeout=None, extra_arguments=[FIGURES]
     )
     project = os.pathsep.join(filter(None, (str(NOTEBOOKS.parent), os.environ.get("PYTHONPATH"))))
-    client.execute(cwd=str(NOTEBOOKS), env={**os.environ, "PYTHONPATH": project})
-    notebook.metadata["snrmjax"] = {"key": depends_on}
+    ended = False
+    try:
+        client.execute(cwd=str(NOTEBOOKS), env={**os.environ, "PYTHONPATH": project})
+    except nbclient.exceptions.CellExecutionError as error:
+        if error.ename != "SystemExit":
+            raise
+        ended = True
+    notebook.metadata["snrmjax"] = {"key": depends_on, "ended_early": ended}
     return notebook
 
 
-def is_fresh(script: Path) -> bool:
-    """Whether the kept outputs are those of this script and this package."""
+def kept(script: Path) -> nbformat.NotebookNode | None:
+    """The executed notebook, if its outputs are those of this script and this package."""
     path = EXECUTED / f"{script.stem}.ipynb"
-    if not path.is_file():
-        return False
-    return nbformat.read(path, 4).metadata.get("snrmjax", {}).get("key") == key(script)
+    notebook = nbformat.read(path, 4) if path.is_file() else None
+    if notebook is None or notebook.metadata["snrmjax"]["key"] != key(script):
+        return None
+    return notebook
 
 
 def main() -> None:
@@ -69,7 +80,8 @@ def main() -> None:
         sys.exit(f"there is no notebook {only} in {NOTEBOOKS}")
     EXECUTED.mkdir(exist_ok=True)
     for script in chosen:
-        if is_fresh(script):
+        before = kept(script)
+        if before is not None and not before.metadata["snrmjax"]["ended_early"]:
             print(f"{script.stem}: unchanged")
             continue
         start = time.perf_counter()

@@ -1,7 +1,8 @@
 """The site's tutorials: a page and a notebook to download for every executed notebook.
 
 A hook of MkDocs. Outputs are those that `execute_notebooks.py` has kept; where they are not those
-of the present script and package the build warns, which `--strict` makes an error. With
+of the present script and package the build warns, which `--strict` makes an error. The comment at
+the head of a figure's cell is its alternative text; cells with the tag hide-input are folded. With
 TUTORIALS_UNEXECUTED=1 in the environment the pages are made of the scripts alone.
 """
 
@@ -11,8 +12,9 @@ import os
 
 import jupytext
 import nbformat
-from execute_notebooks import EXECUTED, is_fresh, scripts
+from execute_notebooks import kept, scripts
 from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 from nbconvert import MarkdownExporter
 from PIL import Image
@@ -35,6 +37,8 @@ TEMPLATE = """{% extends 'markdown/index.md.j2' %}
 {{ output.text | trim("\n") }}
 ```
 {% endblock stream %}
+{# The sentence before it says why a notebook ended. #}
+{% block error %}{% endblock error %}
 {% block data_png scoped %}
 ![{{ cell | description }}]({{ output.metadata.filenames["image/png"] }})
 {% endblock data_png %}
@@ -49,7 +53,7 @@ def description(cell: nbformat.NotebookNode) -> str:
             break
         said.append(line.removeprefix("# "))
     if not said:
-        raise ValueError(f"a figure without a comment at the head of its cell:\n{cell.source}")
+        raise PluginError(f"A figure's cell begins without a comment on it:\n{cell.source}")
     return " ".join(said).replace("[", "(").replace("]", ")")
 
 
@@ -73,17 +77,15 @@ def page(notebook: nbformat.NotebookNode, name: str) -> tuple[str, dict[str, byt
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the pages, their figures and the notebooks."""
     for script in scripts():
-        fresh = is_fresh(script)
-        if not fresh and os.environ.get(UNEXECUTED) != "1":
+        notebook = kept(script)
+        if notebook is None and os.environ.get(UNEXECUTED) != "1":
             LOG.warning(
                 "%s has no outputs of its present script and package: run "
                 "`python notebooks/site/execute_notebooks.py` (minutes), or set %s=1 for pages "
                 "without outputs.",
                 *(script.name, UNEXECUTED),
             )
-        notebook = (
-            nbformat.read(EXECUTED / f"{script.stem}.ipynb", 4) if fresh else jupytext.read(script)
-        )
+        notebook = notebook or jupytext.read(script)
         text, figures = page(notebook, script.stem)
         made: dict[str, str | bytes] = {f"{script.stem}.md": text, **figures}
         made[f"{script.stem}.ipynb"] = nbformat.writes(notebook)
