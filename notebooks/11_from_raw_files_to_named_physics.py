@@ -71,7 +71,7 @@ figure
 
 # %% [markdown]
 # The resonance is damped five times more at the largest level than at the smallest, while it moves
-# down by a quarter of a hertz and up again: this is what a joint does that slips, and a little more.
+# down by a quarter of a hertz and up again: a joint that slips does the first.
 # The check looks for the usual mistakes, with the linear modes of the lowest level. The
 # accelerometer sits where the force acts, so that the modal mass comes from the same states.
 
@@ -168,9 +168,9 @@ headline[
 plot.comparison_figure(predicted.before, predicted.after, built_on)
 
 # %% [markdown]
-# The gap shrinks from a factor of four to less than a tenth; it does not close. Peaks come out too
-# high at the upper levels and 16 % too low at the lowest: the damping law is not the true one, as
-# the diagnosis said.
+# The gap shrinks from factors of 2.6 and 4.4 to less than a tenth; it does not close. Peaks come out
+# too high at the upper levels and 16 % too low at the lowest: the damping law is not the true one,
+# as the diagnosis said.
 #
 # ## 5. Another test, on another day
 #

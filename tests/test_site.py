@@ -54,3 +54,9 @@ def test_every_page_is_in_the_navigation():
     navigation = (SITE / "mkdocs.yml").read_text("utf-8").partition("\nnav:")[2]
     for page in PAGES:
         assert page.relative_to(SITE / "pages").as_posix() in navigation
+
+
+def test_every_notebook_has_a_tutorial():
+    navigation = (SITE / "mkdocs.yml").read_text("utf-8").partition("\nnav:")[2]
+    for script in SITE.parent.glob("*.py"):
+        assert f"tutorials/{script.stem}.md\n" in navigation

@@ -1,0 +1,63 @@
+"""A notebook with its outputs as a page in Markdown.
+
+The comment at the head of a figure's cell is its alternative text; cells with the tag hide-input
+are folded.
+"""
+
+import io
+
+import nbformat
+from nbconvert import MarkdownExporter
+from PIL import Image
+
+TEMPLATE = """{% extends 'markdown/index.md.j2' %}
+{% block input %}
+{% set folded = "hide-input" in cell.metadata.get("tags", []) %}
+{% if folded %}<details class="code" markdown="1"><summary>Code</summary>{% endif %}
+
+```python
+{{ cell.source }}
+```
+
+{% if folded %}</details>{% endif %}
+{% endblock input %}
+{% block stream %}
+```text
+{{ output.text | trim("\n") }}
+```
+{% endblock stream %}
+{# The sentence before it says why a notebook ended. #}
+{% block error %}{% endblock error %}
+{% block data_png scoped %}
+![{{ cell | description }}]({{ output.metadata.filenames["image/png"] }})
+{% endblock data_png %}
+"""
+
+
+def description(cell: nbformat.NotebookNode) -> str:
+    """What a figure shows, for who cannot see it: the comment at the head of its cell."""
+    said = []
+    for line in cell.source.splitlines():
+        if not line.startswith("# "):
+            break
+        said.append(line.removeprefix("# "))
+    if not said:
+        raise ValueError(f"A figure's cell begins without a comment on it:\n{cell.source}")
+    return " ".join(said).replace("[", "(").replace("]", ")")
+
+
+def tutorial_page(notebook: nbformat.NotebookNode, name: str) -> tuple[str, dict[str, bytes]]:
+    """The page of a notebook in Markdown, and its figures by their names."""
+    exporter = MarkdownExporter(raw_template=TEMPLATE, filters={"description": description})
+    text, resources = exporter.from_notebook_node(
+        notebook, {"unique_key": name, "output_files_dir": "figures"}
+    )
+    figures = {}
+    for path, png in (resources["outputs"] or {}).items():
+        smaller = io.BytesIO()
+        Image.open(io.BytesIO(png)).convert("RGB").save(smaller, "webp", lossless=True, method=6)
+        figures[path.replace(".png", ".webp")] = smaller.getvalue()
+        text = text.replace(f"({path})", f"({path.replace('.png', '.webp')})")
+    title, rest = text.lstrip().split("\n", 1)
+    link = f"[Download this page as a notebook]({name}.ipynb)"
+    return f"{title}\n\n{link}\n{rest}", figures
