@@ -323,7 +323,7 @@ monostable_damping = {
 }
 print({key: f"{value:.2f} 1/s" for key, value in monostable_damping.items()})
 
-# %%
+# %% tags=["hide-input"]
 headline = {
     "flat beam, displacement, median % <= 0.03": np.median(by_displacement) <= 0.03,
     "flat beam, displacement, worst % <= 0.1": by_displacement.max() <= 0.1,

@@ -229,7 +229,7 @@ for one in advice:
     )
 advice.plot()
 
-# %%
+# %% tags=["hide-input"]
 headline |= {
     "32 states near resonance: band of frequency at most twice that of 85 along one response": (
         width["32 near resonance"][0] < 2 * width["85 along one response"][0]
@@ -239,6 +239,6 @@ headline |= {
     and abs(sum(s.damping_share for s in shares) - 1) < 1e-9,
 }
 
-# %%
+# %% tags=["hide-input"]
 print("\n".join(f"{'yes' if holds else 'NO '}  {claim}" for claim, holds in headline.items()))
 assert all(headline.values())

@@ -37,14 +37,11 @@ headline = {}
 
 
 def report(found):
-    """A diagnosis, with the parts of the model that disagree and the notes."""
+    """A diagnosis, and where the model disagrees."""
     print(found)
     for part in found.located:
-        power = f", power {part.exponent:.2f} ± {part.exponent_std:.2f}" if part.exponent else ""
         low, high = part.velocity_range
-        print(f"  located: {part.part}, {low:.3g} to {high:.3g} m/s{power}")
-    for note in found.notes:
-        print("  note:", note)
+        print(f"  located: {part.part.replace('_', ' ')}, {low:.3g} to {high:.3g} m/s")
 
 
 # %% [markdown]
@@ -109,13 +106,10 @@ predicted = sj.diagnose.predict_levels(found, model)
 plot.comparison_figure(predicted.before, predicted.after, test.steady_states)
 
 # %%
+print("velocity at resonance (m/s): measured, before, completed")
 for row in predicted.levels:
-    print(
-        f"level {row.level}{', left out' if row.held_out else ''}: resonance measured "
-        f"{row.measured.frequency:.3f} Hz, {row.measured.velocity:.4f} m/s; before "
-        f"{row.before.frequency:.3f} Hz, {row.before.velocity:.4f} m/s; completed "
-        f"{row.after.frequency:.3f} Hz, {row.after.velocity:.4f} m/s"
-    )
+    values = (row.measured.velocity, row.before.velocity, row.after.velocity)
+    print(f"level {row.level}:", *(f"{v:.4f}" for v in values), "left out" * row.held_out)
 left_out = [row for row in predicted.levels if row.held_out]
 headline["resonances of levels left out predicted within 0.1 Hz and 2 %"] = all(
     abs(row.after.frequency - row.measured.frequency) < 0.1
@@ -167,6 +161,6 @@ headline["without harmonics it is ambiguous, the truth in the class"] = (
 )
 headline["the diagnosis asks for harmonics"] = "harmonic" in (blurred.decide_by or "")
 
-# %%
+# %% tags=["hide-input"]
 print("\n".join(f"{'yes' if holds else 'NO '}  {claim}" for claim, holds in headline.items()))
 assert all(headline.values())

@@ -116,7 +116,7 @@ for axes, (name, (volts, tenths, used)) in zip(grid[0], PRINTED.items(), strict=
 drawing.legend(figure)
 figure
 
-# %%
+# %% tags=["hide-input"]
 headline["printed intercepts are 6 % and 15 % of the lowest forces"] = (
     abs(shares["curved"] - 0.063) < 2e-3 and abs(shares["flat"] - 0.146) < 2e-3
 )
@@ -230,7 +230,7 @@ for number, share in enumerate(rise):
     axes.plot(speed, line, color=drawing.SERIES[number], linewidth=0.9)
 figure
 
-# %%
+# %% tags=["hide-input"]
 headline["damping at the lowest level errs by the share left out, within 2 %"] = all(
     abs(ratio - (1 + share)) < 0.02 for share, ratio in rise.items()
 )
@@ -491,6 +491,6 @@ headline["it is damping that falls with amplitude"] = min(law.parameters.values(
 # over the same amplitudes, which no damping law does, and peak and fundamental of the recorded
 # signal differ. Use fundamentals; do not compute damping from peaks.
 
-# %%
+# %% tags=["hide-input"]
 print("\n".join(f"{'yes' if holds else 'NO '}  {claim}" for claim, holds in headline.items()))
 assert all(headline.values())

@@ -93,8 +93,6 @@ old_values = np.array(
 )
 new_values = np.array([float(new[m]) * np.prod(turn[list(m)]) for m in quartic])
 ratio = new_values / old_values
-for m, a, b in zip(quartic, old_values, new_values, strict=True):
-    print("".join(str(k + 1) for k in m), f"{a:11.4g} printed, {b:11.4g} here, ratio {b / a:6.2f}")
 print(f"median ratio {np.median(ratio):.3f}")
 
 # %% tags=["hide-input"]
@@ -343,6 +341,6 @@ figure
 #
 # ## The headline, checked
 
-# %%
-for text, held in headline.items():
-    print("yes" if held else "NO ", "", text)
+# %% tags=["hide-input"]
+print("\n".join(f"{'yes' if holds else 'NO '}  {claim}" for claim, holds in headline.items()))
+assert all(headline.values())

@@ -318,7 +318,7 @@ headline["the spring is too stiff by the gain three times over, within 2 %"] = b
 # shapes without the sensor's gain, and the two modal masses differ by 5 %. Or the accelerometer
 # on a calibrator.
 
-# %%
+# %% tags=["hide-input"]
 folder.cleanup()
 print("\n".join(f"{'yes' if holds else 'NO '}  {claim}" for claim, holds in headline.items()))
 assert all(headline.values())

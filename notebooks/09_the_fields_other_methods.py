@@ -125,7 +125,7 @@ figure
 # differs, and where levels are few, they are biased by some tenths of a percent. Far outliers lie
 # beyond the figure.
 
-# %%
+# %% tags=["hide-input"]
 headline |= {
     "flat beam: inverse SNRM within 0.05 % of frequency, 0.5 % of damping in the median": (
         misses["snrm"][0] < 0.05 and misses["snrm"][1] < 0.5
@@ -176,7 +176,6 @@ curve = sj.simulate.s_curve(
     sj.simulate.FeedbackSettings(3000.0, filter_rate=200.0),
 )
 resonances = sj.simulate.phase_controlled(stop, 1.5)
-print(loop)
 print(
     f"seconds of test: open loop {sum(one[2] for one in sines.values()):.0f}, phase-locked loop "
     f"{loop.test_seconds:.0f}, phase by phase {around.test_seconds:.0f}, S-curve "
@@ -313,7 +312,7 @@ for axes, what, limit in zip(
 drawing.legend(figure)
 figure
 
-# %%
+# %% tags=["hide-input"]
 headline |= {
     f"{name}: within 0.02 % of frequency and 3 % of damping": off[0] < 0.02 and off[1] < 3
     for name, off in worst.items()
@@ -399,6 +398,6 @@ headline["ours has the smallest error of frequency for at least five of the seve
 # - Decays and multisines need seconds of test, but their bands are too narrow where their
 #   polynomials are not the law, and a second mode that rings along spoils a decay.
 
-# %%
+# %% tags=["hide-input"]
 print("\n".join(f"{'yes' if holds else 'NO '}  {claim}" for claim, holds in headline.items()))
 assert all(headline.values())

@@ -258,6 +258,6 @@ headline["responses of two modes within 1 % at both sensors"] = bool(
     np.all(np.abs(largest / size - 1) < 0.01)
 )
 
-# %%
+# %% tags=["hide-input"]
 print("\n".join(f"{'yes' if holds else 'NO '}  {claim}" for claim, holds in headline.items()))
 assert all(headline.values())

@@ -168,9 +168,9 @@ headline[
 plot.comparison_figure(predicted.before, predicted.after, built_on)
 
 # %% [markdown]
-# The gap shrinks from factors of 2.6 and 4.4 to less than a tenth; it does not close. Peaks come out
-# too high at the upper levels and 16 % too low at the lowest: the damping law is not the true one,
-# as the diagnosis said.
+# The gap shrinks from factors of 2.6 and 4.4 to less than a tenth; it does not close. Peaks come
+# out too high at the upper levels and 16 % too low at the lowest: the damping law is not the true
+# one, as the diagnosis said.
 #
 # ## 5. Another test, on another day
 #
@@ -243,7 +243,7 @@ figure
 #   differ. Every force and every damping ratio has this error. A known added mass decides.
 # - **What lies beyond 0.16 m/s.**
 
-# %%
+# %% tags=["hide-input"]
 headline["what is missing is located: damping, but no law is named"] = (
     found.verdict == "unknown" and any(part.part == "damping" for part in found.located)
 )

@@ -69,6 +69,7 @@ def test_a_page_keeps_equations_and_says_what_figures_show():
     assert figures[where].startswith(b"RIFF")
     assert "```text\n1\n```" in text
     assert text.count("<details") == 1
+    assert text.count("A line that rises.") == 1
     notebook.cells[1].source = "figure"
     with pytest.raises(ValueError, match="without a comment"):
         tutorial_page(notebook, "00_title")

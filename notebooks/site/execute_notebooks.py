@@ -47,7 +47,11 @@ def execute(script: Path) -> nbformat.NotebookNode:
     """
     depends_on, notebook = key(script), jupytext.read(script)
     client = nbclient.NotebookClient(
-        notebook, kernel_name="python3", timeout=None, extra_arguments=[FIGURES]
+        notebook,
+        kernel_name="python3",
+        timeout=None,
+        extra_arguments=[FIGURES],
+        coalesce_streams=True,
     )
     project = os.pathsep.join(filter(None, (str(NOTEBOOKS.parent), os.environ.get("PYTHONPATH"))))
     ended = False

@@ -16,7 +16,7 @@ TEMPLATE = """{% extends 'markdown/index.md.j2' %}
 {% if folded %}<details class="code" markdown="1"><summary>Code</summary>{% endif %}
 
 ```python
-{{ cell.source }}
+{{ cell | code }}
 ```
 
 {% if folded %}</details>{% endif %}
@@ -34,21 +34,32 @@ TEMPLATE = """{% extends 'markdown/index.md.j2' %}
 """
 
 
+def split(cell: nbformat.NotebookNode) -> tuple[str, str]:
+    """The comment at the head of a cell, without its marks, and the code below it."""
+    lines = cell.source.splitlines()
+    count = next((k for k, line in enumerate(lines) if not line.startswith("# ")), len(lines))
+    return " ".join(line[2:] for line in lines[:count]), "\n".join(lines[count:])
+
+
 def description(cell: nbformat.NotebookNode) -> str:
-    """What a figure shows, for who cannot see it: the comment at the head of its cell."""
-    said = []
-    for line in cell.source.splitlines():
-        if not line.startswith("# "):
-            break
-        said.append(line.removeprefix("# "))
+    """What a figure shows, for who cannot see it."""
+    said, _ = split(cell)
     if not said:
         raise ValueError(f"A figure's cell begins without a comment on it:\n{cell.source}")
-    return " ".join(said).replace("[", "(").replace("]", ")")
+    return said.replace("[", "(").replace("]", ")")
+
+
+def code(cell: nbformat.NotebookNode) -> str:
+    """What a page shows of a cell: not the comment that describes a figure."""
+    draws = any("image/png" in output.get("data", {}) for output in cell.outputs)
+    return split(cell)[1] if draws else cell.source
 
 
 def tutorial_page(notebook: nbformat.NotebookNode, name: str) -> tuple[str, dict[str, bytes]]:
     """The page of a notebook in Markdown, and its figures by their names."""
-    exporter = MarkdownExporter(raw_template=TEMPLATE, filters={"description": description})
+    exporter = MarkdownExporter(
+        raw_template=TEMPLATE, filters={"description": description, "code": code}
+    )
     text, resources = exporter.from_notebook_node(
         notebook, {"unique_key": name, "output_files_dir": "figures"}
     )
