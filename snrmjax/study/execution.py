@@ -1,5 +1,7 @@
 """Computes the chunks of a study in processes that may die: local ones, or a Dask cluster's."""
 
+import copyreg
+import importlib
 import os
 import threading
 import time
@@ -19,6 +21,7 @@ import jax
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+import snrmjax.model
 from snrmjax.io.programs.compilation_cache import WORTH_KEEPING, default_cache_folder
 from snrmjax.study.computations.base import COMPLETE, Failure, MemberStatus, joined, with_refused
 from snrmjax.study.store import StudyFolder, write_chunk
@@ -36,6 +39,10 @@ _ONE_THREAD = {
     "MKL_NUM_THREADS": "1",
     "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false",
 }
+
+# lazy-loader 0.6 gives modules a class of its own, which pickles do not take for one of modules: a
+# user's function that names this package would not reach a worker.
+copyreg.pickle(type(snrmjax.model), lambda module: (importlib.import_module, (module.__name__,)))
 
 
 class WorkerDied(Exception):

@@ -270,3 +270,12 @@ def of_loss_factor(values):
     """A structure of its loss factor, which is twice the damping ratio."""
     modes = sj.model.linear_modes([2 * np.pi * 50], [values["loss_factor"] / 2], [[2.0]], [3.0])
     return sj.model.structure(modes)
+
+
+def test_functions_that_name_the_package_reach_other_processes():
+    # As those of a notebook do, which are sent by value; lazy-loader 0.6 made modules unpicklable.
+    from loky.backend.reduction import dumps
+
+    namespace = {"sj": sj, "__name__": "__main__"}
+    exec("def beam(values): return sj.model.flat_beam()", namespace)
+    assert len(dumps(namespace["beam"])) < 10_000
