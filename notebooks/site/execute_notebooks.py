@@ -61,6 +61,9 @@ def execute(script: Path) -> nbformat.NotebookNode:
         if error.ename != "SystemExit":
             raise
         ended = True
+        # What it printed, without the console's advice on how to exit.
+        for cell in (cell for cell in notebook.cells if cell.cell_type == "code"):
+            cell.outputs = [output for output in cell.outputs if output.get("name") == "stdout"]
     notebook.metadata["snrmjax"] = {"key": depends_on, "ended_early": ended}
     return notebook
 

@@ -26,8 +26,6 @@ TEMPLATE = """{% extends 'markdown/index.md.j2' %}
 {{ output.text | trim("\n") }}
 ```
 {% endblock stream %}
-{# The sentence before it says why a notebook ended. #}
-{% block error %}{% endblock error %}
 {% block data_png scoped %}
 ![{{ cell | description }}]({{ output.metadata.filenames["image/png"] }})
 {% endblock data_png %}
