@@ -21,7 +21,7 @@ import nbformat
 SITE = Path(__file__).resolve().parent
 NOTEBOOKS = SITE.parent
 EXECUTED = SITE / "executed"
-FIGURES = "--InlineBackend.print_figure_kwargs={'dpi': 150}"
+DPI = 150  # of figures
 
 
 def scripts() -> list[Path]:
@@ -50,7 +50,7 @@ def execute(script: Path) -> nbformat.NotebookNode:
         notebook,
         kernel_name="python3",
         timeout=None,
-        extra_arguments=[FIGURES],
+        extra_arguments=[f"--InlineBackend.print_figure_kwargs={{'dpi': {DPI}}}"],
         coalesce_streams=True,
     )
     project = os.pathsep.join(filter(None, (str(NOTEBOOKS.parent), os.environ.get("PYTHONPATH"))))

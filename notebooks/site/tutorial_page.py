@@ -7,6 +7,7 @@ are folded.
 import io
 
 import nbformat
+from execute_notebooks import DPI
 from nbconvert import MarkdownExporter
 from PIL import Image
 
@@ -63,10 +64,12 @@ def tutorial_page(notebook: nbformat.NotebookNode, name: str) -> tuple[str, dict
     )
     figures = {}
     for path, png in (resources["outputs"] or {}).items():
-        smaller = io.BytesIO()
-        Image.open(io.BytesIO(png)).convert("RGB").save(smaller, "webp", lossless=True, method=6)
-        figures[path.replace(".png", ".webp")] = smaller.getvalue()
-        text = text.replace(f"({path})", f"({path.replace('.png', '.webp')})")
+        image, smaller = Image.open(io.BytesIO(png)), io.BytesIO()
+        image.convert("RGB").save(smaller, "webp", lossless=True, method=6)
+        where = path.replace(".png", ".webp")
+        figures[where] = smaller.getvalue()
+        width = round(image.width * 96 / DPI)  # letters are then as large in all figures
+        text = text.replace(f"({path})", f'({where}){{ width="{width}" loading="lazy" }}')
     title, rest = text.lstrip().split("\n", 1)
     link = f"[Download this page as a notebook]({name}.ipynb)"
     return f"{title}\n\n{link}\n{rest}", figures
