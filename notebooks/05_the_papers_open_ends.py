@@ -397,8 +397,9 @@ def read(states, quantity):
 
 
 # %% tags=["hide-input"]
-# Modal damping against velocity, softening and stiffening: by fundamentals on the linear value,
-# by peaks below it in softening and a sixth above it in stiffening.
+# Modal damping against velocity. Stiffening: a sixth above the linear value by peaks, near it by
+# fundamentals. Softening: below it by peaks; by fundamentals near it, and a tenth above it next
+# to the lowest frequency.
 linear = float(2 * curved.modes.damping_ratio[0] * curved.modes.natural_frequency[0])
 series, apparent, ratios = [], {}, {}
 for name, states in full.items():

@@ -213,8 +213,8 @@ for note in coupled.notes:
 # `modes=2` (`snrmjax identify --modes 2`) the responses come from the fitted model of both:
 
 # %% tags=["hide-input"]
-# Velocity against frequency at two sensors: the fit of two modes lies on the truth, one mode does
-# not.
+# Velocity against frequency at two sensors, with two resonances each: the model of both modes
+# lies on the truth; that of one mode is drawn at its own sensor.
 both = sj.pipelines.identify_test(measured, known, modes=2, predict_force=(2.2,))
 print(both.coupled.modes)
 predicted = both.coupled.responses[0]
