@@ -13,7 +13,7 @@
 # # A measured bolted beam, from its files to what is missing
 #
 # Two beams bolted at a lap joint, hung freely and shaken at a point with an accelerometer: the
-# Brake–Reuss beam near 80 Hz. Two tables of stepped sines, measured on different days:
+# Brake–Reuss beam near 80 Hz. Two tables of stepped sines, of two tests:
 #
 # - `response_controlled.csv`, eight levels of constant response, on which all of this is built;
 # - `force_controlled.csv`, four levels of constant force, kept aside until the end.
@@ -172,7 +172,7 @@ plot.comparison_figure(predicted.before, predicted.after, built_on)
 # out too high at the upper levels and 16 % too low at the lowest: the damping law is not the true
 # one, as the diagnosis said.
 #
-# ## 5. Another test, on another day
+# ## 5. Another test
 #
 # Now the table that was kept aside. Its phase resonances, where the phase crosses 0°, can be read
 # without a method. The curves of section 2 predict them from the force alone; no effect needs a
@@ -203,7 +203,7 @@ for force, hertz, speed in measured:
         f"{bands[-1][2]:.4f} ± {1.96 * bands[-1][3]:.4f} m/s; measured {hertz:.2f} Hz, {speed:.4f}"
     )
 bands = np.array(bands)
-headline["another day: frequency and velocity of all four resonances within their 95 % bands"] = (
+headline["another test: frequency and velocity of all four resonances within their 95 % bands"] = (
     bool(
         np.all(np.abs(bands[:, 0] - measured[:, 1]) < 1.96 * bands[:, 1])
         and np.all(np.abs(bands[:, 2] - measured[:, 2]) < 1.96 * bands[:, 3])
@@ -211,7 +211,7 @@ headline["another day: frequency and velocity of all four resonances within thei
 )
 
 # %% tags=["hide-input"]
-# Frequency and velocity at resonance against force: four measured points of the other day within
+# Frequency and velocity at resonance against force: four measured points of the other test within
 # the bars of the prediction; the straight line of the linear model leaves the figure.
 figure, ((left, right),) = drawing.panels(drawing.PAGE, 3.0, 1, 2)
 for axes, k, seen in ((left, 0, measured[:, 1]), (right, 2, measured[:, 2])):
