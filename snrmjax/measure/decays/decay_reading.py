@@ -99,8 +99,8 @@ def _read_from(
     backwards = np.flatnonzero(rate.imag <= 0)
     if backwards.size:
         raise ValueError(
-            f"the mode cannot be isolated: at {at[backwards[0]]:.4g} s the phase of its motion runs "
-            "backwards, as where another motion of like size beats with it."
+            f"the mode cannot be isolated: at {at[backwards[0]]:.4g} s the phase of its motion "
+            "runs backwards, as where another motion of like size beats with it."
         )
     rows = np.unique([*range(0, len(at), POINTS * PER_CYCLE), len(at) - 1])
     read = local_fit(time, signal, before, at[rows], sigma, rows=True)
