@@ -26,7 +26,7 @@ from snrmjax.identify.modal.linear_fit import ResidualTerms
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.frequency_responses import frequency_responses
 from snrmjax.methods.comparison import METHODS, RECORD_METHODS
-from snrmjax.model.base_motion import SensorMotion
+from snrmjax.model.moving_base import SensorMotion
 from snrmjax.pipelines.options import FAMILY_NAMES, IdentifyOptions, ModesOptions
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -109,7 +109,7 @@ SUB_ROOMS = {
     "report.study": {"report.style", "report.html", "report.sentences"},
     "io.programs": set(),
     "model.builders": {
-        *("model.base_motion", "model.effect_base", "model.effects", "model.modes"),
+        *("model.moving_base", "model.effect_base", "model.effects", "model.modes"),
         *("model.places", "model.potential", "model.structures"),
     },
     "io.reduction": {
@@ -286,6 +286,21 @@ def test_each_public_name_is_defined_once():
     for name in ("write", "headline"):
         assert all(module.startswith("snrmjax.report.pages.") for module in twice.pop(name))
     assert twice == {}
+
+
+def test_no_public_name_is_a_module_beside_it():
+    """Once such a module is imported, its package's attribute is the module, not the function."""
+    stubs, clashes = list(PACKAGE.rglob("__init__.pyi")), []
+    for stub in stubs:
+        for node in ast.parse(stub.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.ImportFrom) and node.module:
+                names = {alias.asname or alias.name for alias in node.names}
+                clashes += [stub.parent / name for name in names if stub.with_name(name).exists()]
+                clashes += [
+                    path for name in names if (path := stub.with_name(f"{name}.py")).exists()
+                ]
+    assert len(stubs) > 5
+    assert clashes == []
 
 
 BROKEN = {

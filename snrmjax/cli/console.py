@@ -18,7 +18,7 @@ PAGES = {
     "io.files": None,  # no such file, or no text
     "io.tables.check_driven_alike": ("Use a shaker table", "how-to/shaker-table"),
     "io.structure_matrices.moving_base": ("Use a shaker table", "how-to/shaker-table"),
-    "model.base_motion": ("Use a shaker table", "how-to/shaker-table"),
+    "model.moving_base": ("Use a shaker table", "how-to/shaker-table"),
     "io.tables": _FORMATS,
     "io.models": _FORMATS,
     "io.exchange": _IMPORT,

@@ -12,9 +12,9 @@ from jaxtyping import Float
 from snrmjax.io.files import shown
 from snrmjax.io.toml_table import TomlTable
 from snrmjax.io.units import DEGREE
-from snrmjax.model.base_motion import MOTIONS, BaseMotion, base_motion
 from snrmjax.model.builders.matrices import from_matrices
 from snrmjax.model.effect_base import AbstractEffect
+from snrmjax.model.moving_base import MOTIONS, BaseMotion, base_motion
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.rules import BELOW_ONE, NOT_ZERO
 

@@ -33,8 +33,8 @@ from snrmjax.measure.states import (
     SteadyStates,
     steady_states,
 )
-from snrmjax.model.base_motion import BaseMotion
 from snrmjax.model.modes import LinearModes
+from snrmjax.model.moving_base import BaseMotion
 from snrmjax.model.structures import Structure, modes_of
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.names import suggestion

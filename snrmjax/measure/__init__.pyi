@@ -1,7 +1,7 @@
 from .base_excitation import base_excited_states
 from .decays.isolated_decay import IsolatedDecay, isolate_decay
-from .equivalent_force import EquivalentForce, equivalent_force
 from .force_calibration import ForceCalibration, apply_calibration, calibrate_force
+from .force_on_mode import EquivalentForce, equivalent_force
 from .indicators import appropriation_of, nnm_appropriation
 from .recordings.channels import Channel
 from .recordings.frequency_responses import FrequencyResponses, frequency_responses

@@ -14,7 +14,7 @@ from snrmjax.measure.states import (
     SteadyStates,
     steady_states,
 )
-from snrmjax.model.base_motion import BaseMotion, base_motion
+from snrmjax.model.moving_base import BaseMotion, base_motion
 
 
 def base_excited_states(

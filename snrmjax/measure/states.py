@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from snrmjax.model.base_motion import BaseMotion
+from snrmjax.model.moving_base import BaseMotion
 from snrmjax.numerics.compiled import value_of
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting

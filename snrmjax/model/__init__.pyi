@@ -1,5 +1,4 @@
 from .averaging import averaged_effect
-from .base_motion import BaseMotion, base_motion
 from .builders.arches import ArchSettings, shallow_arch
 from .builders.beams import CURVED_BEAM_FORCES, FLAT_BEAM_FORCES, curved_beam, flat_beam
 from .builders.matrices import Matrices, beam, chain, from_matrices
@@ -33,6 +32,7 @@ from .modes import (
     linear_response,
     residual_velocity,
 )
+from .moving_base import BaseMotion, base_motion
 from .parameters import parameter_values, with_parameters
 from .places import between
 from .potential import PolynomialPotential, polynomial_potential

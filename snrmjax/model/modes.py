@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Shaped
 
-from snrmjax.model.base_motion import BaseMotion
+from snrmjax.model.moving_base import BaseMotion
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.names import suggestion
 from snrmjax.numerics.result import AbstractShown

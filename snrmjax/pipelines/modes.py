@@ -28,7 +28,7 @@ from snrmjax.io.units import HERTZ
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.states import SteadyStates, join_steady_states
-from snrmjax.model.base_motion import SensorMotion, base_motion
+from snrmjax.model.moving_base import SensorMotion, base_motion
 from snrmjax.model.structures import Structure, structure
 from snrmjax.numerics.facts import Fact
 from snrmjax.pipelines.options import ModesOptions, checked, flag_of

@@ -29,7 +29,7 @@ from snrmjax.measure.states import (
     with_levels_apart,
 )
 from snrmjax.methods.records.recorded_test import RecordedTest, RecordKind, recorded_test
-from snrmjax.model.base_motion import base_motion
+from snrmjax.model.moving_base import base_motion
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.facts import Fact
 from snrmjax.pipelines.check import files_of_test, is_certain, with_imports

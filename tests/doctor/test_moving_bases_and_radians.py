@@ -6,8 +6,8 @@ from truths.one_mode import OMEGA, SHAPE, ZETA, model, noisy, states, table
 
 import snrmjax as sj
 from snrmjax.measure.base_excitation import seen_from_base
-from snrmjax.model.base_motion import base_motion
 from snrmjax.model.modes import Beside
+from snrmjax.model.moving_base import base_motion
 
 
 def on_a_base(recorded, said, seed=0):

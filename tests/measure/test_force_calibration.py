@@ -10,8 +10,8 @@ import scipy.optimize
 import scipy.stats
 
 import snrmjax  # noqa: F401
-from snrmjax.measure.equivalent_force import ForceStatus, equivalent_force
 from snrmjax.measure.force_calibration import apply_calibration, calibrate_force
+from snrmjax.measure.force_on_mode import ForceStatus, equivalent_force
 from snrmjax.measure.states import steady_states
 from snrmjax.model.modes import LinearModesStd, RigidBodyModes, linear_modes
 

@@ -22,7 +22,7 @@ from snrmjax.identify.modal.separable_fit import SeparableFit
 from snrmjax.identify.modal.weighted_fit import FitSpread, line_weights, modal_result, weighted_fit
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.states import SteadyStates, relative_errors
-from snrmjax.model.base_motion import SensorMotion
+from snrmjax.model.moving_base import SensorMotion
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.units import HERTZ
 

@@ -20,7 +20,7 @@ from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses, frequency_responses
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.states import SteadyStates, relative_errors
-from snrmjax.model.base_motion import SensorMotion
+from snrmjax.model.moving_base import SensorMotion
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.units import HERTZ
 

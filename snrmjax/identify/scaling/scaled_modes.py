@@ -6,8 +6,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from snrmjax.model.base_motion import BaseMotion
 from snrmjax.model.modes import Beside, LinearModes, LinearModesStd, RigidBodyModes, linear_modes
+from snrmjax.model.moving_base import BaseMotion
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
 from snrmjax.numerics.units import HERTZ

@@ -33,7 +33,7 @@ from snrmjax.measure.states import (
     steady_states,
     with_levels_apart,
 )
-from snrmjax.model.base_motion import BaseMotion
+from snrmjax.model.moving_base import BaseMotion
 from snrmjax.numerics.facts import Fact
 
 

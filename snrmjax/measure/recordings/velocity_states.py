@@ -10,7 +10,7 @@ from jaxtyping import Complex, Float, Int
 from snrmjax.measure.recordings.channels import DERIVATIVE, Channel, channel_number
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.states import SteadyStates, steady_states
-from snrmjax.model.base_motion import BaseMotion
+from snrmjax.model.moving_base import BaseMotion
 from snrmjax.numerics.facts import Fact
 
 Levels = Literal["auto", "force", "drive", "runs"]

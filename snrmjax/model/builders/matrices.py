@@ -9,9 +9,9 @@ import scipy.sparse
 import scipy.sparse.linalg
 from jaxtyping import Float
 
-from snrmjax.model.base_motion import BaseMotion
 from snrmjax.model.effect_base import AbstractEffect, AbstractForce, checked_effects
 from snrmjax.model.modes import Beside, RigidBodyModes, linear_modes
+from snrmjax.model.moving_base import BaseMotion
 from snrmjax.model.places import Row, row_over_points
 from snrmjax.model.structures import Structure, structure
 from snrmjax.numerics.names import suggestion

@@ -9,7 +9,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from snrmjax.model.base_motion import BaseMotion
+from snrmjax.model.moving_base import BaseMotion
 from snrmjax.numerics.blocks import by_blocks, over_cores, taken
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
