@@ -78,7 +78,7 @@ def problems() -> str:
 
 def left_out() -> str:
     """Problems of the same list that are not compared."""
-    return table(["problem", "why"], of.sources()["left_out"].items()).replace("--:", "---")
+    return table(["problem", "why"], of.sources()["left_out"].items())
 
 
 # The paper

@@ -1,5 +1,6 @@
 """How the validation pages write numbers and tables."""
 
+import re
 from collections.abc import Iterable
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -26,10 +27,13 @@ def per_cent(share: float | None, digits: int = 2) -> str:
 
 
 def table(head: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
-    """A table; its first column is text, the others are on the right."""
+    """A table; columns of numbers are on the right, those with words in a row on the left."""
     head, rows = list(head), [[str(c).replace("|", "\\|") for c in row] for row in rows]
     if not rows:
         raise ValueError(f"A table of validation is empty: {', '.join(head)}.")
-    lines = [head, ["---", *["--:"] * (len(head) - 1)], *rows]
+    words = [
+        any(re.match(r"[^\W\d]{3}", cell) for cell in column) for column in zip(*rows, strict=True)
+    ]
+    lines = [head, ["---" if is_text else "--:" for is_text in words], *rows]
     text = "\n".join(f"| {' | '.join(line)} |" for line in lines)
     return f'<div class="results" markdown>\n\n{text}\n\n</div>'
