@@ -12,4 +12,14 @@ document.addEventListener("DOMContentLoaded", () => {
       throwOnError: true,
     });
   }
+  // What scrolls sideways on a narrow page can be reached by keyboard.
+  const wide = document.querySelectorAll(".md-typeset__scrollwrap, .figure, .katex-display");
+  const reachable = () => {
+    for (const part of wide) {
+      if (part.scrollWidth > part.clientWidth) part.tabIndex = 0;
+      else part.removeAttribute("tabindex");
+    }
+  };
+  addEventListener("load", reachable);
+  addEventListener("resize", reachable);
 });
