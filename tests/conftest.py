@@ -21,7 +21,8 @@ _QUICK = " ".join(
         "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1",
         # Another fifth: loops within loops are copied for every look into how often they turn and
         # what does not change in them, and what is known of memory is for optimisations alone.
-        "--xla_disable_hlo_passes=while-loop-invariant-code-motion,while-loop-trip-count-annotator",
+        "--xla_disable_hlo_passes=while-loop-invariant-code-motion,while-loop-trip-count-annotator"
+        ",simplify-while-loops",
         "--xla_llvm_enable_alias_scope_metadata=false --xla_llvm_enable_noalias_metadata=false",
         "--xla_llvm_enable_invariant_load_metadata=false",
     )
@@ -135,13 +136,16 @@ def pytest_collection_modifyitems(items):
             if item.get_closest_marker("long"):
                 item.add_marker(skip)
     # What runs longest starts first: no worker then waits at the end for the other's last file.
-    items.sort(key=lambda item: _unit(item.nodeid) not in ("joint fits", "test_notebooks.py"))
+    items.sort(key=lambda item: _turn(_unit(item.nodeid)))
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config, log):
     """Files go to workers whole; those of joint fits, which share programs, all to one."""
     from xdist.scheduler import LoadFileScheduling
+
+    # By itself it starts with the files of most tests, which are not those that take longest.
+    config.option.loadscopereorder = False
 
     class ByPrograms(LoadFileScheduling):
         def _split_scope(self, nodeid: str) -> str:
@@ -158,6 +162,19 @@ def _unit(nodeid: str) -> str:
         *("report/test_html", "report/test_figures", "test_cli.py", "test_readme.py"),
     )
     return "joint fits" if file.startswith(joint) else file
+
+
+def _turn(unit: str) -> int:
+    """When a unit starts: the longest first, after them what simulates, searches or starts others.
+
+    All else takes seconds a file and fills what is left.
+    """
+    turns = ("joint fits", "diagnose/test_diagnosis.py", "test_help.py", "test_notebooks.py")
+    later = ("simulate/", "diagnose/", "doctor/", "pipelines/", "identify/")
+    return next(
+        (turn for turn, first in enumerate((*turns, *later)) if unit.startswith(first)),
+        len(turns) + len(later),
+    )
 
 
 @pytest.fixture
