@@ -207,20 +207,28 @@ def test_further_examples_are_commands_with_all_that_is_needed(words, printed):
 # ------------------------------------------------------------------------------ completion
 
 
-def completed(*words):
-    """What a shell gets for the last of these words."""
+def line_to_complete(*words):
+    """What a shell sets to ask for the last of these words."""
     line = {"COMP_WORDS": shlex.join(["snrmjax", *words]), "COMP_CWORD": str(len(words))}
+    return line | {"_SNRMJAX_COMPLETE": "complete_bash"}
+
+
+def test_a_shell_completes_commands_options_and_words(monkeypatch, capsys):
     done = subprocess.run(
         [sys.executable, "-m", "snrmjax"],
-        env=os.environ | line | {"_SNRMJAX_COMPLETE": "complete_bash"},
+        env=os.environ | line_to_complete("dia"),
         capture_output=True,
         text=True,
         check=True,
     )
-    return done.stdout.split()
+    assert done.stdout.split() == ["diagnose"]
 
+    def completed(*words):  # in this process, which saves the start of another
+        for name, value in line_to_complete(*words).items():
+            monkeypatch.setenv(name, value)
+        assert run() == 0
+        return capsys.readouterr().out.split()
 
-def test_a_shell_completes_commands_options_and_words():
     assert completed("dia") == ["diagnose"]
     assert completed("study", "re") == ["report"]
     assert completed("identify", "--predict-f") == ["--predict-force"]
@@ -255,20 +263,16 @@ def test_the_words_to_complete_are_those_that_are_taken():
         ("fish", ".config/fish/completions/snrmjax.fish"),
     ],
 )
-def test_completion_is_installed_in_a_fresh_home(shell, file, tmp_path):
-    words = [sys.executable, "-m", "snrmjax", "--install-completion", shell]
+def test_completion_is_installed_in_a_fresh_home(shell, file, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("HOME", str(tmp_path))
     # Of typer: a shell is named in place of that which started the program.
-    named = {"HOME": str(tmp_path), "_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1"}
-    subprocess.run(words, env=os.environ | named, check=True, capture_output=True)
-    shown = subprocess.run(
-        [*words[:3], "--show-completion", shell],
-        env=os.environ | named,
-        check=True,
-        capture_output=True,
-        text=True,
-    )
-    assert shown.stdout.strip() == (tmp_path / file).read_text().strip()
-    assert f"_SNRMJAX_COMPLETE=complete_{shell}" in shown.stdout
+    monkeypatch.setenv("_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION", "1")
+    assert run("--install-completion", shell) == 0
+    capsys.readouterr()
+    assert run("--show-completion", shell) == 0
+    shown = capsys.readouterr().out
+    assert shown.strip() == (tmp_path / file).read_text().strip()
+    assert f"_SNRMJAX_COMPLETE=complete_{shell}" in shown
 
 
 # ------------------------------------------------------------------------------ read more

@@ -84,6 +84,7 @@ def is_number(text):
 
 
 LIGHT = ("wrong", "diagnose", "stopped")
+pytestmark = pytest.mark.usefixtures("optimised")  # whole searches, of which each runs twice
 
 
 @pytest.mark.parametrize(
