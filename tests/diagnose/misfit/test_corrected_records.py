@@ -20,6 +20,7 @@ from snrmjax.diagnose.misfit.predictions import predictions_of, scales_of, with_
 from snrmjax.diagnose.misfit.reference import with_reference
 from snrmjax.diagnose.misfit.weighted_misfit import weighted_misfit
 
+pytestmark = pytest.mark.usefixtures("optimised")  # searches run for longer than they compile
 RATIO, NOISE = 0.002, 0.003
 GAIN, PHASE = np.array([0.15, -0.1, 0.08, -0.12, 0.05]), np.radians([3.0, -2.0, 1.0, -3.0, 2.0])
 
