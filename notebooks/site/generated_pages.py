@@ -145,9 +145,13 @@ def effects_page() -> str:
         "The kinds that a model file may name under `[[effect]]`. Without `at` or `between` they "
         "act on the mode of interest and their parameters are modal; with them they act at points "
         "and their parameters are in N, m and kg "
-        "([how to place one](../how-to/element.md)).",
+        "([how to place one](../how-to/element.md)). A force c·|v|ⁿ or c·|x|ⁿ at one point, where "
+        "the mode has the mass-normalised shape φ, has the modal coefficient c·φⁿ⁺¹: a spring k₃x³ "
+        'is `cubic_stiffness` with k₃φ⁴, or `"1111" = k₃φ⁴/4` in `[potential]`, whose force is its '
+        "derivative.",
     ]
-    for kind, effect in snrmjax.model.EFFECTS.items():
+    tables = snrmjax.model.EFFECTS, snrmjax.model.ELEMENTS, snrmjax.model.LAWS
+    for kind, effect in (entry for table in tables for entry in table.items()):
         rows = ["| parameter | what it is | modal unit |", "|---|---|---|"]
         for name, of in effect.parameters().items():
             rows.append(f"| `{name}` | {cell(of.meaning)} | {cell(of.unit)} |")

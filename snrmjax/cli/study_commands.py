@@ -157,9 +157,10 @@ def _shard(text: str) -> tuple[int, int]:
 
 def _say_study(study: "Study") -> None:
     names = ", ".join(study.names) or "nothing but the noise"
+    several = len(study.names) > 1
     say(
         f"{study.name}: {study.n_members} members ({study.computation.kind}) in {study.n_chunks} "
-        f"chunks; {names} varies" + ("" if len(study.names) < 2 else " together")
+        f"chunks; {names} {'vary' if several else 'varies'}"
     )
 
 

@@ -33,7 +33,7 @@ from .modes import (
     residual_velocity,
 )
 from .moving_base import BaseMotion, base_motion
-from .parameters import parameter_values, with_parameters
+from .parameters import parameter_names, parameter_values, with_parameters
 from .places import between
 from .potential import PolynomialPotential, polynomial_potential
 from .structures import Structure, equilibria, structure
@@ -80,6 +80,7 @@ __all__ = [
     "linear_response",
     "make_effect",
     "parameter",
+    "parameter_names",
     "parameter_values",
     "polynomial_potential",
     "register_effect",

@@ -84,9 +84,9 @@ class DrivePoint(NamedTuple):
         place = _drive_point_of(fit)
         if place is None:
             raise ValueError(
-                "the shapes cannot be mass-normalised: no sensor is at the force "
-                f"{fit.reference.name} (point and axis of {', '.join(fit.sensor_names)} say none), "
-                "and no added mass, sensor masses or known shape was given."
+                "the shapes cannot be mass-normalised: no sensor is known to be where the force "
+                f"acts (by points and axes of {', '.join(fit.sensor_names)}); name that sensor, or "
+                "give an added mass, sensor masses or a known shape."
             )
         return place[0], sign * place[1]
 

@@ -19,6 +19,12 @@ from snrmjax.report.sentences import number_of, sentences
 from snrmjax.report.style import save_figure, save_figures
 from snrmjax.simulate.continuation.response_curve import Branch, ResponseCurve, velocity_at_sensors
 
+# Events that the terminal counts, beside the largest velocity.
+_COUNTED = {
+    "fold": "fold",
+    "period_doubling": "period doubling",
+    "neimark_sacker": "Neimark-Sacker point",
+}
 _CAPTIONS = {
     "response": "Velocity over the frequency of the force; dashed where the response is unstable.",
     "events": "Events of the responses over the parameter.",
@@ -81,7 +87,10 @@ def _largest(curve: ResponseCurve, sensor: str) -> str:
     if not speed.size:
         return f"{load}: no response"
     top = int(np.argmax(speed))
+    # A fold is always counted, the others where there are any.
+    counts = {name: len(curve.at_events(kind)) for kind, name in _COUNTED.items()}
+    turns = ", ".join(number_of(n, name) for name, n in counts.items() if n or name == "fold")
     return (
-        f"{load}: {speed[top]:.4g} m/s at {sensor} at most, at "
-        f"{curve.frequency[top] / HERTZ:.5g} Hz; {number_of(len(curve.at_events('fold')), 'fold')}"
+        f"{load}: fundamental velocity at {sensor} up to {speed[top]:.4g} m/s, at "
+        f"{curve.frequency[top] / HERTZ:.5g} Hz; {turns}"
     )

@@ -162,7 +162,7 @@ def test_a_forced_free_fixture():
     assert scaled.rigid_participation == pytest.approx(6.0**-0.5)
     with pytest.raises(ValueError, match="no fixture mass is stated"):
         scale_modes(fit, SensorMasses(masses))
-    with pytest.raises(ValueError, match="no sensor is at the force"):
+    with pytest.raises(ValueError, match="no sensor is known to be where the force acts"):
         scale_modes(fit, DrivePoint())
 
 
