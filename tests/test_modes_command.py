@@ -156,7 +156,7 @@ def test_shape_times_participation_is_the_residue_without_a_scale(base, tmp_path
 
 
 BAD = [
-    (("elsewhere.uff",), "no sensor is at the force"),
+    (("elsewhere.uff",), "no sensor is known to be where"),
     (("conjugated.uff",), "negative damping"),
     (("two.uff",), "over one reference, but there are 2"),
     (("line.uff",), "modes need 6 lines"),
