@@ -92,7 +92,7 @@ def drawn(path: str, by_points: list[dict], by_unknowns: list[dict]) -> None:
         x, y = [row["n_points"] for row in rows], [row["milliseconds_a_point"] for row in rows]
         left.loglog(x, y, "o-", markersize=3, label=f"{n_modes} modes")
     left.set(xlabel="Nonlinear points", ylabel="Time a point of the curve (ms)", title="(a)")
-    left.legend(frameon=False)
+    left.legend(frameon=False, loc="center right", bbox_to_anchor=(1.0, 0.68))
     x = [row["unknowns"] for row in by_unknowns]
     for name, label in (("reduction_seconds", "reduction"), ("seconds", "response curve")):
         right.loglog(x, [row[name] for row in by_unknowns], "o-", markersize=3, label=label)
