@@ -97,7 +97,11 @@ def followed(
     assert np.all(np.isfinite(curve.points[:n]))
     assert np.all(np.isfinite(curve.tangents[:n]))
     assert np.all(np.isnan(curve.points[n:]))  # nothing plausible behind the last point
-    return np.asarray(curve.points)[:n], np.asarray(curve.tangents)[:n], CurveStatus(curve.status)
+    return (
+        np.asarray(curve.points)[:n],
+        np.asarray(curve.tangents)[:n],
+        CurveStatus(int(curve.status)),
+    )
 
 
 @pytest.fixture(scope="module")
