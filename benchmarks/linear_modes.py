@@ -190,14 +190,20 @@ def run_close(seeds):
 def run_random(seeds):
     """Random excitation in time."""
     structure = usual([0.02, 0.02, 0.02])
-    make = lambda rng: tested(rng, structure, 800.0, 1024.0, 32768, 0.05)  # noqa: E731
+
+    def make(rng):
+        return tested(rng, structure, 800.0, 1024.0, 32768, 0.05)
+
     coverage("random", structure, make, lambda data: scaled(data, window="hann"), seeds)
 
 
 def run_light(seeds):
     """Few lines in the half-power band."""
     structure = usual([0.003, 0.002, 0.002])
-    make = lambda rng: tested(rng, structure, 800.0, 1024.0, 8192, 0.02)  # noqa: E731
+
+    def make(rng):
+        return tested(rng, structure, 800.0, 1024.0, 8192, 0.02)
+
     for window in ("hann", None):
         coverage(
             "light",
@@ -212,8 +218,13 @@ def run_light(seeds):
 def run_decay(seeds):
     """Free decays."""
     structure = usual([0.01, 0.008, 0.006])
-    make = lambda rng: decayed(rng, structure, 3.0, 1024.0, 0.02)  # noqa: E731
-    fit = lambda data: identify.scale_modes(identify.fit_free_decay(data), None)  # noqa: E731
+
+    def make(rng):
+        return decayed(rng, structure, 3.0, 1024.0, 0.02)
+
+    def fit(data):
+        return identify.scale_modes(identify.fit_free_decay(data), None)
+
     coverage("decay", structure, make, fit, seeds)
 
 

@@ -128,6 +128,11 @@ def test_help_fits_a_screen(words, printed):
 def test_every_option_is_in_the_long_help_and_what_must_be_stated_in_the_usage(words, printed):
     short, long = (printed(*words, option) for option in ("--help", "--help-all"))
     parameters = COMMANDS[words].params
+    for one in parameters:
+        assert len(one.help) > 15, one.name
+        # A number's unit is said; those of an import name channels.
+        if words != ("import",) and one.name.endswith(("_hz", "force")):
+            assert re.search(r"\bHz\b|\bN\b", one.help), one.name
     every = {flag for one in parameters for flag in (*one.opts, *one.secondary_opts)}
     assert options_of(long) >= {flag for flag in every if flag.startswith("--")}
     (usage,) = re.findall(r"Usage: (snrmjax [^\n]*\n?[^\n]*?)\s*\n\s*\n", short)

@@ -227,7 +227,10 @@ def _met(value: str, bar: str) -> bool | None:
     found = float(per_cent[1] if per_cent else value.split()[0])
     if bar in ("all", "0"):
         return found == (100.0 if bar == "all" else 0.0)
-    sign, limit = re.fullmatch(r"([<>])= ([\d.]+)(?: %)?", bar).groups()  # type: ignore[union-attr]
+    stated = re.fullmatch(r"([<>])= ([\d.]+)(?: %)?", bar)
+    if stated is None:
+        raise ValueError(f"A bar of the blind sets is not understood: {bar!r}.")
+    sign, limit = stated.groups()
     return found <= float(limit) if sign == "<" else found >= float(limit)
 
 

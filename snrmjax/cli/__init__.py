@@ -90,9 +90,8 @@ def main() -> None:
     """Run the commands; wrong input ends with exit code 2 and one sentence."""
     # Imports and programs stay to the end: to look for rubbish in them takes a tenth of a command.
     gc.set_threshold(_OBJECTS)
-    if sys.argv[1:] and not {"--help", "--help-all"} & {
-        *sys.argv
-    }:  # help does not wait for the import of JAX
+    asks_help = not {"--help", "--help-all"}.isdisjoint(sys.argv)
+    if sys.argv[1:] and not asks_help:  # help does not wait for the import of JAX
         from snrmjax.io.programs.compilation_cache import use_compilation_cache
 
         use_compilation_cache()

@@ -157,10 +157,9 @@ def _shard(text: str) -> tuple[int, int]:
 
 def _say_study(study: "Study") -> None:
     names = ", ".join(study.names) or "nothing but the noise"
-    several = len(study.names) > 1
     say(
         f"{study.name}: {study.n_members} members ({study.computation.kind}) in {study.n_chunks} "
-        f"chunks; {names} {'vary' if several else 'varies'}"
+        f"chunks; {names} {'vary' if len(study.names) > 1 else 'varies'}"
     )
 
 

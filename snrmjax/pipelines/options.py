@@ -416,7 +416,7 @@ class ModesOptions:
     )
     newtons_per_volt_std: float = option(
         0.0,
-        "Its 1σ.",
+        "1σ of that calibration.",
         panel=_ONE_SCALE,
         needs=("newtons_per_volt",),
         why_needed="belongs to a calibration: add `--newtons-per-volt`",

@@ -9,10 +9,13 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.figure import Figure
 
+from snrmjax import __version__
 from snrmjax.io.files import FilePath, write_atomically
 from snrmjax.report.style import COLUMN, PrintedFigure, printed
 
 Rows = Sequence[tuple[str, str]]
+
+PROGRAM = ("program", f"snrmjax {__version__}")  # among what was done
 
 _REM_PER_INCH = 8.0  # of figures on the page: their letters are then as large as the text's
 

@@ -15,6 +15,7 @@ from concurrent.futures import (
     Future,
     wait,
 )
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import jax
@@ -42,7 +43,10 @@ _ONE_THREAD = {
 
 # lazy-loader 0.6 gives modules a class of its own, which pickles do not take for one of modules: a
 # user's function that names this package would not reach a worker.
-copyreg.pickle(type(snrmjax.model), lambda module: (importlib.import_module, (module.__name__,)))
+if type(snrmjax.model) is not ModuleType:
+    copyreg.pickle(
+        type(snrmjax.model), lambda module: (importlib.import_module, (module.__name__,))
+    )
 
 
 class WorkerDied(Exception):

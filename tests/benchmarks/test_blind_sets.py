@@ -1,9 +1,5 @@
 """The generator of blind sets against exact answers and first-order formulas."""
 
-import importlib
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -11,13 +7,10 @@ STEPS = 128  # a period: enough for the tolerances here
 
 
 @pytest.fixture(scope="module")
-def blind():
+def blind(of_benchmark):
     """The benchmark's modules, which stand beside each other and not in a package."""
-    folder = str(Path(__file__).resolve().parents[2] / "benchmarks" / "blind_sets")
-    sys.path.insert(0, folder)
     names = ("drawn", "effects", "forces", "integration", "laws", "sweep", "truth")
-    yield type("Blind", (), {name: importlib.import_module(name) for name in names})
-    sys.path.remove(folder)
+    return type("Blind", (), {name: of_benchmark(f"blind_sets/{name}") for name in names})
 
 
 def lanes(blind, rows, *, start, direction):

@@ -1,9 +1,5 @@
 """The true modes of a benchmark of coupled sets, against closed forms."""
 
-import importlib
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy.special import ellipj, ellipk
@@ -13,14 +9,8 @@ SHAPE = np.array([[1.5, 0.8], [0.7, -1.2]])
 
 
 @pytest.fixture(scope="module")
-def score():
-    """The benchmark's module, which is in no package."""
-    folder = str(Path(__file__).resolve().parents[2] / "benchmarks/coupled_sets")
-    sys.path.insert(0, folder)
-    yield importlib.import_module("score")
-    sys.path.remove(folder)
-    for name in ("score", "generate"):
-        sys.modules.pop(name, None)
+def score(of_benchmark):
+    return of_benchmark("coupled_sets/score")
 
 
 def test_alone_the_true_mode_is_the_duffing_oscillators(score):

@@ -1,9 +1,5 @@
 """The steady states of the regime's map against time integration of the same law."""
 
-import importlib
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -12,11 +8,8 @@ DAMPING = 0.01
 
 
 @pytest.fixture(scope="module")
-def oscillator():
-    folder = str(Path(__file__).resolve().parents[2] / "benchmarks" / "regime_map")
-    sys.path.insert(0, folder)
-    yield importlib.import_module("oscillator")
-    sys.path.remove(folder)
+def oscillator(of_benchmark):
+    return of_benchmark("regime_map/oscillator")
 
 
 @pytest.mark.parametrize(

@@ -1,9 +1,5 @@
 """The integrated bolted beams of a benchmark, against what is known of one slider and of none."""
 
-import importlib
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -12,12 +8,8 @@ OWN = 2 * np.pi * np.array([1.0, 4.0, 9.0])
 
 
 @pytest.fixture(scope="module")
-def integration():
-    """The benchmark's module, which is in no package."""
-    folder = str(Path(__file__).resolve().parents[2] / "benchmarks")
-    sys.path.insert(0, folder)
-    yield importlib.import_module("slip_integration")
-    sys.path.remove(folder)
+def integration(of_benchmark):
+    return of_benchmark("slip_integration")
 
 
 def beams(integration, *, limit, moving=0.0, back=0.0, drive=(1.0, 0.0, 0.0)):

@@ -7,7 +7,6 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-from snrmjax import __version__
 from snrmjax.diagnose.decide import Verdict
 from snrmjax.diagnose.diagnosis_result import Diagnosis
 from snrmjax.diagnose.evidence import NOISE_REJECTED, NONE, UNKNOWN
@@ -38,6 +37,7 @@ from snrmjax.report.figures.diagnosis import (
 )
 from snrmjax.report.figures.drawn_laws import LAW_CAPTION, drawn_laws_figure, law_tables
 from snrmjax.report.html import (
+    PROGRAM,
     Report,
     ReportFigure,
     ReportTable,
@@ -202,7 +202,7 @@ def diagnosis_report(
     shown = {name: ReportFigure(figure, captions[name]) for name, figure in figures.items()}
     return Report(
         title=title,
-        done=[*(done or {}).items(), ("program", f"snrmjax {__version__}")],
+        done=[*(done or {}).items(), PROGRAM],
         result=diagnosis.verdict_sentence,
         summary=_key_numbers(diagnosis, predicted),
         notes=[*map(str, diagnosis.notes)],

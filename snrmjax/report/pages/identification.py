@@ -6,7 +6,6 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
-from snrmjax import __version__
 from snrmjax.identify.inference.identification import Identification
 from snrmjax.identify.joint.joint_fit import NoiseEstimate
 from snrmjax.identify.pointwise.backbone import Backbone
@@ -17,7 +16,16 @@ from snrmjax.identify.pointwise.prediction import (
 )
 from snrmjax.io.units import DEGREE, HERTZ
 from snrmjax.model.modes import LinearModes
-from snrmjax.report.html import Report, ReportFigure, ReportTable, Rows, Section, minus, with_error
+from snrmjax.report.html import (
+    PROGRAM,
+    Report,
+    ReportFigure,
+    ReportTable,
+    Rows,
+    Section,
+    minus,
+    with_error,
+)
 from snrmjax.report.sampling import sample_backbone, velocity_of
 from snrmjax.report.style import PrintedFigure, Unit, unit_for, with_unit
 from snrmjax.simulate.solutions.forced_response import ResponseCurve
@@ -147,7 +155,7 @@ def identification_report(
         sections.append(Section("Predicted responses", further_levels, shown, [table]))
     return Report(
         title=title,
-        done=[*(done or {}).items(), ("program", f"snrmjax {__version__}")],
+        done=[*(done or {}).items(), PROGRAM],
         result=identification_sentence(identification, modes),
         summary=identification_summary(identification, modes, words),
         notes=list(dict.fromkeys(map(str, [*notes, *identification.notes]))),

@@ -3,7 +3,6 @@
 from pathlib import Path
 from typing import NamedTuple
 
-from snrmjax import __version__
 from snrmjax.doctor.findings import Checkup
 from snrmjax.io.laboratory.checkups import write_checkup
 from snrmjax.io.tables import write_steady_states
@@ -11,7 +10,7 @@ from snrmjax.io.units import HERTZ
 from snrmjax.pipelines.whole_test import WholeTest
 from snrmjax.report.figures.live import NEEDED, has_bokeh
 from snrmjax.report.figures.state_explorer import state_explorer
-from snrmjax.report.html import Report, ReportTable, Section, write_report
+from snrmjax.report.html import PROGRAM, Report, ReportTable, Section, write_report
 from snrmjax.report.pages import diagnosis, identified_test, modes
 from snrmjax.report.pages.identification import linear_mode_row
 
@@ -103,7 +102,7 @@ def _report(found: WholeTest, stages: list[_Stage], result: str) -> Report:
             notes.setdefault(note, f"{name}: ")
     return Report(
         title=f"Test: {found.name}",
-        done=[("program", f"snrmjax {__version__}")],
+        done=[PROGRAM],
         result=result,
         summary=list(dict.fromkeys(rows)),
         notes=[f"{stage}{note}" for note, stage in notes.items()],
