@@ -9,11 +9,14 @@ from typing import Any, ParamSpec, TypeVar
 import equinox as eqx
 import jax
 import numpy as np
+from jaxtyping import Int, Shaped
 from threadpoolctl import ThreadpoolController
 
 P = ParamSpec("P")
 T = TypeVar("T")
 R = TypeVar("R")
+
+_ROW, _MEMBERS = 16, (1, 4, 64)  # rows of one member, and of how many members, in one program
 
 
 def padded(rows: np.ndarray, at_least: int = 128) -> np.ndarray:
@@ -38,6 +41,38 @@ def by_blocks(
 
     parts = over_cores(answered, range(0, max(n, 1), size))
     return tuple(np.concatenate(column) for column in zip(*parts, strict=True))
+
+
+def by_member(
+    function: Callable[..., Any],
+    members: Any,
+    owner: Int[np.ndarray, " row"],
+    *rows: Shaped[np.ndarray, "row ..."],
+) -> Shaped[np.ndarray, "row ..."]:
+    """A compiled function of members and rows of each, for every row with the member it is of.
+
+    Arguments: `function` of stacked members and of rows of every one, of shape (member, row, …),
+    gives an array so; `owner` says of which of the `members` a row is. Rows are grouped by member,
+    a few of one and some members a call: those of one member and those of thousands need three
+    programs, whose digits do not depend on other members. Returns shape (row, …).
+    """
+    groups = [np.flatnonzero(owner == o) for o in np.unique(owner)]
+    parts = [
+        np.resize(part, _ROW)  # filled up with its own
+        for group in groups
+        for part in np.split(group, range(_ROW, len(group), _ROW))
+    ]
+    size = max(size for size in _MEMBERS if size <= len(parts))
+
+    def block(begin: int) -> tuple[np.ndarray, np.ndarray]:
+        index = np.stack(parts[begin : begin + size])
+        index = index[np.minimum(np.arange(size), len(index) - 1)]
+        found = function(taken(members, owner[index[:, 0]]), *(row[index] for row in rows))
+        return index.ravel(), np.asarray(found).reshape(index.size, *found.shape[2:])
+
+    found = over_cores(block, range(0, len(parts), size))
+    index, values = (np.concatenate(column) for column in zip(*found, strict=True))
+    return values[np.unique(index, return_index=True)[1]]
 
 
 def stacked(trees: Sequence[T]) -> T:

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from snrmjax.model.averaging import AveragedForce
 from snrmjax.model.effect_base import AbstractHysteresis, AbstractKinked
@@ -65,13 +65,17 @@ class HarmonicBalance(eqx.Module):
         return jnp.append(scaled, frequency / self.frequency_scale)
 
     def motions(
-        self, points: Float[np.ndarray, "point unknown"]
+        self,
+        points: Float[np.ndarray, "point unknown"],
+        owner: Int[np.ndarray, " point"] | None = None,
     ) -> tuple[Float[np.ndarray, "point coefficient mode"], Float[np.ndarray, " point"]]:
         """Coefficients (kg^1/2 m) and frequencies (rad/s) of scaled points (x, λ), on the host.
 
-        Of a stacked balance: one point of each.
+        Of a stacked balance: `owner` says of which one every point is.
         """
         scale, unit = np.asarray(self.displacement_scale), np.asarray(self.frequency_scale)
+        if owner is not None:
+            scale, unit = scale[owner], unit[owner]
         rows = points[:, :-1] * scale[..., None]
         shape = (len(points), self.n_coefficients, self.model.n_modes)
         return rows.reshape(shape), points[:, -1] * unit

@@ -11,6 +11,7 @@ from snrmjax.simulate.continuation.continuation import CurveEvent, StepControl, 
 from snrmjax.simulate.continuation.events import (
     NewPoint,
     inserted,
+    neighbours_of,
     points_between,
 )
 from snrmjax.simulate.continuation.stability import MARGIN, many_multipliers
@@ -120,18 +121,17 @@ def _located_bifurcations(
     value_low, value_high = (sense * known).T
     share = np.tile(np.arange(1, _SHARES + 1) / (_SHARES + 1), (count, 1))
     # Where the crossing is known to be passed: at first the neighbours behind it.
-    point, tangent = (
-        np.stack([rows[k + 1] for rows, k in zip(column, before.tolist(), strict=True)])
-        for column in zip(*((curves[o].points, curves[o].tangents) for o in owner), strict=True)
-    )
+    neighbours = neighbours_of(curves, owner.tolist(), before.tolist())
+    point, tangent = (rows.copy() for rows in neighbours[2:])
     passed, inside, missed = ends[1], np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
     for _ in range(_ROUNDS):
         still = np.flatnonzero(high - low > _CROSSING)
         if not still.size:
             break
-        owners, places = (np.repeat(part[still], _SHARES) for part in (owner, before))
+        which = np.repeat(still, _SHARES)
+        owners, ways = owner[which], tuple(rows[which] for rows in neighbours)
         points, tangents, found = points_between(
-            *(balances, curves, owners.tolist(), places.tolist()), share[still].ravel(), steps
+            balances, owners, ways, share[still].ravel(), steps
         )
         rows = many_multipliers(balances, owners, points)
         found = (found & np.all(np.isfinite(rows), axis=1)).reshape(-1, _SHARES)

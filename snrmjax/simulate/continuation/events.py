@@ -18,6 +18,7 @@ from snrmjax.simulate.continuation.newton import correct
 
 EVENT_KINDS = (CurveEvent.FOLD, CurveEvent.PEAK, CurveEvent.PHASE_RESONANCE)
 _INSIDE = 7  # points inside an interval that is looked at more closely
+_MANY = 8  # times as many lanes, where there are points for them
 
 
 def velocities_along(
@@ -161,7 +162,7 @@ def with_events(
         position += where.tolist()
     if not owner:
         return divided
-    here, ahead, there, _ = _neighbours(divided, owner, position)
+    here, ahead, there, _ = neighbours_of(divided, owner, position)
     jobs = (taken(balances, np.array(owner)), np.array(kind), here, ahead, there)
     found, tangents, resolved, missed = _searched(jobs, steps)
     for e in np.flatnonzero(missed).tolist():
@@ -195,7 +196,8 @@ def _divided(
             share += [(i + 1) / (_INSIDE + 1) for i in range(_INSIDE)]
     if not owner:
         return list(curves)
-    found, tangents, ok = points_between(balances, curves, owner, position, share, steps)
+    between = neighbours_of(curves, owner, position)
+    found, tangents, ok = points_between(balances, np.array(owner), between, np.array(share), steps)
     keep = np.flatnonzero(ok).tolist()
     return inserted(
         curves,
@@ -205,20 +207,22 @@ def _divided(
 
 def points_between(
     balances: HarmonicBalance,
-    curves: list[TracedCurve],
-    owner: list,
-    position: list,
-    share: Sequence[float] | np.ndarray,
+    owner: Int[np.ndarray, " point"],
+    neighbours: tuple[np.ndarray, ...],
+    share: Float[np.ndarray, " point"],
     steps: StepControl,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points at shares of the way to the next one, their tangents, and whether they were found."""
-    neighbours = _neighbours(curves, owner, position)
-    ahead, rows = neighbours[1], (*neighbours, np.array(share))
-    n, lanes = len(owner), lanes_for(balances.size + 1)
+    """Points at shares of the way between neighbours, their tangents, and whether they were found.
+
+    Arguments: `owner` says of which of the `balances` a point is, `neighbours` are its own.
+    """
+    n, ahead, rows = len(owner), neighbours[1], (*neighbours, share)
+    lanes = lanes_for(balances.size + 1)
+    lanes *= _MANY if n >= _MANY * lanes else 1
 
     def corrected(begin: int) -> list[np.ndarray]:
         index = np.minimum(np.arange(begin, begin + lanes), n - 1)
-        mine = taken(balances, np.array(owner)[index])
+        mine = taken(balances, owner[index])
         found = _between(mine, *(row[index] for row in rows), steps)
         return [np.asarray(part)[: n - begin] for part in found]
 
@@ -228,7 +232,9 @@ def points_between(
     return found, np.where(turned[:, None], -tangents, tangents), ok
 
 
-def _neighbours(curves: list[TracedCurve], owner: list, position: list) -> tuple[np.ndarray, ...]:
+def neighbours_of(
+    curves: list[TracedCurve], owner: Sequence[int], position: Sequence[int]
+) -> tuple[np.ndarray, ...]:
     """Points and tangents at positions on curves, then those behind them."""
     pairs = list(zip(owner, position, strict=True))
     return tuple(

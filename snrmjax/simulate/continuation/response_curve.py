@@ -1,16 +1,16 @@
 """Curves of periodic motions as results: nonlinear modes, forced responses and their events."""
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from enum import StrEnum
 from typing import ClassVar
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Bool, Complex, Float, Int
+from jaxtyping import Array, Bool, Complex, Float, Int
 
 from snrmjax.model.moving_base import BaseMotion
-from snrmjax.numerics.blocks import by_blocks, over_cores, taken
+from snrmjax.numerics.blocks import by_member, mapped, taken
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, truncation_error
@@ -26,7 +26,7 @@ from snrmjax.simulate.continuation.continuation import (
 from snrmjax.simulate.continuation.events import with_events
 from snrmjax.simulate.continuation.stability import (
     Stability,
-    floquet_multipliers,
+    many_multipliers,
     stability_of,
 )
 
@@ -187,36 +187,58 @@ def assembled(
         balances, [c._replace(events=(CurveEvent.NONE,) * len(c.points)) for c in curves], steps
     )
 
-    def followed(number: int) -> TracedCurve:
-        balance, curve = taken(balances, number), labelled[number]
-        multipliers = floquet_multipliers(balance.model, *balance.motions(curve.points))
-        return curve._replace(multipliers=multipliers)
-
     if stability:
-        followed_curves = over_cores(followed, range(len(curves)))
-        labelled = with_bifurcations(balances, followed_curves, steps)
+        multipliers = _of_points(many_multipliers, balances, labelled)
+        labelled = [
+            c._replace(multipliers=rows) for c, rows in zip(labelled, multipliers, strict=True)
+        ]
+        labelled = with_bifurcations(balances, labelled, steps)
+    truncations = _of_points(_truncation_errors, balances, labelled) if stability else None
 
     def finished(number: int) -> ResponseCurve:
-        balance, curve, truncation = taken(balances, number), labelled[number], None
+        balance, curve = taken(balances, number), labelled[number]
         motions = motions_of(balance, curve.points)
-        if stability:
-            (truncation,) = by_blocks(
-                lambda x, w: (_truncation(balance, x, w),),
-                *(128, motions["coefficients"], motions["frequency"]),
-            )
         return ResponseCurve(
             **motions,
             force=float(balance.force),
             event=curve.events,
             status=curve.status,
             multipliers=curve.multipliers,
-            truncation=truncation,
+            truncation=None if truncations is None else truncations[number],
             not_located=curve.not_located,
             branch=branch,
             n_solves=curve.n_solves,
         )
 
-    return over_cores(finished, range(len(curves)))
+    return [finished(number) for number in range(len(curves))]
 
 
-_truncation = compiled(truncation_error)
+def _of_points(
+    numbers: Callable[[HarmonicBalance, np.ndarray, np.ndarray], np.ndarray],
+    balances: HarmonicBalance,
+    curves: list[TracedCurve],
+) -> list[np.ndarray]:
+    """Numbers of every point of many curves, asked for at once."""
+    counts = [len(curve.points) for curve in curves]
+    owner = np.repeat(np.arange(len(curves)), counts)
+    rows = numbers(balances, owner, np.concatenate([curve.points for curve in curves]))
+    return np.split(rows, np.cumsum(counts)[:-1])
+
+
+@compiled
+def _truncations(
+    balances: HarmonicBalance,
+    coefficients: Float[Array, "row point coefficient mode"],
+    frequency: Float[Array, "row point"],
+) -> Float[Array, "row point"]:
+    return mapped(truncation_error, balances, coefficients, frequency)
+
+
+def _truncation_errors(
+    balances: HarmonicBalance, owner: np.ndarray, points: np.ndarray
+) -> Float[np.ndarray, " point"]:
+    """Estimated truncation errors of scaled points of several structures."""
+    if not len(points):
+        return np.zeros(0)
+    coefficients, frequency = balances.motions(points, owner)
+    return by_member(_truncations, balances, owner, coefficients, frequency)

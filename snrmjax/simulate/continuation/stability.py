@@ -8,14 +8,13 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
 from snrmjax.model.structures import Structure
-from snrmjax.numerics.blocks import mapped, over_cores, padded, taken
+from snrmjax.numerics.blocks import by_member, mapped, over_cores, padded
 from snrmjax.numerics.compiled import compiled
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance
 from snrmjax.simulate.continuation.monodromy import monodromy
 
 _BLOCKS = ((1, 128), (2, 64))  # modes, and points whose linearised motions are side by side
 _BLOCK = 32  # of more modes
-_ROW, _ROWS = 16, 4  # points of one structure, and of how many structures, in one program
 STEPS_PER_CYCLE = 6  # of the fastest tangent frequency
 MARGIN = 1e-6  # beyond the unit circle: what the multipliers of a conservative motion may err by
 
@@ -71,25 +70,11 @@ def many_multipliers(
     balances: HarmonicBalance, owner: np.ndarray, points: Float[np.ndarray, "point unknown"]
 ) -> Complex[np.ndarray, "point multiplier"]:
     """Floquet multipliers of scaled points of several structures: `owner` says of which."""
-    groups = [np.flatnonzero(owner == o) for o in np.unique(owner)]
-    rows = [
-        np.resize(part, _ROW)  # filled up with its own
-        for group in groups
-        for part in np.split(group, range(_ROW, len(group), _ROW))
-    ]
-    size = _ROWS if len(rows) > 1 else 1
-    coefficients, frequency = taken(balances, owner).motions(points)
-    found = np.full((len(points), 2 * balances.model.n_modes), np.nan, dtype=np.complex128)
-
-    def block(begin: int) -> None:
-        index = np.stack(rows[begin : begin + size])
-        index = index[np.minimum(np.arange(size), len(index) - 1)]
-        models = taken(balances.model, owner[index[:, 0]])
-        maps = _monodromies(models, coefficients[index], frequency[index])
-        found[index] = _eigenvalues(np.asarray(maps), found.shape[1])
-
-    over_cores(block, range(0, len(rows), size))
-    return found
+    if not len(points):
+        return np.zeros((0, 2 * balances.model.n_modes), dtype=np.complex128)
+    coefficients, frequency = balances.motions(points, owner)
+    maps = by_member(_monodromies, balances.model, owner, coefficients, frequency)
+    return _eigenvalues(maps, 2 * balances.model.n_modes)
 
 
 @partial(compiled, long_loops=True)
