@@ -6,14 +6,11 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Num
 
-from snrmjax.io.laboratory.names import role_of
-from snrmjax.io.laboratory.physical_units import unit_meaning
+from snrmjax.io.laboratory.names import label_of, listed_name, role_of
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.numerics.facts import Fact
 
-_QUANTITIES = ("force", "drive", "displacement", "velocity", "acceleration", "frequency", "time")
-_ROLES = {one: one for one in _QUANTITIES} | {"angle": "phase", "voltage": "drive"}
 Kind = Literal["uff", "matlab", "hdf5", "netcdf", "tdms", "lvm", "csv"]
 
 
@@ -32,20 +29,17 @@ class NumberTable(NamedTuple):
     words: Mapping[str, tuple[str, ...]] = {}
 
     def role(self, name: str) -> str:
-        """What a column is: by its name or, where that says little, by its unit; or nothing.
+        """What a column is, by its name and its unit; see `role_of`."""
+        return role_of(name, self.units.get(name, ""))
 
-        A unit says "frequency", "phase", "time", "force", "drive" (volts) or which motion it is,
-        and is believed before a name that says another of these quantities.
-        """
-        by_name = role_of(name)
-        try:
-            meaning = unit_meaning(self.units.get(name, ""))
-        except ValueError:
-            return by_name
-        by_unit = _ROLES.get(meaning.dimension, "")
-        is_drive = by_unit == "drive" and by_name != "drive"  # a sensor's volts are volts, too
-        plain = not by_name or (by_name in _QUANTITIES and by_unit in _QUANTITIES)
-        return by_unit if by_unit and plain and not is_drive else by_name
+    def with_named_units(self) -> "NumberTable":
+        """With the units that names of columns have in them, where the file states none."""
+        said = {name: self.units.get(name) or label_of(name).unit for name in self.columns}
+        return self._replace(units={name: unit for name, unit in said.items() if unit})
+
+    def listed(self, name: str) -> str:
+        """The column of a name that may be as the file has it; see `listed_name`."""
+        return listed_name(name, {known: self.units.get(known, "") for known in self.columns})
 
     @property
     def n_rows(self) -> int:

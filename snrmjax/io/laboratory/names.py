@@ -1,27 +1,58 @@
 """What the names of columns and variables say in laboratories of several languages."""
 
 import re
+from collections.abc import Mapping
+from typing import NamedTuple
 
+from snrmjax.io.laboratory.physical_units import (
+    size_words_removed,
+    unit_in_table,
+    unit_meaning,
+    without_size,
+)
+
+_QUANTITIES = ("force", "drive", "displacement", "velocity", "acceleration", "frequency", "time")
+_BY_UNIT = {one: one for one in _QUANTITIES} | {"angle": "phase", "voltage": "drive"}
 _ROLES = {
-    "time": r"t|time|times|zeit|temps|tiempo|time_?(axis|vector|stamp|s|sec)|x_?time",
-    "rate": r"fs|f_s|fsamp|sr|rate|samp(le|ling)?_?(rate|freq(uency)?)(_?hz)?|abtastrate",
+    "time": r"t|time|times|zeit|temps|tiempo|time_?(axis|vector|stamp|sec)|x_?time",
+    "rate": r"fs|f_s|fsamp|sr|rate|samp(le|ling)?_?(rate|freq(uency)?)|abtast(rate|freq\w*)|"
+    r"fr[ée]q\w*_d_[ée]chantillonnage",
     "step": r"dt|delta_?t|d_t|sample_?(time|interval)|time_?step|wf_increment|ts|increment",
-    "frequency": r"f|freq\w*|frequency\w*|frequenz\w*|fr[ée]quence\w*|hz|drive_?freq\w*|"
-    r"excitation_?freq\w*|f_?exc|f_?hz|omega\w*|w|frf_?freq",
+    "frequency": r"f|freq\w*|\w*frequenz\w*|fr[ée]q\w*|(drive|excitation|forcing)_?freq\w*|"
+    r"f_?exc|omega\w*|w|frf_?freq",
     "level": r"levels?|lvl|run|stufe|niveau|setpoint|block|sweep|entry|z_axis_value",
     "deviation": r"\w*(std|sigma|dev|deviation|uncert\w*)\w*",
-    "phase": r"\w*pha(se|z)\w*|phi\w*|(\w*_)?ph|\w*_deg|theta\w*|arg\w*",
+    "phase": r"\w*(pha(se|z)|phasage)\w*|phi\w*|(\w*_)?ph|theta\w*|arg\w*",
     "real": r"x|\w+[_. ](re|real|x)|re|real|(re|real)[_ ]\w+|in_?phase",
     "imaginary": r"y|\w+[_. ](im|imag|y)|im|imag|(im|imag)[_ ]\w+|quad\w*",
-    "drive": r"\w*(drive|volt\w*|source|generator|amplifier|signal)\w*|v_?(in|out|exc)|u",
-    "force": r"\w*(force|kraft|load_?cell|hammer|impedance_?head_?f)\w*|f_?n|fexc|f_?amp\w*|lc\w*",
+    "drive": r"\w*(drive|volt\w*|source|generator|amplifier|signal|spannung|tension)\w*|"
+    r"v_?(in|out|exc)|u",
+    "force": r"\w*(force|kraft|load_?cell|hammer|impedance_?head_?f)\w*|fexc|f_?amp\w*|lc\w*",
     "coherence": r"\w*coh\w*",
-    "velocity": r"\w*(velo\w*|vibrometer|ldv|geschw\w*)|v|vel\w*|\w*_m_s",
+    "velocity": r"\w*(velo\w*|vibrometer|ldv|geschw\w*|vitesse)|v|vel\w*",
     "acceleration": r"\w*(acc\w*|beschl\w*)|a",
-    "displacement": r"\w*(disp\w*|weg|laser|position)\w*|d|disp\w*",
-    "amplitude": r"\w*(amp\w*|magn\w*|abs)|r|h|frf\w*|response\w*|xfer|transfer\w*",
+    "displacement": r"\w*(disp\w*|weg|position|d[ée]pl\w*|auslenk\w*)\w*|d",
+    "amplitude": r"\w*(amp\w*|magn\w*|abs)|r|h|frf\w*|response\w*|xfer|transfer\w*|\w*laser\w*",
 }
 _COMPILED = {role: re.compile(pattern, re.IGNORECASE) for role, pattern in _ROLES.items()}
+
+# Of which dimension the unit is of what a name calls.
+_FITTING = {
+    **{motion: (motion,) for motion in ("displacement", "velocity", "acceleration")},
+    **{"time": ("time",), "step": ("time",), "rate": ("frequency",), "frequency": ("frequency",)},
+    **{"phase": ("angle",), "force": ("force",), "drive": ("voltage", "force"), "coherence": ()},
+}
+_SYMBOLS = {"f": ("frequency", "force"), "w": ("frequency",)}  # which may be a deflection, too
+# Times are called so, and volts are of every sensor.
+_TOLD_BY_UNIT = ("force", "displacement", "velocity", "acceleration", "frequency", "angle")
+_WORDS = {"in", "lb", "lbs", "gs", "kp", "rad", "mil", "mils", "foot", "feet"}
+_ALONE = ("N", "rad")  # what a name may be
+
+_BOUNDARY = re.compile(
+    r"\s(?:in|en)\s+|[\s_/,.\-]+|(?<=[a-z0-9])(?=[A-Z])|(?<=[a-zA-Z])(?=°)|(?<=[a-fh-z])(?=(?:deg|rad|hz)$)"
+)
+_IN_BRACKETS = re.compile(r"^(.*?)\s*(?:\[([^\[\]]*)\]|\(((?:[^()]|\([^()]*\))*)\))$")
+_DATE = re.compile(r"[0-9]+[-/.:][0-9]+[-/.:]|[0-9]:[0-9]")  # and times of day: no units
 
 _BASE = re.compile(
     r"(.*[^a-z])?(base|table|shaker|control|ctrl|foot|fixture|slip|basis|tisch|fu[sß]s?punkt|pot)"
@@ -39,19 +70,107 @@ def is_of_base(name: str) -> bool:
     return bool(_BASE.fullmatch(name.strip()[:60]))
 
 
-def role_of(name: str) -> str:
-    """What a column is by its name, or nothing: "frequency", "force", "phase", "time", …
+class Label(NamedTuple):
+    """The name of a column in two: what it is called, and the unit that stands in it or nothing."""
 
-    A name may be a path ("data.freq") or have a unit behind it ("Freq [Hz]"): its last word counts.
+    word: str
+    unit: str = ""
+    is_bracketed: bool = False
+
+
+def label_of(name: str) -> Label:
+    """The unit that a name has in brackets behind it, as its ending, or that it is.
+
+    What brackets hold is a unit. An ending is one where it can mean nothing else: the word before
+    it calls the same quantity ("acc_g", "force_n"), or says of none, and the unit is no letter or
+    word of another meaning ("tip_mm", but not "ref_m", "x_max_in", "v_rad").
+
+    >>> label_of("Kraft eff. (N)")[:2], label_of("vel_mm_s")[:2], label_of("f/Hz")[:2]
+    (('Kraft eff.', 'N'), ('vel', 'mm/s'), ('f', 'Hz'))
+    >>> label_of("mm/s")[:2], label_of("g")[:2], label_of("acc_mm_s")[:2]
+    (('', 'mm/s'), ('g', ''), ('acc_mm_s', ''))
+    """
+    plain, size = without_size(name.strip())
+    match = _IN_BRACKETS.match(plain)
+    if match and _DATE.search(match[2] or match[3] or ""):
+        return Label(name)
+    if match:
+        word = f"{match[1].rstrip(' /,_-')} {size}".strip()
+        return Label(word, (match[2] or match[3] or "").strip(), True)
+    for start, end in [(0, 0), *(found.span() for found in _BOUNDARY.finditer(plain))]:
+        word, ending = plain[:start], plain[end:]
+        unit = unit_in_table(ending)
+        if not unit and len(word) > 1 and len(ending) == 1:  # as in our own "force_n"
+            unit = unit_in_table(ending.upper())
+        if not unit:
+            continue
+        if _is_unit_of(word, unit):
+            return Label(f"{word} {size}".strip(), unit)
+        # What stands here is another unit (N_m), unless its first letter is a symbol: A_mm.
+        if word or not _called(_BOUNDARY.split(plain)[0]):
+            break
+    return Label(name.strip())
+
+
+def _is_unit_of(word: str, unit: str) -> bool:
+    """Whether an ending is the unit of what the word before it calls, or of one that says little.
+
+    A voltage stands for the generator's signal alone: that of a sensor leaves its scale open.
+    """
+    meaning, role = unit_meaning(unit), _called(word)
+    is_symbol = word.lower() in _SYMBOLS
+    fitting = _SYMBOLS.get(word.lower()) or _FITTING.get(role) or ()
+    if meaning.per_volt or (meaning.per_force and not word):
+        return False
+    if meaning.dimension in fitting:
+        return True
+    if role in _FITTING and role != "drive" and not is_symbol:
+        return False
+    is_plain = (len(unit) > 1 and unit not in _WORDS) or unit == "°"
+    return meaning.dimension in _TOLD_BY_UNIT and (is_plain or (not word and unit in _ALONE))
+
+
+def role_of(name: str, unit: str = "") -> str:
+    """What a column is: by its name or, where that says little, by its unit; or nothing.
+
+    A name says "frequency", "force", "phase", "time", … It may be a path ("data.freq") and have a
+    unit in it (`label_of`). A unit says "frequency", "phase", "time", "force", "drive" (volts) or
+    which motion it is, and is believed before a name that says another of these quantities.
+    Arguments: `unit` as the file states it elsewhere, which wins over that of the name.
 
     >>> role_of("data.Frequency [Hz]"), role_of("Kraft (N)"), role_of("fs"), role_of("qwe")
     ('frequency', 'force', 'rate', '')
     """
-    last = re.sub(r"[\[(].*[\])]\s*$", "", name.strip()).strip().rsplit(".", 1)[-1]
-    plain = re.sub(r"[\s\-]+", "_", last)[:60]
+    label = label_of(name)
+    by_name = _called(label.word)
+    try:
+        meaning = unit_meaning(unit or label.unit)
+    except ValueError:
+        return by_name
+    by_unit = _BY_UNIT.get(meaning.dimension, "")
+    is_drive = by_unit == "drive" and by_name != "drive"  # a sensor's volts are volts, too
+    plain = not by_name or (by_name in _QUANTITIES and by_unit in _QUANTITIES)
+    return by_unit if by_unit and plain and not is_drive else by_name
+
+
+def listed_name(name: str, units: Mapping[str, str]) -> str:
+    """The name in a list of columns of one that may be as the file has it, its unit in brackets.
+
+    Arguments: `units` has the names that are listed, with the unit of each or "".
+
+    >>> listed_name("Kraft (N)", {"Kraft": "N"}), listed_name("Kraft (N)", {"Kraft": "V"})
+    ('Kraft', 'Kraft (N)')
+    """
+    label = label_of(name)
+    known = label.is_bracketed and units.get(label.word) == label.unit
+    return label.word if known and name not in units else name
+
+
+def _called(word: str) -> str:
+    """What a name without its unit calls."""
+    last = size_words_removed(word).strip(" ._-").rsplit(".", 1)[-1]
+    plain = re.sub(r"[\s\-'’]+", "_", last.strip())[:60]
     if plain == "F":  # f is a frequency
         return "force"
-    for role, pattern in _COMPILED.items():
-        if pattern.fullmatch(plain):
-            return role
-    return ""
+    roles = (role for role, pattern in _COMPILED.items() if pattern.fullmatch(plain))
+    return next(roles, "")

@@ -20,13 +20,17 @@ _AS_PYTHON = str.maketrans(
 )
 _NOTHING = {"", "-", "--", "1", "eu", "none", "unknown", "n/a", "na", "a.u."}
 _ODD = re.compile(r"[0-9.]{2,}|\^\s*[^-1-9(]|\*\*|\^.*\^.*\^")
-_SIZE = {
-    **{"rms": "rms", "eff": "rms", "pk": "peak", "peak": "peak"},
-    **dict.fromkeys(("pp", "pk-pk", "p-p", "pkpk"), "peak_to_peak"),
+_SIZES = {
+    "peak_to_peak": r"pk[-_ ]?pk|p[-_ ]?p|p2p|peak[-_ ]?to[-_ ]?peak|cr[eê]te[-_ ][aà][-_ ]cr[eê]te"
+    r"|spitze[-_ ]spitze",
+    "rms": r"rms|eff(?:ektiv[a-z]*|icace)?",
+    "peak": r"pk|peak|cr[eê]te|spitzen?[a-z]*|scheitel[a-z]*",
 }
+_SIZE = "|".join(f"(?P<{size}>{words})" for size, words in _SIZES.items())
+_SIZE = rf"(?:(?<![^\W\d_])|(?<=V))(?:{_SIZE})(?![^\W\d_])\.?"
+_A_SIZE = re.compile(_SIZE, re.IGNORECASE)
 _SIZED = re.compile(
-    r"(?<![A-Za-z])(?:\(|\[)?(pk-pk|p-p|pkpk|peak|rms|eff|pk|pp)(?:\)|\])?\s*$|(?<=V)(rms|pp|pk)$",
-    re.IGNORECASE,
+    rf"[\s_,]*(?:(?P<round>\()|(?P<square>\[))?{_SIZE}(?(round)\)|(?(square)\]))$", re.IGNORECASE
 )
 
 _Powers = tuple[int, int, int, int, int]  # of metre, kilogram, second, ampere and radian
@@ -75,6 +79,12 @@ _PREFIXES = {
     **{"n": -9, "u": -6, "m": -3, "c": -2, "d": -1, "h": 2, "k": 3, "M": 6, "G": 9},
     **{"nano": -9, "micro": -6, "milli": -3, "centi": -2, "kilo": 3, "mega": 6},
 }
+_SPELLED = {
+    prefix + name: (size.scaleb(power), powers)
+    for prefix, power in reversed(_PREFIXES.items())
+    for name, (size, powers) in (_UNITS | {"g": _GRAM}).items()
+    if name not in _ALONE
+} | _UNITS
 _MOTIONS = ("displacement", "velocity", "acceleration")
 _WITH_VOLTS = ("force", *_MOTIONS)
 
@@ -118,11 +128,8 @@ def unit_meaning(text: str) -> UnitMeaning:
         return UnitMeaning("unknown", 1.0)
     if len(plain) > _LONGEST or not _ALLOWED.fullmatch(plain):
         raise _not_understood(text)
-    size = ""
-    match = _SIZED.search(plain)
-    if match is not None:
-        size = _SIZE[(match[1] or match[2]).lower()]
-        plain = plain[: match.start()].strip()
+    plain, tail = without_size(plain)
+    size = size_of(tail)
     number = _NUMBER.match(plain)
     value = float(number[1]) if number else 1.0
     if number:
@@ -147,6 +154,56 @@ def unit_meaning(text: str) -> UnitMeaning:
     if dimension == "angle" and not powers[4]:
         dimension = "other"
     return UnitMeaning(dimension, value * factor, size)
+
+
+def size_of(text: str) -> str:
+    """What a unit or a name says of the size of amplitudes: "rms", "peak", "peak_to_peak", or "".
+
+    >>> size_of("N rms"), size_of("Kraft eff."), size_of("v_pk_pk"), size_of("effort")
+    ('rms', 'rms', 'peak_to_peak', '')
+    """
+    match = _A_SIZE.search(text)
+    return (match.lastgroup or "") if match else ""
+
+
+def without_size(text: str) -> tuple[str, str]:
+    """A unit or a name without the word for a size of amplitudes at its end, and that word.
+
+    >>> without_size("Kraft (N) eff."), without_size("mm/s [rms]"), without_size("Kraft (N eff)")
+    (('Kraft (N)', 'eff.'), ('mm/s', '[rms]'), ('Kraft (N eff)', ''))
+    """
+    match = _SIZED.search(text)
+    return (text[: match.start()].strip(), match[0].strip(" _,")) if match else (text, "")
+
+
+def size_words_removed(text: str) -> str:
+    """A name without the words for a size of amplitudes, wherever they stand.
+
+    >>> size_words_removed("F_eff"), size_words_removed("rms force")
+    ('F_', ' force')
+    """
+    return _A_SIZE.sub("", text)
+
+
+def unit_in_table(text: str) -> str:
+    """An ending of a name as a unit of the table in this module, for `unit_meaning`; or nothing.
+
+    Pint's thousands of words are no endings: point and hand are units of its. "_" stands for "/".
+
+    >>> unit_in_table("mm_s"), unit_in_table("Deg"), unit_in_table("m/s²"), unit_in_table("point")
+    ('mm/s', 'deg', 'm/s²', '')
+    """
+    plain = re.sub(r"_per_|_", "/", text)
+    words = re.findall(r"[^\W\d]+", plain.translate(_AS_PYTHON))
+    known = {word: word if word in _SPELLED else _in_another_case(word) for word in words}
+    if not re.match(r"[^\W\d]|[(°]", plain) or not all(known.values()):
+        return ""
+    plain = re.sub(r"[A-Za-z]+", lambda match: known.get(match[0], match[0]), plain)
+    try:
+        unit_meaning(plain)
+    except ValueError:
+        return ""
+    return plain
 
 
 def channel_meaning(text: str) -> tuple[Quantity, float]:
@@ -223,19 +280,18 @@ def _evaluated(node: ast.expr) -> tuple[Decimal, _Powers]:
     raise ValueError("neither a product nor a power of units")
 
 
+def _in_another_case(name: str) -> str:
+    """The only unit without a prefix that is spelled so but for its case: "Deg", "HZ"; or none."""
+    alike = [known for known in _UNITS if len(known) > 1 and known.lower() == name.lower()]
+    return alike[0] if len({_UNITS[known] for known in alike}) == 1 else ""
+
+
 def _unit(name: str) -> tuple[Decimal, _Powers]:
     """A unit by name, with a prefix or in the plural; one that the table lacks by Pint."""
-    for word in (name, name[:-1] if len(name) > 3 and name[-1] == "s" else name):
-        if word in _UNITS:
-            return _UNITS[word]
-        for prefix, power in _PREFIXES.items():
-            rest = word.removeprefix(prefix)
-            if rest != word and rest in _UNITS and rest not in _ALONE:
-                size, powers = _GRAM if rest == "g" else _UNITS[rest]
-                return size.scaleb(power), powers
-    alike = {_UNITS[known] for known in _UNITS if len(known) > 1 and known.lower() == name.lower()}
-    if len(alike) == 1:  # "Deg", "HZ": in another case
-        return alike.pop()
+    singular = name[:-1] if len(name) > 3 and name[-1] == "s" else name
+    for word in (name, singular, _in_another_case(name)):
+        if word in _SPELLED:
+            return _SPELLED[word]
     base = _registry().Quantity(Decimal(1), _registry().parse_units(name)).to_base_units()
     of = {str(key).strip("[]"): int(power) for key, power in base.dimensionality.items()}
     length, mass, time, current = (of.pop(key, 0) for key in ("length", "mass", "time", "current"))

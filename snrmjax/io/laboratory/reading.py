@@ -41,7 +41,10 @@ def read_laboratory_file(path: FilePath, text_format: TextFormat | None = None) 
     if held.is_empty:
         why = f": {' '.join(map(str, held.notes[:_MOST_REASONS]))}" if held.notes else "."
         raise ValueError(f"{held.name} holds nothing that could be read{why}")
-    return held._replace(recordings=tuple(map(with_named_channels, held.recordings)))
+    return held._replace(
+        recordings=tuple(map(with_named_channels, held.recordings)),
+        tables=tuple(table.with_named_units() for table in held.tables),
+    )
 
 
 def _kind(path: FilePath) -> Kind:

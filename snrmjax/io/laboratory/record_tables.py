@@ -1,11 +1,14 @@
 """Time records as CSV: `time_s`, force or drive, and the motion of one sensor or several."""
 
 import dataclasses
+import re
 
 import numpy as np
 from jaxtyping import Float
 
 from snrmjax.io.files import FilePath
+from snrmjax.io.laboratory.names import label_of
+from snrmjax.io.laboratory.physical_units import channel_meaning
 from snrmjax.io.rows import header_of, read_cells
 from snrmjax.measure.recordings.channels import Channel, Quantity
 from snrmjax.measure.recordings.time_recording import TimeRecording, time_recording
@@ -57,25 +60,23 @@ def read_record_table(path: FilePath) -> TimeRecording:
 
 
 def with_named_channels(recording: TimeRecording) -> TimeRecording:
-    """A laboratory's record with the quantities that the names of its channels say.
+    """A laboratory's record with the quantities that units in the names of its channels say.
 
-    Where a file states no unit, `force_n`, `tip.velocity_m_s` or `tip_velocity_m_s` do; a quantity
-    that the file states stays.
+    Where a file states no unit, `Force / N`, `tip_mm_s` or `tip.velocity_m_s` do (`label_of`), the
+    last the place, too; a quantity that the file states stays.
     """
     channels = tuple(_named(channel) for channel in recording.channels)
     return dataclasses.replace(recording, channels=channels)
 
 
 def _named(channel: Channel) -> Channel:
-    if channel.quantity != "unknown":
+    unit = channel.unit or label_of(channel.name).unit
+    quantity, calibration = channel_meaning(unit)
+    if channel.quantity != "unknown" or quantity == "unknown":
         return channel
-    for column, quantity in _COLUMNS.items():
-        sensor = channel.name.removesuffix(column)
-        if sensor != channel.name and (not sensor or sensor[-1] in "._"):
-            unit = column.split("_", 1)[1]
-            place = channel.point or sensor[:-1]
-            return channel._replace(quantity=quantity, unit=unit, point=place)
-    return channel
+    ours = (re.fullmatch(rf"(.+)[._]{column}", channel.name) for column in _COLUMNS)
+    place = channel.point or next((match[1] for match in ours if match), "")
+    return channel._replace(quantity=quantity, unit=unit, calibration=calibration, point=place)
 
 
 def _channels(names: list[str], file: str) -> tuple[list[Channel], list[Fact]]:

@@ -13,7 +13,7 @@ from snrmjax.io.files import shown
 from snrmjax.io.laboratory.arrays.structs import read_struct
 from snrmjax.io.laboratory.arrays.value_tree import Node, held
 from snrmjax.io.laboratory.contents import LaboratoryFile, TextFormat
-from snrmjax.io.laboratory.names import role_of
+from snrmjax.io.laboratory.names import label_of, role_of
 from snrmjax.io.laboratory.physical_units import unit_meaning
 from snrmjax.io.laboratory.text_files import (
     SEPARATORS,
@@ -27,9 +27,7 @@ from snrmjax.numerics.facts import Fact
 _LOOKED_AT = 200  # lines in which the header ends
 _MOST_COLUMNS = 4096
 _COMMENTS = ("#", "%", "//", "!")
-_IN_BRACKETS = re.compile(r"^(.*?)\s*[\[(]([^\])]*)[\])]\s*$")
 _AXES = ("time", "frequency", "level", "rate", "step")
-_DATE = re.compile(r"[0-9]+[-/.:][0-9]+[-/.:]|[0-9]:[0-9]")  # and times of day: no units
 
 
 def read_separated_text(path: Path, text_format: TextFormat | None = None) -> LaboratoryFile:
@@ -107,11 +105,10 @@ def _said_above(lines: Sequence[str], separator: str, decimal: str) -> _Said:
         role = role_of(key)
         if role not in ("rate", "step") or said.rate:
             continue
-        match = _IN_BRACKETS.match(key)
         number, _, unit = value.partition(" ")
         size = number_in(number, decimal)
         size = number_in(number, "point") if size is None else size
-        unit = unit.strip() or (match[2] if match else "") or ("Hz" if role == "rate" else "s")
+        unit = unit.strip() or label_of(key).unit or ("Hz" if role == "rate" else "s")
         try:
             meaning = unit_meaning(unit)
         except ValueError:
@@ -231,19 +228,20 @@ def _header(
     labels = next((row for row in marked if 1 < sum(map(bool, row)) < width and not row[0]), [])
     units: dict[str, str] = {}
     plain: list[str] = []
-    written: list[str] = []
-    for k, name in enumerate(names):
-        match = _IN_BRACKETS.match(name.strip())
-        has_unit = match and match[1] and not _DATE.search(match[2])
-        word, unit = (match[1], match[2]) if match and has_unit else (name.strip(), "")
-        written.append(f"{word} [{unit}]")
+    bracketed = [label if (label := label_of(name)).is_bracketed else None for name in names]
+    written = {(label.word, label.unit) for label in bracketed if label}
+    alike = [word for word, _ in written]
+    for k, (name, label) in enumerate(zip(names, bracketed, strict=True)):
+        # Names that differ in their units alone stay as they are written.
+        short = label is not None and label.word and alike.count(label.word) == 1
+        word, unit = (label.word, label.unit) if label and short else (name, "")
         word = word or f"column_{k + 1}"
         while word in plain:
             word = f"{word}_{k + 1}"
         plain.append(word)
         unit = unit or unit_row[k].strip("[]() ")
         units |= {word: unit} if unit else {}
-    return _Header(tuple(plain), tuple(written), units, tuple(labels), True)
+    return _Header(tuple(plain), tuple(names), units, tuple(labels), True)
 
 
 def _runs_side_by_side(

@@ -99,9 +99,7 @@ def _rates(item: Any) -> dict[str, Numbers]:
     """Attributes that state a sampling rate or step, or the start of a record."""
     rates = {}
     for key in item.attrs:
-        if role_of(key.removesuffix("_hz").removesuffix("_s")) in ("rate", "step") or key in (
-            "start_time_s",
-        ):
+        if role_of(key) in ("rate", "step") or key == "start_time_s":
             value = np.asarray(item.attrs[key])
             if value.size == 1 and value.dtype.kind in "iuf":
                 rates[key] = held(value.astype(float).reshape(1))

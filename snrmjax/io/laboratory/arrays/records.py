@@ -6,8 +6,9 @@ from typing import NamedTuple, get_args
 import numpy as np
 
 from snrmjax.io.laboratory.arrays.value_tree import ChannelPlace, Numbers, PlacedSamples
-from snrmjax.io.laboratory.names import role_of
-from snrmjax.io.laboratory.physical_units import channel_meaning
+from snrmjax.io.laboratory.names import label_of, role_of
+from snrmjax.io.laboratory.physical_units import channel_meaning, unit_meaning
+from snrmjax.io.units import HERTZ
 from snrmjax.measure.recordings.channels import Channel, Quantity
 from snrmjax.measure.recordings.time_recording import TimeRecording, time_recording
 from snrmjax.numerics.facts import Fact
@@ -137,13 +138,14 @@ def _time_axis(numbers: Mapping[str, Numbers]) -> _Axis | Fact | None:
     stated: tuple[float, str] | None = None
     for key in single:
         if stated is None and (role := role_of(key)) in ("rate", "step"):
-            value = _only(single[key])
+            dimension = "time" if role == "step" else "frequency"
+            value = _only(single[key]) * _size_of_unit(key, single[key], dimension)
             value = 1 / value if role == "step" and value > 0 else value
             stated = (value, key) if np.isfinite(value) and value > 0 else None
     vectors = [
         key
         for key, array in numbers.items()
-        if role_of(key.removesuffix("_s")) == "time"
+        if role_of(key) == "time"
         and array.length is not None
         and array.length >= _SHORTEST
         and not array.is_complex
@@ -179,10 +181,19 @@ def _even_axis(key: str, array: Numbers) -> _Axis | Fact:
     whole = round(rate)
     if whole and abs(rate - whole) < 1e-6 * rate * min(1.0, 1e3 / n):
         rate = float(whole)
-    unit = array.unit.lower()
-    factor = 1e3 if unit in ("ms", "msec") else 1e6 if unit in ("us", "µs", "μs") else 1.0
+    second = 1 / _size_of_unit(key, array, "time")
     notes = (Fact("time_seen_in_places", name=key),) if n > 3 * _LOOK else ()
-    return _Axis(n, rate * factor, first / factor, (key,), notes)
+    return _Axis(n, rate * second, first / second, (key,), notes)
+
+
+def _size_of_unit(key: str, array: Numbers, dimension: str) -> float:
+    """A number of an array in s or Hz, by the unit that the file or the name states, if any."""
+    try:
+        meaning = unit_meaning(array.unit or label_of(key).unit)
+    except ValueError:
+        return 1.0
+    size = meaning.factor / HERTZ if dimension == "frequency" else meaning.factor
+    return size if meaning.dimension == dimension else 1.0
 
 
 def _single(array: Numbers) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 from snrmjax.io.laboratory.arrays.records import recording_of
 from snrmjax.io.laboratory.arrays.value_tree import Node, Numbers, held
 from snrmjax.io.laboratory.contents import Kind, LaboratoryFile, NumberTable
-from snrmjax.io.laboratory.names import role_of
+from snrmjax.io.laboratory.names import label_of, role_of
 from snrmjax.io.laboratory.physical_units import channel_meaning, is_per_force
 from snrmjax.io.laboratory.shared_clock import joined_structs
 from snrmjax.measure.recordings.channels import Channel
@@ -291,7 +291,7 @@ def _responses(name: str, numbers: Mapping[str, Numbers], contents: Struct) -> d
         below = Channel("", "force", "N") if is_per_force(array.unit) else Channel("")
         contents.responses.append(
             frequency_responses(
-                hertz * (1.0 if numbers[axis].unit.lower().startswith("rad") else _HERTZ),
+                hertz * (1.0 if (numbers[axis].unit or label_of(axis).unit).lower().startswith("rad") else _HERTZ),
                 values,
                 [above._replace(name=f"{key}.{k + 1}") for k in range(values.shape[0])],
                 [below._replace(name=f"reference {k + 1}") for k in range(values.shape[1])],
