@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import tomli_w
 
 from snrmjax.io.files import FilePath, file_name, read_text, shown
+from snrmjax.io.laboratory.names import listed_name
 from snrmjax.io.toml_table import TomlTable, parsed_toml
 from snrmjax.measure.recordings.step_counts import StepCounts
 from snrmjax.numerics.facts import Fact
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
     from snrmjax.io.laboratory.contents import TextFormat
 
 _MOTIONS = ("displacement", "velocity", "acceleration")
+_COLUMNS = ("frequency", "force", "force_phase", "level", "drive")
+_OF_RESPONSE = ("channel", "phase", "imaginary", "amplitude_std", "phase_std")
 _CHANNELS, _NUMBERS, _TEXTS = "Channels and columns", "What the numbers are", "Text files"
 
 
@@ -167,7 +170,7 @@ class ImportMap(NamedTuple):
     @property
     def base_motion(self) -> ResponseMap:
         """The base's channel or column with its quantity and unit; its name may be a number."""
-        return response_word(self.base, option="--base")
+        return response_word(self.base)
 
     @property
     def base_channel(self) -> str:
@@ -188,6 +191,29 @@ class ImportMap(NamedTuple):
         """The channel or column that drives the structure: of the force or of the base's motion."""
         return self.base_channel or self.force
 
+    def with_names(self, units: Mapping[str, str]) -> "ImportMap":
+        """With channels and columns named as a list has them that names may have as in the file.
+
+        Arguments: `units` has the names that are listed, with the unit of each or "".
+        Raises `ValueError` for a response's word that is neither a name nor a name with a motion.
+        """
+        responses = []
+        for response in self.responses:
+            whole = ":".join(filter(None, (response.channel, response.quantity)))
+            if whole in units and response.channel not in units:  # of a name with a colon
+                response = response._replace(channel=whole, quantity="")
+            places = {key: listed_name(getattr(response, key), units) for key in _OF_RESPONSE}
+            responses.append(response._replace(**places))
+            name = places["channel"]
+            if name not in units and ":" in name and name.rsplit(":", 1)[1].isalpha():
+                raise ValueError(
+                    f"--response must be a channel and one of {', '.join(_MOTIONS)}, as "
+                    f"CH2:acceleration, but is {shown(name)}."
+                )
+        named: dict[str, Any] = {key: listed_name(getattr(self, key), units) for key in _COLUMNS}
+        base = listed_name(self.base_channel, units) + self.base[len(self.base_channel) :]
+        return self._replace(responses=tuple(responses), base=base, **named)
+
     @property
     def text_format(self) -> "TextFormat":
         """How texts are written."""
@@ -196,12 +222,8 @@ class ImportMap(NamedTuple):
         return TextFormat(self.separator or None, self.decimal or None, self.header_row or None)
 
 
-def response_word(word: str, unit: str = "", *, option: str = "--response") -> ResponseMap:
+def response_word(word: str, unit: str = "") -> ResponseMap:
     """A response of an option: "CH2:acceleration", "CH2:acceleration:g", or "CH2".
-
-    Arguments: `option` is another one that names a motion so: `--base`.
-
-    Raises `ValueError` for a quantity that is no motion.
 
     >>> response_word("CH2:acceleration", "g")[:3]
     ('CH2', 'acceleration', 'g')
@@ -211,11 +233,6 @@ def response_word(word: str, unit: str = "", *, option: str = "--response") -> R
         return ResponseMap(":".join(parts[:-1]), parts[-1], unit)
     if len(parts) > 2 and parts[-2] in _MOTIONS:
         return ResponseMap(":".join(parts[:-2]), parts[-2], parts[-1])
-    if len(parts) > 1 and parts[-1].isalpha():
-        raise ValueError(
-            f"{option} must be a channel and one of {', '.join(_MOTIONS)}, as "
-            f"CH2:acceleration, but is {shown(word)}."
-        )
     return ResponseMap(word, "", unit)
 
 
@@ -281,7 +298,7 @@ def map_of_options(map_file: Path | None, given: Mapping[str, Any]) -> ImportMap
 
 def _require_base(word: str) -> None:
     """Raise `ValueError` for a base's motion without a quantity, or of a number that is none."""
-    stated = response_word(word, option="--base")
+    stated = response_word(word)
     numbers = ImportMap(base=word).base_amplitudes
     if not stated.quantity or (numbers and not stated.unit):
         raise ValueError(

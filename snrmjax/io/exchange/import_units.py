@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from snrmjax.io.exchange.import_map import Assumptions, ImportMap
-from snrmjax.io.laboratory.physical_units import UnitMeaning, unit_meaning
+from snrmjax.io.laboratory.physical_units import UnitMeaning, size_of, unit_meaning
 from snrmjax.measure.recordings.channels import DERIVATIVE, SI_UNIT, Quantity
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.names import near_miss
@@ -156,23 +156,28 @@ def motion_meaning(
 
 
 def amplitude_factor(mapping: ImportMap, units: Mapping[str, str], assumed: Assumptions) -> float:
-    """What turns amplitudes into peak amplitudes: stated, said by a unit, else peak is assumed."""
-    said = {unit_meaning(unit).size for unit in units.values() if unit}
+    """What turns amplitudes into peak amplitudes: stated, else by units and names, else peak.
+
+    Arguments: `units` of the columns by their names.
+    """
+    of_units = {size_of(unit) for unit in units.values()} - {""}
+    said = {size_of(unit) or size_of(name) for name, unit in units.items()}
     sizes = said - {""}
     if mapping.amplitude:
-        if sizes - {mapping.amplitude}:
+        if of_units - {mapping.amplitude}:
             raise ValueError(
-                f"--amplitude says {mapping.amplitude}, but a unit says {min(sizes)}: which is "
+                f"--amplitude says {mapping.amplitude}, but a unit says {min(of_units)}: which is "
                 "right?"
             )
         return float(AMPLITUDE_FACTORS[mapping.amplitude])
     if len(sizes) > 1 or (sizes and "" in said and sizes != {"peak"}):
         raise ValueError(
-            f"units say {' and '.join(sorted(sizes))} of some columns and not of others: which "
-            "holds for all? --amplitude peak, rms or peak_to_peak."
+            f"names and units say {' and '.join(sorted(sizes))} of some columns and not of others: "
+            "which holds for all? --amplitude peak, rms or peak_to_peak."
         )
     size = next(iter(sizes), "peak")
-    assumed.add("amplitude", Fact("units_say_so") if sizes else Fact("nothing_is_said"), size)
+    told = Fact("units_say_so") if of_units else Fact("by_names_of_columns")
+    assumed.add("amplitude", told if sizes else Fact("nothing_is_said"), size)
     return float(AMPLITUDE_FACTORS[size])
 
 
@@ -218,24 +223,13 @@ def phase_in_rad(
     of_file = (
         "" if not stated or stated.dimension != "angle" else "rad" if stated.factor == 1 else "deg"
     )
-    if mapping.phase_unit and of_file not in ("", mapping.phase_unit):
-        raise ValueError(
-            f"--phase-unit says {mapping.phase_unit}, but {column} is in {file_unit}: which is "
-            "right?"
-        )
     unit = mapping.phase_unit or of_file
-    if not mapping.phase_unit and of_file:
-        assumed.add("phase_unit", Fact("unit_of_file"), unit)
+    assumed.unit("phase_unit", mapping.phase_unit, of_file)
     if not unit:
-        ends = [word for word in ("deg", "rad") if column.lower().rstrip("_)]s").endswith(word)]
-        if not ends and not np.nanmax(np.abs(values), initial=0.0) > 2 * _HERTZ:
+        if not np.nanmax(np.abs(values), initial=0.0) > 2 * _HERTZ:
             raise ValueError(f"is {column} in degrees or in radians? --phase-unit deg or rad.")
-        said, beyond = (
-            Fact("column_says_so", column=column),
-            Fact("phase_beyond_two_turns", column=column),
-        )
-        unit, why = (ends[0], said) if ends else ("deg", beyond)
-        assumed.add("phase_unit", why, unit)
+        unit = "deg"
+        assumed.add("phase_unit", Fact("phase_beyond_two_turns", column=column), unit)
     if not mapping.phase_sign:
         assumed.add("phase_sign", Fact("phase_ahead_of_the_force"), "lead")
     sign = -1.0 if mapping.phase_sign == "lag" else 1.0

@@ -14,8 +14,8 @@ from snrmjax.io.exchange.import_units import amplitude_of_name
 from snrmjax.io.exchange.importing import import_files, joined_files
 from snrmjax.io.exchange.record_import import mapped_record
 from snrmjax.io.laboratory.contents import LaboratoryFile, NumberTable
-from snrmjax.io.laboratory.names import is_of_base
-from snrmjax.io.laboratory.physical_units import UnitMeaning, unit_meaning
+from snrmjax.io.laboratory.names import is_of_base, role_of
+from snrmjax.io.laboratory.physical_units import UnitMeaning, size_of, unit_meaning
 from snrmjax.measure.recordings.channels import DERIVATIVE, Channel
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
 from snrmjax.measure.recordings.time_recording import TimeRecording
@@ -186,6 +186,12 @@ def _of_table(table: NumberTable) -> _Options:
         pairs = _phases(list(table.columns), [one.name for one in responses], phases)
         if len(responses) > 1 and pairs:
             found["phase"] = pairs
+    sizes = {
+        size_of(f"{table.units.get(name, '')} {name}")
+        for name in (*loads[:1], *(one.name for one in (*moved, *responses)))
+    }
+    if len(sizes) == 1 and sizes.isdisjoint(("", "peak")):
+        found["amplitude"] = sizes.pop()
     if unit := _phase_unit(table, phases):
         found["phase_unit"] = unit
     return found
@@ -207,9 +213,9 @@ def _phase_unit(table: NumberTable, phases: Sequence[str]) -> str:
     turn by more than 6.
     """
     for name in phases[:1]:
-        said = re.search("deg|rad|°", f"{name} {table.units.get(name, '')}", re.IGNORECASE)
         values = np.asarray(table.columns[name], dtype=float)
-        if said or not np.isfinite(values).any() or np.nanmax(np.abs(values)) > 2 * np.pi:
+        is_told = name in table.units or not np.isfinite(values).any()
+        if is_told or np.nanmax(np.abs(values)) > 2 * np.pi:
             return ""
         turns = float(np.nanmax(values) - np.nanmin(values))
         return "rad" if np.nanmax(np.abs(values)) <= _RADIANS and turns > _A_TURN else "UNIT"
@@ -250,7 +256,7 @@ def _of_record(record: TimeRecording) -> _Options:
 
 
 def _role(channel: Channel) -> str:
-    return NumberTable("", {}, {channel.name: channel.unit}).role(channel.name)
+    return role_of(channel.name, channel.unit)
 
 
 def _of_responses(sets: FrequencyResponses) -> _Options:

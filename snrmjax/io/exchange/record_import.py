@@ -52,6 +52,7 @@ def mapped_record(
             f"velocity, displacement) names it, of {names}."
         )
     channels = list(record.channels)
+    mapping = mapping.with_names({channel.name: channel.unit for channel in channels})
     if mapping.force:
         k = _number(record, mapping.force, file, "--force")
         old = channels[k]

@@ -19,7 +19,7 @@ from snrmjax.io.exchange.import_units import (
     require_name,
 )
 from snrmjax.io.laboratory.contents import NumberTable
-from snrmjax.io.laboratory.names import role_of
+from snrmjax.io.laboratory.names import label_of, role_of
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.velocity_states import velocity_factors
 from snrmjax.measure.states import UNNAMED_SENSOR
@@ -82,6 +82,7 @@ def import_table(
 
     Raises `ValueError` with a question that names the option for what cannot be told.
     """
+    mapping = mapping.with_names({name: table.units.get(name, "") for name in table.columns})
     source = _Source(table, mapping, file, assumed)
     mapping = mapping._replace(frequency=mapping.frequency or _frequency_column(source))
     source = source._replace(mapping=mapping)
@@ -268,7 +269,8 @@ def _partner(source: _Source, channel: str) -> tuple[str, str]:
         if swapped in source.table.columns:
             return swapped, ""
         others = source.with_role("imaginary")
-        return (others[0] if len(others) == 1 else ""), ""
+        if len(others) == 1:
+            return others[0], ""
     phases = [name for name in source.with_role("phase") if name != source.mapping.force_phase]
     return "", (phases[0] if len(phases) == 1 and len(source.mapping.responses) == 1 else "")
 
@@ -279,8 +281,9 @@ def _swap(name: str) -> str:
         swapped = re.sub(rf"(?<![A-Za-z]){old}(?![A-Za-z])|(?<=_){old}(?=_|$)", new, name)
         if swapped != name:
             return swapped
-    last = {"X": "Y", "x": "y"}.get(name[-1:], "")
-    return last and name[:-1] + last
+    word = label_of(name).word
+    last = {"X": "Y", "x": "y"}.get(word[-1:], "")
+    return last and word[:-1] + last + name.removeprefix(word)
 
 
 def _refuse_doubled(source: _Source) -> None:
@@ -362,13 +365,8 @@ def _errors(
 
 def _in_radians(source: _Source, response: ResponseMap) -> bool:
     """Whether an error of the phase is in radians: as its name, its unit or the phase's says."""
-    for name in (response.phase_std, response.phase):
-        unit = source.unit(name).lower()
-        if unit.startswith("rad") or re.search(r"rad(?![a-z])", name.lower()):
-            return True
-        if unit.startswith(("deg", "°")) or "deg" in name.lower():
-            return False
-    return source.mapping.phase_unit == "rad"
+    of_phase = source.mapping.phase_unit or source.unit(response.phase)
+    return (source.unit(response.phase_std) or of_phase).lower().startswith("rad")
 
 
 def _bare(name: str) -> str:
@@ -377,9 +375,7 @@ def _bare(name: str) -> str:
     >>> _bare("R"), _bare("R_std"), _bare("Theta [deg]"), _bare("ThetaDev"), _bare("phase_std_deg")
     ('r', 'r', 'theta', 'theta', 'phase')
     """
-    plain = re.sub(r"[\[(].*[\])]\s*$", "", name.strip()).lower()
-    letters = re.sub(r"[\s_.\-]", "", _DEVIATION.sub("", plain))
-    return re.sub(r"(deg|rad)$", "", letters)
+    return re.sub(r"[\s_.\-]", "", _DEVIATION.sub("", label_of(name).word.lower()))
 
 
 def _deviations(source: _Source, name: str, option: str) -> Float[np.ndarray, " row"]:

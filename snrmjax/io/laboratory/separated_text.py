@@ -228,13 +228,13 @@ def _header(
     labels = next((row for row in marked if 1 < sum(map(bool, row)) < width and not row[0]), [])
     units: dict[str, str] = {}
     plain: list[str] = []
-    bracketed = [label if (label := label_of(name)).is_bracketed else None for name in names]
-    written = {(label.word, label.unit) for label in bracketed if label}
-    alike = [word for word, _ in written]
-    for k, (name, label) in enumerate(zip(names, bracketed, strict=True)):
+    bracketed = [label for label in map(label_of, names) if label.is_bracketed]
+    alike = [label.word for label in dict.fromkeys(bracketed)]
+    for k, name in enumerate(names):
+        label = label_of(name)
         # Names that differ in their units alone stay as they are written.
-        short = label is not None and label.word and alike.count(label.word) == 1
-        word, unit = (label.word, label.unit) if label and short else (name, "")
+        is_short = label.is_bracketed and label.word and alike.count(label.word) == 1
+        word, unit = (label.word, label.unit) if is_short else (name, "")
         word = word or f"column_{k + 1}"
         while word in plain:
             word = f"{word}_{k + 1}"

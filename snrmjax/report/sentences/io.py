@@ -38,7 +38,6 @@ SENTENCES: dict[str, Wording] = {
     "nothing_is_said": "nothing is said",
     "column_by_name": "the column's name says so",
     "by_names_of_columns": "by the names of the columns",
-    "column_says_so": "{column} says so",
     "phase_beyond_two_turns": "{column} reaches beyond two turns in radians",
     "phase_ahead_of_the_force": "a positive phase is ahead of the force, e^(+iwt)",
     "imaginary_ahead_of_the_force": "a positive imaginary part is ahead of the force",

@@ -287,11 +287,12 @@ def _responses(name: str, numbers: Mapping[str, Numbers], contents: Struct) -> d
         if not np.isfinite(values).any() or np.isinf(values).any():
             continue
         quantity, calibration = channel_meaning(array.unit)
+        unit = numbers[axis].unit or label_of(axis).unit
         above = Channel("", quantity, array.unit, calibration)
         below = Channel("", "force", "N") if is_per_force(array.unit) else Channel("")
         contents.responses.append(
             frequency_responses(
-                hertz * (1.0 if (numbers[axis].unit or label_of(axis).unit).lower().startswith("rad") else _HERTZ),
+                hertz * (1.0 if unit.lower().startswith("rad") else _HERTZ),
                 values,
                 [above._replace(name=f"{key}.{k + 1}") for k in range(values.shape[0])],
                 [below._replace(name=f"reference {k + 1}") for k in range(values.shape[1])],
