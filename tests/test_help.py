@@ -284,7 +284,7 @@ def test_completion_is_installed_in_a_fresh_home(shell, file, tmp_path, monkeypa
 
 REFUSED = {
     "formats": "identify lacking.csv --model model.toml --out out",
-    "how-to/import": "import test.csv --force force_N --response acc:acceleration:g --out out",
+    "how-to/import": "import test.csv --force load --response acc:acceleration:g --out out",
     "how-to/element": "nnm matrices.toml --to-hz 90 --out out",
     "how-to/shaker-table": "identify measured.csv --model base.toml --out out",
     "how-to/uncertain-force": "identify peaks.csv --model model.toml --free force_gain --out out",
