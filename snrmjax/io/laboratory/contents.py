@@ -6,7 +6,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Num
 
-from snrmjax.io.laboratory.names import label_of, listed_name, role_of
+from snrmjax.io.laboratory.names import label_of, role_of
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.numerics.facts import Fact
@@ -36,10 +36,6 @@ class NumberTable(NamedTuple):
         """With the units that names of columns have in them, where the file states none."""
         said = {name: self.units.get(name) or label_of(name).unit for name in self.columns}
         return self._replace(units={name: unit for name, unit in said.items() if unit})
-
-    def listed(self, name: str) -> str:
-        """The column of a name that may be as the file has it; see `listed_name`."""
-        return listed_name(name, {known: self.units.get(known, "") for known in self.columns})
 
     @property
     def n_rows(self) -> int:

@@ -25,7 +25,7 @@ _ROLES = {
     "phase": r"\w*(pha(se|z)|phasage)\w*|phi\w*|(\w*_)?ph|theta\w*|arg\w*",
     "real": r"x|\w+[_. ](re|real|x)|re|real|(re|real)[_ ]\w+|in_?phase",
     "imaginary": r"y|\w+[_. ](im|imag|y)|im|imag|(im|imag)[_ ]\w+|quad\w*",
-    "drive": r"\w*(drive|volt\w*|source|generator|amplifier|signal|spannung|tension)\w*|"
+    "drive": r"\w*(drive|volt\w*|source|generator|amplifier|signal|spannung)\w*|"
     r"v_?(in|out|exc)|u",
     "force": r"\w*(force|kraft|load_?cell|hammer|impedance_?head_?f)\w*|fexc|f_?amp\w*|lc\w*",
     "coherence": r"\w*coh\w*",
@@ -45,11 +45,13 @@ _FITTING = {
 _SYMBOLS = {"f": ("frequency", "force"), "w": ("frequency",)}  # which may be a deflection, too
 # Times are called so, and volts are of every sensor.
 _TOLD_BY_UNIT = ("force", "displacement", "velocity", "acceleration", "frequency", "angle")
-_WORDS = {"in", "lb", "lbs", "gs", "kp", "rad", "mil", "mils", "foot", "feet"}
-_ALONE = ("N", "rad")  # what a name may be
+# Units that are words or letters of another meaning: inch, left bottom, radial, gradient, gain.
+_WORDS = ("in", "lb", "lbs", "gs", "gn", "kp", "rad", "Grad", "mil", "mils", "thou", "ft", "foot")
+_ALONE = ("N", "rad", "Grad")  # of these and of letters, those that a whole name may be
 
 _BOUNDARY = re.compile(
-    r"\s(?:in|en)\s+|[\s_/,.\-]+|(?<=[a-z0-9])(?=[A-Z])|(?<=[a-zA-Z])(?=°)|(?<=[a-fh-z])(?=(?:deg|rad|hz)$)"
+    r"\s(?:in|en)\s+|[\s_/,.\-]+|(?<=[a-z0-9])(?=[A-Z])|(?<=[a-zA-Z])(?=°)"
+    r"|(?<=[a-fh-z])(?=(?:deg|rad|hz)$)"
 )
 _IN_BRACKETS = re.compile(r"^(.*?)\s*(?:\[([^\[\]]*)\]|\(((?:[^()]|\([^()]*\))*)\))$")
 _DATE = re.compile(r"[0-9]+[-/.:][0-9]+[-/.:]|[0-9]:[0-9]")  # and times of day: no units
@@ -93,7 +95,7 @@ def label_of(name: str) -> Label:
     plain, size = without_size(name.strip())
     match = _IN_BRACKETS.match(plain)
     if match and _DATE.search(match[2] or match[3] or ""):
-        return Label(name)
+        return Label(name.strip())
     if match:
         word = f"{match[1].rstrip(' /,_-')} {size}".strip()
         return Label(word, (match[2] or match[3] or "").strip(), True)

@@ -13,7 +13,7 @@ from snrmjax.io.files import shown
 from snrmjax.io.laboratory.arrays.structs import read_struct
 from snrmjax.io.laboratory.arrays.value_tree import Node, held
 from snrmjax.io.laboratory.contents import LaboratoryFile, TextFormat
-from snrmjax.io.laboratory.names import label_of, role_of
+from snrmjax.io.laboratory.names import Label, label_of, role_of
 from snrmjax.io.laboratory.physical_units import unit_meaning
 from snrmjax.io.laboratory.text_files import (
     SEPARATORS,
@@ -228,12 +228,11 @@ def _header(
     labels = next((row for row in marked if 1 < sum(map(bool, row)) < width and not row[0]), [])
     units: dict[str, str] = {}
     plain: list[str] = []
-    bracketed = [label for label in map(label_of, names) if label.is_bracketed]
-    alike = [label.word for label in dict.fromkeys(bracketed)]
-    for k, name in enumerate(names):
-        label = label_of(name)
+    labels_of = [label if (label := label_of(name)).is_bracketed else Label(name) for name in names]
+    short = [label.word for label in dict.fromkeys(labels_of)]
+    for k, (name, label) in enumerate(zip(names, labels_of, strict=True)):
         # Names that differ in their units alone stay as they are written.
-        is_short = label.is_bracketed and label.word and alike.count(label.word) == 1
+        is_short = label.word and short.count(label.word) == 1
         word, unit = (label.word, label.unit) if is_short else (name, "")
         word = word or f"column_{k + 1}"
         while word in plain:

@@ -98,9 +98,17 @@ def test_names_as_the_file_has_them_are_taken(tmp_path):
     np.testing.assert_allclose(velocity, VELOCITY * 1e3 / RMS, rtol=1e-12)
 
 
-def test_names_that_differ_in_their_units_alone_are_told_apart(tmp_path):
-    written(tmp_path / "sweep.csv", "f [Hz];F [N];F [m/s];phi [deg]")
-    words = ["--force", "F [N]", "--response", "F [m/s]", "--out", tmp_path / "out"]
+@pytest.mark.parametrize("response", ["F [m/s]", "F"])
+def test_names_that_differ_in_their_units_alone_are_told_apart(tmp_path, response):
+    written(tmp_path / "sweep.csv", f"f [Hz];F [N];{response};phi [deg]")
+    words = [
+        "--force",
+        "F [N]",
+        "--response",
+        f"{response}:velocity:m/s",
+        "--out",
+        tmp_path / "out",
+    ]
     code, said = run_import(tmp_path / "sweep.csv", *words)
     assert code == 0, said
     same(read_steady_states(tmp_path / "out" / "measured.csv"))
@@ -123,8 +131,8 @@ def test_one_column_rms_and_another_of_unknown_size_are_asked_about(tmp_path):
     assert "it will ask: names and units say rms of some columns and not of others" in listed
 
 
-TWO_READINGS = """m,g,s,A,V,in,min,ref_m,left_g,x_max_in,v_rad,ch1_N,acc_mV,acc_mm_s,vel_ms,f_n,
-torque_N_mm,torque_Nm,level 2 N,tip 10 g,ref_point"""
+TWO_READINGS = """m,g,s,A,V,in,min,ref_m,left_g,x_max_in,x_grad,v_rad,ch1_N,acc_mV,acc_mm_s,vel_ms,
+f_n,torque_N_mm,torque_Nm,level 2 N,tip 10 g,ref_point"""
 
 
 @pytest.mark.parametrize("name", TWO_READINGS.replace("\n", "").split(","))
