@@ -159,6 +159,7 @@ TIME = np.arange(400) / 2000
         ("time_ms;drive_mN;vel_mm_s", (1e3, 1e3, 1e3)),
         ("Temps (s);N;mm/s", (1, 1, 1e3)),
         ("t/s;F/N;tip_mm_s", (1, 1, 1e3)),
+        ("Zeit (ms);Kraft [mN];v (mm/s)", (1e3, 1e3, 1e3)),
     ],
 )
 def test_records_have_the_units_of_their_names(tmp_path, names, units):
@@ -176,8 +177,14 @@ def test_records_have_the_units_of_their_names(tmp_path, names, units):
     words = [*shlex.split(line)[2:-2], *([] if "--record" in line else ["--record", "broadband"])]
     code, said = run_import(*words, "--out", tmp_path / "out")
     assert code == 0, said
-    held = np.loadtxt(tmp_path / "out" / "record.csv", delimiter=",", skiprows=1)
-    np.testing.assert_allclose(held, np.array([TIME, force, velocity]).T, rtol=1e-12, atol=1e-15)
+    written_names = ["--force", names.split(";")[1], "--response", names.split(";")[2]]
+    more = [*written_names, "--record", "broadband", "--out", tmp_path / "as_written"]
+    code, said = run_import(tmp_path / "run.csv", *more)
+    assert code == 0, said
+    wanted = np.array([TIME, force, velocity]).T
+    for folder in ("out", "as_written"):
+        held = np.loadtxt(tmp_path / folder / "record.csv", delimiter=",", skiprows=1)
+        np.testing.assert_allclose(held, wanted, rtol=1e-12, atol=1e-15)
 
 
 def test_a_rate_in_the_unit_of_its_name_and_roles_by_unit():
