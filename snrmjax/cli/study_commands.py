@@ -3,7 +3,7 @@
 import dataclasses
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -16,7 +16,7 @@ from snrmjax.pipelines.options import option
 from snrmjax.report.writing import staged
 
 if TYPE_CHECKING:
-    from snrmjax.study.analysis.outputs import ScalarSummary
+    from snrmjax.study.analysis.digest import StudyDigest
     from snrmjax.study.run import Progress, ProgressReport, StudyRun
     from snrmjax.study.study import Study
 
@@ -141,7 +141,7 @@ def report(
     with staged(out) as folder:
         found = write_study_report(folder, data)
     say(members_ended(found))
-    _say_summary(found.summaries)
+    _say_summary(found)
     say(f"written to {out}")
 
 
@@ -157,9 +157,10 @@ def _shard(text: str) -> tuple[int, int]:
 
 def _say_study(study: "Study") -> None:
     names = ", ".join(study.names) or "nothing but the noise"
+    told = f"; velocities at {study.sensor_told}" if study.sensor_told else ""
     say(
         f"{study.name}: {study.n_members} members ({study.computation.kind}) in {study.n_chunks} "
-        f"chunks; {names} {'vary' if len(study.names) > 1 else 'varies'}"
+        f"chunks; {names} {'vary' if len(study.names) > 1 else 'varies'}{told}"
     )
 
 
@@ -178,21 +179,21 @@ def _say_done(done: "StudyRun", out: Path) -> None:
         (warn if found.failures.n_failed else say)(members_ended(found))
         for fact in found.failures.facts:
             say(str(fact))
-        _say_summary(found.summaries)
+        _say_summary(found)
         say(f"{done.computed} members in {_duration(done.seconds)}; written to {out}")
         say(f"figures and tables of it: snrmjax study report {out} --out report")
     else:
         say(f"nothing was left to compute; {done.members} members are in {out}")
 
 
-def _say_summary(summaries: "Sequence[ScalarSummary]") -> None:
+def _say_summary(found: "StudyDigest") -> None:
     """The outputs that vary, as a table."""
     from rich.table import Table
     from rich.text import Text
 
     from snrmjax.report.study.study_report import summary_table
 
-    rows = [row for row in summaries if (row.varies or row.outside) and not row.scalar.is_count]
+    rows = [row for row in found.summaries if (row.varies or row.outside) and not row.scalar.is_count]
     shown = summary_table(rows[:_ROWS_SAID], "")
     table = Table(box=None)
     columns = ("output", "unit", "members", "median", "95 % range")
@@ -204,6 +205,8 @@ def _say_summary(summaries: "Sequence[ScalarSummary]") -> None:
     console.print(table)
     if len(rows) > _ROWS_SAID:
         say(f"and {len(rows) - _ROWS_SAID} more outputs")
+    if found.sensor:
+        say(f"velocities and their peaks are those at {found.sensor}")
 
 
 @contextmanager

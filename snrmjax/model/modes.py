@@ -119,6 +119,23 @@ class LinearModes(AbstractShown):
             participation_lag=None,
         )
 
+    def with_first_sensor(self, sensor: str) -> "LinearModes":
+        """The same modes with this sensor before the others: responses are told of the first.
+
+        Raises `ValueError` for an unknown one.
+        """
+        if sensor not in self.sensors:
+            near = suggestion(sensor, self.sensors) or f"; known are {', '.join(self.sensors)}"
+            raise ValueError(f"the model does not have the sensor {sensor!r}{near}.")
+        names = (sensor, *(name for name in self.sensors if name != sensor))
+        order = np.array([self.sensors.index(name) for name in names])
+        return dataclasses.replace(
+            self,
+            mode_shape=self.mode_shape[..., order, :],
+            rigid_body_shape=self.rigid_body_shape[..., order, :],
+            sensors=names,
+        )
+
     @property
     def force_unit(self) -> str:
         """Unit of what drives the structure: of a force, or of a base's acceleration."""

@@ -23,6 +23,8 @@ def description(study: Study) -> dict[str, Any]:
     """The study, its model and the versions behind it as plain text and numbers."""
     # What is computed from a beam has other last digits on other machines: its file is the model.
     made = ("members_a_chunk", *(("model",) if isinstance(study.model_of, BeamModels) else ()))
+    if study.sensor in (None, study.model.modes.sensors[0]):
+        made = (*made, "sensor")  # as studies are that were begun before they had one
     parts = {
         field.name: _plain(getattr(study, field.name))
         for field in dataclasses.fields(study)

@@ -176,7 +176,11 @@ def _write_store(
     _write_labels(group, ensemble)
     axes = study.computation.axes()
     sizes = {MEMBER: len(ensemble.table), **{name: len(axis.values) for name, axis in axes.items()}}
-    outputs = study.computation.outputs()
+    sensor = study.sensor_told
+    outputs = {
+        name: one._replace(meaning=f"{one.meaning}, at {sensor}") if one.at_sensor else one
+        for name, one in study.computation.outputs().items()
+    }
     ragged = {output.dimensions[0] for output in outputs.values()} - {MEMBER}
     for dimension in ragged:
         text = f"first row of the member along `{dimension}`; n_{dimension}s is how many"
@@ -207,6 +211,7 @@ def _write_store(
             "coordinates": " ".join(study.names),
             "title": study.name,
             "computed": study.computation.kind,
+            **({} if sensor is None else {"sensor": sensor}),
             "study": json.dumps(described, sort_keys=True),
             **{f"{name}_version": v for name, v in described["versions"].items()},
         }

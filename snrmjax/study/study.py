@@ -1,5 +1,6 @@
 """A study: one model, what varies, what is computed; checked before anything runs."""
 
+import dataclasses
 import difflib
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -47,7 +48,9 @@ class Study(eqx.Module):
     `model_of`, a function of the varied values by name, they may name anything: it makes the
     model of a member, and where it raises `ValueError` the member has a status that says so.
     `BeamModels` make it from the numbers of a beam file ("section.thickness_m"), beside those of
-    the model. `members_a_chunk` is how many are computed and stored together.
+    the model. `members_a_chunk` is how many are computed and stored together. Peaks and velocities
+    are those of `sensor`, by default the model's first; what identifies a test has them where the
+    mode of interest moves most.
     """
 
     name: str = eqx.field(static=True)
@@ -58,6 +61,7 @@ class Study(eqx.Module):
     seed: int = eqx.field(static=True, default=0)
     members_a_chunk: int | None = eqx.field(static=True, default=None)
     model_of: Callable[[dict[str, float]], Structure] | None = eqx.field(static=True, default=None)
+    sensor: str | None = eqx.field(static=True, default=None)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -68,6 +72,14 @@ class Study(eqx.Module):
     def n_members(self) -> int:
         """How many members there are."""
         return number_of_members(self.variations, self.sampling)
+
+    @property
+    def sensor_told(self) -> str | None:
+        """The sensor of peaks and velocities; None where nothing is told of one.
+
+        Raises `ValueError` for a `sensor` that the model does not have.
+        """
+        return self.computation.sensor(_seen(self.model, self.sensor).modes)
 
     @property
     def chunk_size(self) -> int:
@@ -85,8 +97,8 @@ class Study(eqx.Module):
         """The members, drawn and checked.
 
         Raises `ValueError` for a quantity that the model does not have or that varies twice, for a
-        missing force or a needless one, for too many members, and for the first value that the
-        model cannot have.
+        missing force or a needless one, for a `sensor` that the model does not have or of which
+        nothing is told, for too many members, and for the first value that the model cannot have.
         """
         if self.seed < 0:
             raise ValueError(f"`seed` must be zero or positive, but is {self.seed}.")
@@ -95,6 +107,7 @@ class Study(eqx.Module):
                 f"`members_a_chunk` must be at least 1, but is {self.members_a_chunk}."
             )
         _check_names(self)
+        _check_sensor(self)
         table = drawn_members(self.variations, self.sampling, self.seed)
         _check_values(self, table)
         return Ensemble(self, table)
@@ -131,24 +144,34 @@ def models_of(study: Study, rows: Float[np.ndarray, "member name"]) -> list[Stru
     named = [k for k, name in enumerate(study.names) if name != FORCE]
     if study.model_of is not None:
         each = [dict(zip(study.names, row, strict=True)) for row in rows.tolist()]
-        return [_made(study.model_of, values) for values in each]
+        return [_made(study.model_of, values, study.sensor) for values in each]
+    model = _seen(study.model, study.sensor)
     if not named:
-        return [study.model] * len(rows)
+        return [model] * len(rows)
     names, units = zip(*(_in_model(study.names[k]) for k in named), strict=True)
-    together = _varied(study.model, names, rows[:, named] * np.array(units))
+    together = _varied(model, names, rows[:, named] * np.array(units))
     return [taken(together, k) for k in range(len(rows))]
 
 
 def _made(
-    model_of: Callable[[dict[str, float]], Structure], values: dict[str, float]
+    model_of: Callable[[dict[str, float]], Structure],
+    values: dict[str, float],
+    sensor: str | None,
 ) -> Structure | Failure:
     if isinstance(model_of, BeamModels):
         named = {_in_model(name): value for name, value in values.items()}
         values = {name: value * unit for (name, unit), value in named.items()}
     try:
-        return model_of(values)
+        return _seen(model_of(values), sensor)
     except ValueError as error:
         return refusal(error)
+
+
+def _seen(model: Structure, sensor: str | None) -> Structure:
+    """The model with this sensor as its first, of which peaks and velocities are told."""
+    if sensor in (None, model.modes.sensors[0]):
+        return model
+    return dataclasses.replace(model, modes=model.modes.with_first_sensor(str(sensor)))
 
 
 @eqx.filter_jit
@@ -196,6 +219,16 @@ def _check_names(study: Study) -> None:
         raise ValueError(f"{FORCE} cannot vary: {why}.")
     if forces is not None and not stated and FORCE not in names:
         raise ValueError(f"{study.computation.kind} needs `forces_n`, or {FORCE} to vary.")
+
+
+def _check_sensor(study: Study) -> None:
+    asked, told = study.sensor, study.sensor_told
+    if asked not in (None, told):
+        kind = study.computation.kind
+        instead = f"tells of {told}, where the mode of interest moves most"
+        raise ValueError(
+            f"`sensor` cannot be {asked}: {kind} {instead if told else 'tells of no sensor'}."
+        )
 
 
 def _check_values(study: Study, table: Float[np.ndarray, "member name"]) -> None:

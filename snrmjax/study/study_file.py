@@ -36,10 +36,10 @@ _RANGE = ("from_hz", "to_hz")
 _ERRORS = ("amplitude", "phase_deg", "force", "level_gain", "level_phase_deg")
 # Keys that each kind of computation needs and may have, beside those of every study.
 _KEYS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
-    "peaks": (_RANGE, ("forces_n", "harmonics", "stability", "grid_points")),
-    "curves": (_RANGE, ("forces_n", "harmonics", "stability")),
-    "nnm": (("to_hz",), ("harmonics",)),
-    "damped_nnm": (("to_velocity_m_s",), ("harmonics",)),
+    "peaks": (_RANGE, ("forces_n", "harmonics", "stability", "grid_points", "sensor")),
+    "curves": (_RANGE, ("forces_n", "harmonics", "stability", "sensor")),
+    "nnm": (("to_hz",), ("harmonics", "sensor")),
+    "damped_nnm": (("to_velocity_m_s",), ("harmonics", "sensor")),
     "virtual_test": ((*_RANGE, "forces_n"), ("harmonics", "errors", "points_per_level")),
     "identify": (("data",), ()),
     "diagnose": (("data",), ()),
@@ -77,6 +77,7 @@ def read_study(path: FilePath) -> Study:
         seed=top.whole("seed", 0, 0),
         members_a_chunk=top.whole("members_a_chunk", 0, 0) or None,
         model_of=beam,
+        sensor=top.text("sensor") if "sensor" in top.entries else None,
     )
     try:
         study.ensemble()

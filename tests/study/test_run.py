@@ -8,11 +8,12 @@ import zipfile
 import numpy as np
 import pytest
 from filelock import FileLock
+from scipy.optimize import minimize_scalar
 
 import snrmjax as sj
 from snrmjax.study.execution import LOST, WorkerDied
 
-from .conftest import InThisProcess, peak_velocity
+from .conftest import OMEGA, InThisProcess, peak_velocity
 
 DAMPING = np.linspace(0.01, 0.03, 7)
 
@@ -279,3 +280,68 @@ def test_functions_that_name_the_package_reach_other_processes():
     namespace = {"sj": sj, "__name__": "__main__"}
     exec("def beam(values): return sj.model.flat_beam()", namespace)
     assert len(dumps(namespace["beam"])) < 10_000
+
+
+@pytest.fixture(scope="module")
+def two_sensors():
+    """Two linear modes of which sensor a sees one more and sensor b the other."""
+    modes = sj.model.linear_modes(
+        *([OMEGA, 1.2 * OMEGA], [0.02, 0.02], [[2.0, 0.2], [0.1, 2.0]], [3.0, 3.0]),
+        sensors=("a", "b"),
+    )
+    return sj.model.structure(modes)
+
+
+def linear_peak(model, sensor, force):
+    """Largest velocity of two linear modes by SciPy and the frequency in Hz where it is."""
+    modes = model.modes
+    own, shape = np.asarray(modes.natural_frequency), np.asarray(modes.shape_at(sensor))
+
+    def speed(omega):
+        stiffness = own**2 - omega**2 + 0.04j * own * omega
+        return abs(np.sum(1j * omega * force * shape * 3.0 / stiffness))
+
+    grid = np.linspace(0.8, 1.4, 601) * OMEGA
+    near = grid[np.argmax([speed(omega) for omega in grid])]
+    ends = (near - 0.01 * OMEGA, near + 0.01 * OMEGA)
+    found = minimize_scalar(
+        lambda omega: -speed(omega), bounds=ends, method="bounded", options={"xatol": 1e-7 * OMEGA}
+    )
+    return found.x / (2 * np.pi), -found.fun
+
+
+def test_a_study_tells_of_the_sensor_that_it_is_asked_for(two_sensors, tmp_path):
+    within = sj.study.ResponseRange(0.8 * OMEGA, 1.4 * OMEGA, harmonic_order=1, stability=False)
+    varied = (sj.study.Discrete("mode_1.damping_ratio", [0.02]),)
+
+    def study(sensor):
+        peaks = sj.study.Peaks(within, [0.5])
+        return sj.study.Study("sensors", two_sensors, peaks, varied, sensor=sensor)
+
+    for sensor in ("a", "b"):
+        out = tmp_path / f"{sensor}.zarr"
+        data = run_here(study(sensor), out).open()
+        hertz, velocity = linear_peak(two_sensors, sensor, 0.5)
+        # Located peaks are polished by Newton's method; SciPy's frequency is good to 1e-7.
+        np.testing.assert_allclose(data.peak_velocity_m_s, velocity, rtol=1e-9)
+        np.testing.assert_allclose(data.peak_frequency_hz, hertz, rtol=1e-6)
+        assert data.attrs["sensor"] == sensor
+        said = data.peak_velocity_m_s.attrs["long_name"]
+        assert said == f"velocity at the highest peak, at {sensor}"
+    # A study that names no sensor, as one begun before, is that of the first.
+    again = InThisProcess()
+    run_here(study(None), tmp_path / "a.zarr", again)
+    assert again.done == []
+    with pytest.raises(ValueError, match="`sensor` is 'absent' here and 'b' in the store"):
+        run_here(study(None), tmp_path / "b.zarr")
+    with pytest.raises(ValueError, match=r"the sensor 'c'; known are a, b\."):
+        study("c").ensemble()
+
+
+def test_what_identifies_a_test_tells_of_the_sensor_that_moves_most(two_sensors):
+    within = sj.study.ResponseRange(0.8 * OMEGA, 1.1 * OMEGA)
+    tests = sj.study.VirtualTests(within, np.array([0.5]))
+    varied = (sj.study.Discrete("mode_1.damping_ratio", [0.02]),)
+    assert sj.study.Study("test", two_sensors, tests, varied).sensor_told == "a"
+    with pytest.raises(ValueError, match="virtual_test tells of a, where the mode of interest"):
+        sj.study.Study("test", two_sensors, tests, varied, sensor="b").ensemble()

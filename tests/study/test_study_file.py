@@ -60,7 +60,7 @@ def written(folder, text):
 
 
 def test_a_study_file_says_what_the_object_has(folder):
-    text = HEAD + "harmonics = 3\ngrid_points = 11\nmembers_a_chunk = 5\n" + VARY
+    text = HEAD + "sensor = 'tip'\nharmonics = 3\ngrid_points = 11\nmembers_a_chunk = 5\n" + VARY
     text += '[[vary]]\nparameter = "coulomb_friction.force"\ndistribution = "lognormal"\n'
     text += "mean = 0.02\nstd = 0.01\n" + SAMPLE
     study = sj.study.read_study(written(folder, text))
@@ -73,6 +73,7 @@ def test_a_study_file_says_what_the_object_has(folder):
     assert within.harmonic_order == 3
     np.testing.assert_array_equal(study.computation.forces.values, [0.5])
     assert study.computation.grid_points == 11
+    assert study.sensor == "tip"
 
 
 @pytest.mark.parametrize(
@@ -138,6 +139,7 @@ def test_a_study_file_says_what_the_object_has(folder):
             "is in rad/s, 314.159 in the model",
         ),
         (HEAD + "data = 3\n" + VARY, "unknown key 'data'"),
+        (HEAD + 'sensor = "tipp"\n' + VARY, "the sensor 'tipp' (did you mean `tip`?)."),
         ("compute = [", "is not valid TOML"),
     ],
 )

@@ -85,6 +85,7 @@ def write_study_report(folder: Path, data: "xarray.Dataset") -> StudyDigest:
     )
     stated = {
         "computed": data.attrs.get("computed"),
+        "velocities at": study.sensor,
         "members": study.n_members,
         "sampling": study.sampling,
         "varied": ", ".join(study.quantities),

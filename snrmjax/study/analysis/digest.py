@@ -51,6 +51,7 @@ class StudyDigest(NamedTuple):
     effects: list[OutputEffects]  # of the outputs that vary
     failures: Failures
     sampling: str  # how the members were chosen; empty where the data set does not say
+    sensor: str  # of peaks and velocities; empty likewise
 
     @property
     def n_members(self) -> int:
@@ -121,6 +122,7 @@ def digest(data: "xarray.Dataset") -> StudyDigest:
         effects=effects,
         failures=failures_of(data),
         sampling=str(described.get("sampling", {}).get("method", "")),
+        sensor=str(data.attrs.get("sensor", "")),
     )
 
 

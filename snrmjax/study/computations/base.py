@@ -10,6 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from snrmjax.model.modes import LinearModes
 from snrmjax.model.structures import Structure
 
 MEMBER = "member"
@@ -64,6 +65,7 @@ class Output(NamedTuple):
     kind: str  # "f8", "i4", "i1" or "text"
     unit: str
     meaning: str
+    at_sensor: bool = False  # whether it is that of one sensor
 
 
 class Axis(NamedTuple):
@@ -99,6 +101,11 @@ class AbstractComputation(eqx.Module):
     def axes(self) -> dict[str, Axis]:
         """Dimensions beside `member` and `force_n` whose values all members share."""
         return {}
+
+    def sensor(self, modes: LinearModes) -> str | None:
+        """The sensor of the outputs that are those of one: the first; None if there are none."""
+        told = any(output.at_sensor for output in self.outputs().values())
+        return modes.sensors[0] if told else None
 
 
 class OfForces(eqx.Module):

@@ -23,9 +23,9 @@ _SUMMARY = {
     "status": Output((MEMBER,), TEXT, "", "how the mode ended"),
     "n_points": Output((MEMBER,), "i4", "1", "points of the mode"),
     "end_frequency_hz": Output((MEMBER,), "f8", "Hz", "frequency of the last point"),
-    "end_velocity_m_s": Output((MEMBER,), "f8", "m/s", "velocity of the last point"),
+    "end_velocity_m_s": Output((MEMBER,), "f8", "m/s", "velocity of the last point", True),
     "point_frequency_hz": Output(_AT, "f8", "Hz", "natural frequency"),
-    "point_velocity_m_s": Output(_AT, "f8", "m/s", "velocity fundamental at the first sensor"),
+    "point_velocity_m_s": Output(_AT, "f8", "m/s", "velocity fundamental", True),
 }
 
 
@@ -60,7 +60,7 @@ class NormalModes(AbstractModes):
 
 
 class DampedModes(AbstractModes):
-    """The damped nonlinear mode of interest up to a velocity (m/s)."""
+    """The damped nonlinear mode of interest up to a velocity (m/s) at the sensor."""
 
     kind: ClassVar[str] = "damped_nnm"
     further: ClassVar[tuple[str, str, str]] = ("point_damping_ratio", "1", "damping ratio")

@@ -58,15 +58,15 @@ class AbstractResponses(AbstractComputation):
         return {
             "status": Output(at, TEXT, "", "how the curve ended"),
             "n_points": Output(at, "i4", "1", "points of the curve"),
-            "peak_frequency_hz": Output(at, "f8", "Hz", "frequency of the highest peak"),
-            "peak_velocity_m_s": Output(at, "f8", "m/s", "velocity at the highest peak"),
+            "peak_frequency_hz": Output(at, "f8", "Hz", "frequency of the highest peak", True),
+            "peak_velocity_m_s": Output(at, "f8", "m/s", "velocity at the highest peak", True),
             "resonance_frequency_hz": Output(at, "f8", "Hz", "strongest phase resonance"),
-            "resonance_velocity_m_s": Output(at, "f8", "m/s", "velocity at phase resonance"),
-            PEAK_SIDE: Output(at, "i1", "1", "peak above (1) or below (-1) the range"),
+            "resonance_velocity_m_s": Output(at, "f8", "m/s", "velocity at phase resonance", True),
+            PEAK_SIDE: Output(at, "i1", "1", "peak above (1) or below (-1) the range", True),
             "n_folds": Output(at, "i4", "1", "folds of the curve"),
             "n_not_located": Output(at, "i4", "1", "events that are there but were not located"),
             "fold_frequency_hz": Output(("fold",), "f8", "Hz", "frequency of a fold"),
-            "fold_velocity_m_s": Output(("fold",), "f8", "m/s", "velocity at a fold"),
+            "fold_velocity_m_s": Output(("fold",), "f8", "m/s", "velocity at a fold", True),
         }
 
     def axes(self) -> dict[str, Axis]:
@@ -116,7 +116,7 @@ class Peaks(AbstractResponses):
             for name, which in (("upper", "highest"), ("lower", "lowest")):
                 text = f"{which} velocity of the response at this frequency"
                 dimensions = *self.forces.dimensions, GRID
-                named[f"{name}_velocity_m_s"] = Output(dimensions, "f8", "m/s", text)
+                named[f"{name}_velocity_m_s"] = Output(dimensions, "f8", "m/s", text, True)
         return named
 
     def axes(self) -> dict[str, Axis]:
@@ -160,8 +160,10 @@ class Curves(AbstractResponses):
         return {
             **super().outputs(),
             "point_frequency_hz": Output(at, "f8", "Hz", "frequency of the force"),
-            "point_velocity_re_m_s": Output(at, "f8", "m/s", "velocity in phase with the force"),
-            "point_velocity_im_m_s": Output(at, "f8", "m/s", "velocity a quarter period ahead"),
+            **{
+                f"point_velocity_{part}_m_s": Output(at, "f8", "m/s", f"velocity {which}", True)
+                for part, which in (("re", "in phase with the force"), ("im", "90° ahead of it"))
+            },
             "point_stability": Output(at, "i1", "1", "1 stable, 0 unstable, -1 not computed"),
             "point_branch": Output(at, "i1", "1", "number of the branch: a response may have two"),
         }

@@ -11,6 +11,7 @@ from snrmjax.diagnose.evidence import answer_of
 from snrmjax.identify.inference.identification import Identification, identify_backbone
 from snrmjax.identify.pointwise.inversion_result import PointStatus
 from snrmjax.measure.states import SteadyStates
+from snrmjax.model.modes import LinearModes, reference_sensor
 from snrmjax.model.structures import Structure
 from snrmjax.simulate.balance.labelled import HERTZ
 from snrmjax.simulate.virtual_test.phase_resonance_test import phase_resonance_test
@@ -32,7 +33,7 @@ _FOUND = {
     "status": Output((MEMBER,), TEXT, "", "solved, or why not"),
     "n_states": Output((MEMBER,), "i4", "1", "steady states of the test"),
     "n_solved": Output((MEMBER,), "i4", "1", "steady states that the inverse method solved"),
-    "velocity_m_s": Output(_CURVE, "f8", "m/s", "velocity on the backbone"),
+    "velocity_m_s": Output(_CURVE, "f8", "m/s", "velocity on the backbone", True),
     "natural_frequency_hz": Output(_CURVE, "f8", "Hz", "natural frequency"),
     "natural_frequency_std_hz": Output(_CURVE, "f8", "Hz", "its standard deviation"),
     "damping_ratio": Output(_CURVE, "f8", "1", "damping ratio"),
@@ -51,6 +52,10 @@ class AbstractIdentified(AbstractSingly):
         """See `AbstractComputation.axes`."""
         text = "place between the smallest (0) and the largest (1) measured amplitude"
         return {SHARE: Axis(np.linspace(0.0, 1.0, _POINTS), "1", text)}
+
+    def sensor(self, modes: LinearModes) -> str:
+        """That where the mode of interest moves most, whatever the order of the sensors."""
+        return modes.sensors[reference_sensor(modes)]
 
     def identified(self, data: SteadyStates, model: Structure) -> dict[str, np.ndarray]:
         """One member's row."""
