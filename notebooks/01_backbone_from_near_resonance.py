@@ -158,7 +158,7 @@ printed = sj.model.curved_beam("as_printed")
 for model in (curved, printed):
     print(model.name)
     for e in sj.model.equilibria(model):
-        print(f"   q = {e.displacement[0]:.3g} kg^1/2 m, {'stable' if e.stable else 'unstable'}")
+        print(f"   q = {e.displacement[0]:.3g} √kg m, {'stable' if e.stable else 'unstable'}")
 
 # %% [markdown]
 # The stable side of resonance changes from lag to lead where the frequency is lowest. There the

@@ -248,7 +248,7 @@ first_well = sj.forced_response(bistable, [weakest], 20 * HERTZ, 150 * HERTZ)[0]
 for name, well, curve in (("first", wells[0], first_well), ("second", wells[1], second_well)):
     mean = curve.coefficients[np.argmax(level(curve)), 0, 0]
     print(
-        f"{name} well at q = {well.displacement[0]:.3g}: response about {mean:.3g} kg^1/2 m, "
+        f"{name} well at q = {well.displacement[0]:.3g}: response about {mean:.3g} √kg m, "
         f"up to {level(curve).max():.4f} m/s"
     )
 

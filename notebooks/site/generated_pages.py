@@ -17,6 +17,7 @@ from mkdocs.structure.files import File, Files
 
 import snrmjax
 from snrmjax.cli import app
+from snrmjax.numerics.units import unit_in_print
 
 SITE = Path(__file__).parent
 PACKAGE = SITE.parents[1] / "snrmjax"
@@ -154,7 +155,7 @@ def effects_page() -> str:
     for kind, effect in (entry for table in tables for entry in table.items()):
         rows = ["| parameter | what it is | modal unit |", "|---|---|---|"]
         for name, of in effect.parameters().items():
-            rows.append(f"| `{name}` | {cell(of.meaning)} | {cell(of.unit)} |")
+            rows.append(f"| `{name}` | {cell(of.meaning)} | {cell(unit_in_print(of.unit) or "1")} |")
         blocks += [f"## {kind}", effect.description, "\n".join(rows)]
     return "\n\n".join(blocks) + "\n"
 

@@ -193,7 +193,9 @@ def _say_summary(found: "StudyDigest") -> None:
 
     from snrmjax.report.study.study_report import summary_table
 
-    rows = [row for row in found.summaries if (row.varies or row.outside) and not row.scalar.is_count]
+    rows = [
+        row for row in found.summaries if (row.varies or row.outside) and not row.scalar.is_count
+    ]
     shown = summary_table(rows[:_ROWS_SAID], "")
     table = Table(box=None)
     columns = ("output", "unit", "members", "median", "95 % range")

@@ -59,6 +59,7 @@ from snrmjax.model.library.stiffness import (
 from snrmjax.model.places import Row, row_over_points
 from snrmjax.numerics.kept_programs import keep_no_programs
 from snrmjax.numerics.rules import require
+from snrmjax.numerics.units import unit_in_print
 
 
 class EffectTable(dict[str, type[AbstractEffect]]):
@@ -75,7 +76,7 @@ class EffectTable(dict[str, type[AbstractEffect]]):
 
 def _parameters_with_units(effect: type[AbstractEffect]) -> str:
     return ", ".join(
-        f"{name} ({'no unit' if of.unit == '1' else of.unit})" if of.unit else name
+        f"{name} ({unit_in_print(of.unit) or 'no unit'})" if of.unit else name
         for name, of in effect.parameters().items()
     )
 

@@ -27,6 +27,7 @@ from snrmjax.model.places import row_text, unit_at
 from snrmjax.model.potential import PolynomialPotential, polynomial_potential
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.result import AbstractShown
+from snrmjax.numerics.units import unit_in_print
 
 
 def _number(value: float = 0.0) -> Array:
@@ -89,9 +90,9 @@ class Structure(AbstractShown):
         for effect in self.effects:
             rows = effect.rows if isinstance(effect, AbstractForce) else (None,)
             values = [
-                f"{name} {_text(getattr(effect, name))} {unit}".removesuffix(" 1")
+                f"{name} {_text(getattr(effect, name))} {unit}".rstrip()
                 for name, of in effect.parameters().items()
-                for unit in [unit_at(rows[0], of.unit)]
+                for unit in [unit_in_print(unit_at(rows[0], of.unit))]
             ]
             texts = [row_text(row) for row in rows if row is not None]
             where = f" at {', pressed at '.join(texts)}" if texts else ""

@@ -1,4 +1,4 @@
-"""Units of files and reports in those in which the package computes: rad/s and rad."""
+"""Units of files in those in which the package computes, rad/s and rad, and as they are printed."""
 
 import numpy as np
 
@@ -7,3 +7,14 @@ HERTZ = 2 * np.pi
 
 DEGREE = np.pi / 180
 """One degree in rad."""
+
+
+def unit_in_print(unit: str) -> str:
+    """A unit as a reader has it: roots of the kilogram with their sign, nothing for "1".
+
+    Files and data sets keep the spelling that programs read.
+
+    >>> unit_in_print("1/(kg^1/2 m)"), unit_in_print("kg^-1/2"), unit_in_print("1")
+    ('1/(√kg m)', '1/√kg', '')
+    """
+    return "" if unit == "1" else unit.replace("kg^1/2", "√kg").replace("kg^-1/2", "1/√kg")

@@ -10,6 +10,7 @@ import numpy as np
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, AbstractShown, Variable
 from snrmjax.numerics.status import Status
+from snrmjax.numerics.units import unit_in_print
 
 _LINES = 8  # of quantities on one screen, and of parameters that a notebook does not fold
 _LEFT = 'style="text-align: left"'
@@ -71,8 +72,16 @@ def _head(result: AbstractShown, variables: Mapping[str, Variable]) -> str:
     sizes: dict[str, int] = {}
     for variable in variables.values():
         sizes |= dict(zip(variable.dimensions, np.shape(variable.values), strict=True))
-    listed = ", ".join(f"{size} {name}{'' if size == 1 else 's'}" for name, size in sizes.items())
+    listed = ", ".join(_counted(size, name, variables) for name, size in sizes.items())
     return f"{type(result).__name__}: {listed}" if listed else type(result).__name__
+
+
+def _counted(size: int, dimension: str, variables: Mapping[str, Variable]) -> str:
+    """How many there are of what a dimension counts, or of the values of a quantity along it."""
+    several = "" if size == 1 else "s"
+    if dimension in variables and variables[dimension].unit not in ("", "1"):
+        return f"{size} value{several} of {dimension}"
+    return f"{size} {dimension.replace('_', ' ')}{several}"
 
 
 def _settings(result: AbstractShown) -> Iterator[str]:
@@ -99,7 +108,7 @@ def _parameters(variables: Mapping[str, Variable]) -> Iterator[tuple[str, str, s
     std = variables["value_std" if "value_std" in variables else "std"]
     columns = (variables["parameter"], variables["value"], std, variables["unit"])
     for name, value, error, unit in zip(*(of.values for of in columns), strict=True):
-        after = "" if unit in ("", "1") else f" {unit}"
+        after = f" {unit_in_print(unit)}".rstrip()
         yield name, f"{value:.6g}{after}", f"{error:.2g}{after}" if np.isfinite(error) else ""
 
 
@@ -110,7 +119,7 @@ def _range(of: Variable, digits: int = 6) -> str:
     if not finite.size:
         return ""
     sizes = np.abs(finite) if values.dtype.kind == "c" else finite
-    low, high, unit = sizes.min(), sizes.max(), "" if of.unit == "1" else f" {of.unit}"
+    low, high, unit = sizes.min(), sizes.max(), f" {unit_in_print(of.unit)}".rstrip()
     ends = dict.fromkeys(f"{end:.{digits}g}" for end in (low, high))  # one where they are alike
     return f"{' to '.join(ends)}{unit}"
 

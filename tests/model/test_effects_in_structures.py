@@ -63,7 +63,7 @@ def test_effects_and_families_print_as_tables():
     lines = repr(EFFECTS).splitlines()
     assert [line.split()[0] for line in lines] == list(EFFECTS)
     (drag,) = (line for line in lines if line.startswith("quadratic_damping "))
-    assert "coefficient (1/(kg^1/2 m)): Drag of the surrounding air" in drag
+    assert "coefficient (1/(√kg m)): Drag of the surrounding air" in drag
     assert drag in type(EFFECTS).__doc__
     families = repr(sj.identify.FAMILIES)
     assert [line.split()[0] for line in families.splitlines()] == list(sj.identify.FAMILIES)

@@ -311,7 +311,7 @@ def test_a_structure_says_itself_on_one_screen():
         "stiffness 9 1/s²",
     ):
         assert part in text
-    assert "slip_displacement 0.0002 kg^1/2 m" in text
+    assert "slip_displacement 0.0002 √kg m" in text
     seen = []
     jax.jit(lambda m: seen.append(repr(m)) or m.modes.participation)(model)
     batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), model)

@@ -11,10 +11,13 @@ from matplotlib.colors import to_rgba
 from truths.printed_page import unreadable
 
 import snrmjax as sj
+from snrmjax.diagnose.decide import Verdict
+from snrmjax.diagnose.location.laws_at_places import PlacedLaw
+from snrmjax.diagnose.location.where import PlacedForce, Whereabouts
 from snrmjax.diagnose.search.locating import Located
 from snrmjax.io.units import HERTZ
 from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
-from snrmjax.pipelines.diagnose import simulated_levels
+from snrmjax.pipelines.diagnose import DiagnosedTest, simulated_levels
 from snrmjax.report import style as drawing
 from snrmjax.report.figures import diagnosis as plot
 from snrmjax.report.html import report_html
@@ -264,6 +267,36 @@ def test_predictions_of_unseen_levels_are_told_from_those_of_the_completed_model
     assert len(set(re.findall(r"\d ([mµ]?m/s)", table))) == 1
 
 
+def test_the_terminal_has_what_was_found_with_its_error_and_unit(drag):
+    given, _, found = drag
+    value, std = found.parameters["quadratic_damping.coefficient"]
+    (line,) = (one for one in told.headline(DiagnosedTest(found, given)) if "± 1σ" in one)
+    words = r"found \(± 1σ\): quadratic damping, coefficient (\S+) ± (\S+) 1/\(√kg m\)"
+    printed = re.fullmatch(words, line)
+    assert printed
+    # To two digits of the error.
+    assert [float(text) for text in printed.groups()] == pytest.approx([value, std], rel=0.05)
+    poor = dataclasses.replace(found, verdict="unknown", gap=found.gap._replace(after=169.0))
+    (line,) = (one for one in told.headline(DiagnosedTest(poor, given)) if "± 1σ" in one)
+    assert line.startswith("best attempt (± 1σ): quadratic damping, coefficient")
+    assert line.endswith("; the ± holds only if the noise is as stated")
+    nothing = dataclasses.replace(found, answer=found.answer._replace(effects=(), candidates=()))
+    assert not any("±" in one for one in told.headline(DiagnosedTest(nothing, given)))
+
+
+def test_a_law_at_a_place_has_physical_units_in_the_terminal(drag):
+    given, _, found = drag
+    law = PlacedLaw("cubic_stiffness", 1.0, 10, {"coefficient": 2e4}, {"coefficient": 300.0})
+    place = PlacedForce("tip", (("tip", 1.0),), 0.9, law, {"cubic_stiffness": 1.0})
+    other = place._replace(name="everywhere", row=None, probability=0.1)
+    where = Whereabouts(
+        *((place, other), given, None, ("tip", "everywhere"), np.array([0.9, 0.1])), misfit=1.0
+    )
+    poor = dataclasses.replace(found, verdict=Verdict.UNKNOWN)
+    lines = told.headline(DiagnosedTest(poor, given, where=where))
+    assert "found (± 1σ): cubic stiffness at tip, coefficient 20000 ± 300 N/m³" in lines
+
+
 def test_a_best_attempt_and_its_errors_are_called_so(drag, pictures):
     found = drag[2]
     assert "holds only if the noise is as stated" not in html_of(found, pictures)
@@ -271,7 +304,7 @@ def test_a_best_attempt_and_its_errors_are_called_so(drag, pictures):
     html = html_of(poor, pictures)
     assert "best attempt: quadratic damping" in html
     assert "The best attempt, which does not explain the data" in html
-    assert "× noise; the ± above holds only if the noise is as stated" in html
+    assert "× noise; the ± holds only if the noise is as stated" in html
     assert "holds only if the noise is as stated" in repr(poor)
     assert "the misfit that is left is 170 times that noise" in html
 

@@ -103,3 +103,10 @@ def test_within_jit_there_is_nothing_to_show(results):
     ((table, text),) = seen
     assert table is None
     assert "f64[1]" in text
+
+
+def test_what_is_counted_is_no_unit_with_an_s(results):
+    first = repr(results["Backbone"]).splitlines()[0]
+    n = results["Backbone"].to_xarray().sizes["velocity_m_s"]
+    assert first == f"Backbone: {n} values of velocity_m_s"
+    assert repr(results["SteadyStates"]).startswith("SteadyStates: 24 states")

@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from snrmjax.io.units import DEGREE, HERTZ
+from snrmjax.numerics.units import unit_in_print
 from snrmjax.report.sampling import BAND, sensor_index, velocity_of
 from snrmjax.report.style import (
     BACKGROUND,
@@ -113,7 +114,7 @@ def event_curve_figure(curves: Sequence[EventCurve], *, sensor: str | None = Non
     of = unit_for(np.concatenate([c.value for c in drawn]), "N") if base == "N" else None
     size, label = (of.size, of.name) if of else (1.0, base)
     below = parameter.replace("_", " ").capitalize() if of else parameter
-    below += "" if label == "1" else f" ({label})"
+    below += f" ({unit_in_print(label)})" if unit_in_print(label) else ""
     unit = unit_for(np.concatenate([np.abs(velocity_of(c, name)) for c in drawn]), "m/s")
     figure, ((frequencies, speeds),) = panels(PAGE, 3.2, 1, 2)
     kinds = list(dict.fromkeys(curve.kind for curve in drawn))

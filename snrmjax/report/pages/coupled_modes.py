@@ -13,6 +13,7 @@ from snrmjax.io import results
 from snrmjax.io.models import write_model
 from snrmjax.io.units import HERTZ
 from snrmjax.model.parameters import parameter_unit
+from snrmjax.numerics.units import unit_in_print
 from snrmjax.report.figures.simulation import simulated_response_figure
 from snrmjax.report.html import ReportFigure, ReportTable, Section, with_error
 from snrmjax.report.style import (
@@ -102,7 +103,7 @@ def section(found: CoupledDetails, drawn: Mapping[str, Figure | PrintedFigure]) 
     """The part of the page."""
     fit = found.modes.calibration
     rows = [
-        (name, with_error(float(value), float(std)), parameter_unit(fit.model, name))
+        (name, with_error(float(value), float(std)), unit_in_print(parameter_unit(fit.model, name)))
         for name, value, std in zip(fit.names, fit.values, fit.std, strict=True)
     ]
     shown = [ReportFigure(drawn["coupled_backbone"], _SHAPE_CAPTION)]

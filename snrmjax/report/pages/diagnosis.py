@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from snrmjax.diagnose.decide import Verdict
 from snrmjax.diagnose.diagnosis_result import Diagnosis
 from snrmjax.diagnose.evidence import NOISE_REJECTED, NONE, UNKNOWN
-from snrmjax.diagnose.location.where import Whereabouts
+from snrmjax.diagnose.location.where import PlacedForce, Whereabouts
 from snrmjax.diagnose.misfit.candidates import scales_of_motions
 from snrmjax.diagnose.priors import AS_NOISE
 from snrmjax.diagnose.response_prediction import (
@@ -52,6 +52,14 @@ from snrmjax.report.pages.resonance_table import (
     resonance_rows,
     velocity_unit,
 )
+from snrmjax.report.parameters import (
+    own_parameters,
+    parameter_meaning,
+    parameter_words,
+    printed_unit,
+    value_and_unit,
+    values_in_words,
+)
 from snrmjax.report.sentences.diagnose import effect_name, kinds_in_words
 from snrmjax.report.sentences.diagnose import probability_in_words as in_words
 from snrmjax.report.style import PrintedFigure, save_figures, unit_for, with_unit
@@ -84,6 +92,7 @@ _PROBABILITIES = (
     "The most probable answers, by how well each explains these data with all its parameters "
     "uncertain. All answers considered add up to 100 %."
 )
+_ONLY_AS_STATED = "; the ± holds only if the noise is as stated"
 _OTHER_ANSWERS = {
     NONE: "nothing is missing",
     UNKNOWN: "something that no effect of the library explains",
@@ -145,19 +154,42 @@ def answer_in_words(found: DiagnosedTest) -> str:
 
 
 def headline(found: DiagnosedTest) -> list[str]:
-    """Verdict, probability, and what would decide an open answer."""
+    """Verdict, values of what was found, probability, and what would decide an open answer."""
     diagnosis = found.diagnosis
+    values = _effects_with_values(diagnosis)
     lines = [
         diagnosis.verdict_sentence,
+        *([f"{_attempt(diagnosis, 'found')} (± 1σ): {values}"] if values else []),
         f"probability: {diagnosis.most_probable()}",
     ]
     if found.is_placed and found.where is not None:
-        lines = [str(found.where.answer)]
+        lines = [str(found.where.answer), f"found (± 1σ): {_placed_values(found.where.places[0])}"]
     elif diagnosis.decide_by:
         lines.append(f"what would decide: {diagnosis.decide_by}")
     if found.where is not None:
         lines.append(str(found.where.words))
     return lines
+
+
+def _attempt(diagnosis: Diagnosis, answer: str) -> str:
+    """What to call effects: the answer's name for them, or that they are an attempt."""
+    return "best attempt" if diagnosis.verdict == Verdict.UNKNOWN else answer
+
+
+def _effects_with_values(diagnosis: Diagnosis) -> str:
+    """The effects that were found with their parameters, in one line; "" where none has any."""
+    values = {kind: values_in_words(kind, diagnosis.parameters) for kind in diagnosis.effects}
+    line = "; ".join(f"{effect_name(kind)}, {text}" for kind, text in values.items() if text)
+    return line + (_ONLY_AS_STATED if line and diagnosis.gap.after > AS_NOISE else "")
+
+
+def _placed_values(place: PlacedForce) -> str:
+    """The law at a place with its parameters, in one line."""
+    law = place.law
+    if law is None:
+        return ""
+    pairs = {f"{law.kind}.{name}": (value, law.std[name]) for name, value in law.parameters.items()}
+    return f"{effect_name(law.kind)} at {place.name}, {values_in_words(law.kind, pairs, place.row)}"
 
 
 def responses_figure(diagnosis: Diagnosis, simulated: SimulatedLevels) -> Figure:
@@ -222,16 +254,12 @@ def _times(misfit: float) -> str:
 def _key_numbers(diagnosis: Diagnosis, predicted: Sequence[LevelResponse]) -> list[tuple[str, str]]:
     gap, rows = diagnosis.gap, []
     for kind in diagnosis.effects:
-        values = [
-            " ".join((_words(name), *_value_and_unit(kind, name, pair))).strip()
-            for name, pair in _own(kind, diagnosis.parameters).items()
-        ]
-        name = effect_name(kind)
-        unsure = diagnosis.verdict == Verdict.UNKNOWN
-        rows.append((f"best attempt: {name}" if unsure else name, ", ".join(values)))
+        name, attempt = effect_name(kind), _attempt(diagnosis, "")
+        values = values_in_words(kind, diagnosis.parameters)
+        rows.append((f"{attempt}: {name}" if attempt else name, values))
     misfit = f"{_times(gap.before)} → {_times(gap.after)} × noise"
     if diagnosis.effects and gap.after > AS_NOISE:
-        misfit += "; the ± above holds only if the noise is as stated"
+        misfit += _ONLY_AS_STATED
     rows.append(("misfit of the force (rms), errors of levels and laws in it", misfit))
     if np.isfinite(np.asarray(relative_errors(jax.tree.map(np.asarray, diagnosis.data)))).any():
         rows.append(
@@ -273,9 +301,9 @@ def _effects_section(diagnosis: Diagnosis, shown: Mapping[str, ReportFigure]) ->
         if others:
             text[-1] += f" These data do not tell it from: {', '.join(others)}."
     rows = [
-        (effect_name(kind), _meaning(kind, name), *_value_and_unit(kind, name, pair))
+        (effect_name(kind), parameter_meaning(kind, name), *value_and_unit(kind, name, pair))
         for kind in diagnosis.effects
-        for name, pair in _own(kind, diagnosis.parameters).items()
+        for name, pair in own_parameters(kind, diagnosis.parameters).items()
     ]
     caption = "Parameters of the effects ± 1σ, as model.toml has them."
     if diagnosis.gap.after > AS_NOISE:
@@ -344,10 +372,10 @@ def _limits_section(diagnosis: Diagnosis) -> Section:
         scales = scales_of_motions(modes, misfit.sensor, *of_states)
     for name, limit in sorted(diagnosis.detection_limits.items()):
         kind, parameter = name.split(".", 1)
-        size = (number(limit, 2), _unit(kind, parameter))
+        size = (number(limit, 2), printed_unit(kind, parameter))
         if beyond_data(EFFECTS[kind], limit, scales):
             size = ("not detectable in these data", "")
-        rows.append((effect_name(kind), _meaning(kind, parameter), *size))
+        rows.append((effect_name(kind), parameter_meaning(kind, parameter), *size))
     table = ReportTable(
         ("effect", "parameter", "detected from", "unit"),
         rows,
@@ -357,43 +385,17 @@ def _limits_section(diagnosis: Diagnosis) -> Section:
     return Section("What would have been detected", [text], (), [table])
 
 
-def _own(kind: str, parameters: Mapping[str, tuple[float, float]]) -> dict:
-    """The parameters of one effect by their own names."""
-    start = f"{kind}."
-    return {k.removeprefix(start): v for k, v in parameters.items() if k.startswith(start)}
-
-
-def _value_and_unit(kind: str, name: str, pair: tuple[float, float]) -> tuple[str, str]:
-    value, std = pair
-    if std > 0:
-        return with_error(value, std), _unit(kind, name)
-    return f"{number(value)} (1σ not determined by these data)", _unit(kind, name)
-
-
 def _description(kind: str) -> str:
     """What an effect is physically and where it shows, as its class states it."""
     shape = shape_of(effect_class(kind))
     return f"{effect_class(kind).description} {shape.fact if shape else ''}".strip()
 
 
-def _unit(kind: str, name: str) -> str:
-    unit = effect_class(kind).parameters()[name].unit.replace("kg^1/2", "√kg")
-    return "" if unit == "1" else unit
-
-
-def _meaning(kind: str, name: str) -> str:
-    return effect_class(kind).parameters()[name].meaning or _words(name)
-
-
-def _words(name: str) -> str:
-    return name.removesuffix("_hz").removesuffix("_deg").replace("_", " ")
-
-
 def _tried(row: TriedEffect) -> tuple[str, str, str]:
-    own = _own(row.kind, {name: (value, 0.0) for name, value in row.parameters.items()})
+    own = own_parameters(row.kind, {name: (value, 0.0) for name, value in row.parameters.items()})
     own = own or {name: (value, 0.0) for name, value in row.parameters.items()}
     values = [
-        f"{_words(name)} {number(value, 3)} {_unit(row.kind, name)}".strip()
+        f"{parameter_words(name)} {number(value, 3)} {printed_unit(row.kind, name)}".strip()
         for name, (value, _) in own.items()
     ]
     return (

@@ -10,6 +10,7 @@ from snrmjax.identify.scaling.scaled_modes import ScaledModes
 from snrmjax.io.models import write_model
 from snrmjax.io.tables import write_table
 from snrmjax.io.units import HERTZ
+from snrmjax.numerics.units import unit_in_print
 from snrmjax.pipelines.modes import LinearModesFound
 from snrmjax.report.figures.modes import (
     decay_figure,
@@ -158,7 +159,7 @@ def _table(modes: ScaledModes, found: LinearModalFit | DecayModes) -> ReportTabl
 
 
 def _shapes(modes: ScaledModes) -> ReportTable:
-    unit = "kg^-1/2" if modes.mass_normalised else "relative"
+    unit = unit_in_print("kg^-1/2") if modes.mass_normalised else "relative"
     rows = [
         (
             name,

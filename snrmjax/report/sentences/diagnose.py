@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from snrmjax.numerics.units import unit_in_print
 from snrmjax.report.sentences import Wording, enumerated, number_of
 
 _PEOPLE = ("Coulomb", "Jenkins", "Iwan", "Van der Pol")
@@ -207,7 +208,7 @@ SENTENCES: dict[str, Wording] = {
     "most_probable": _most_probable,
     "probability_of_verdict": "probability: {probability}",
     "parameter_found": lambda *, name, unit, value, std: (
-        f"{name} = {value:.4g} ± {std:.2g} {'' if unit == '1' else unit}".rstrip()
+        f"{name} = {value:.4g} ± {std:.2g} {unit_in_print(unit)}".rstrip()
     ),
     "misfits": lambda *, before, after, unsure: (
         f"misfit: {before:.3g} before, {after:.3g} after, in units of noise"

@@ -11,6 +11,7 @@ from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.result import Variable, quantity, setting
 from snrmjax.numerics.status import Status
+from snrmjax.numerics.units import unit_in_print
 from snrmjax.simulate.balance.given_numbers import positive
 from snrmjax.simulate.balance.harmonic_balance import harmonic_balance, resonance_displacement
 from snrmjax.simulate.balance.labelled import HERTZ
@@ -90,7 +91,7 @@ class EventCurve(MotionCurve):
         n, kind = len(self.frequency), self.kind.replace("_", " ")
         lines = [f"{kind} over {self.parameter}: {n} points"]
         if n:
-            hertz, unit = self.frequency / HERTZ, "" if self.unit == "1" else f" {self.unit}"
+            hertz, unit = self.frequency / HERTZ, f" {unit_in_print(self.unit)}".rstrip()
             lines += [
                 f"{self.parameter} {self.value.min():.6g} to {self.value.max():.6g}{unit}",
                 f"frequency {hertz.min():.6g} to {hertz.max():.6g} Hz",
