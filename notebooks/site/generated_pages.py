@@ -155,7 +155,9 @@ def effects_page() -> str:
     for kind, effect in (entry for table in tables for entry in table.items()):
         rows = ["| parameter | what it is | modal unit |", "|---|---|---|"]
         for name, of in effect.parameters().items():
-            rows.append(f"| `{name}` | {cell(of.meaning)} | {cell(unit_in_print(of.unit) or "1")} |")
+            rows.append(
+                f"| `{name}` | {cell(of.meaning)} | {cell(unit_in_print(of.unit) or '1')} |"
+            )
         blocks += [f"## {kind}", effect.description, "\n".join(rows)]
     return "\n\n".join(blocks) + "\n"
 
