@@ -103,11 +103,11 @@ SUB_ROOMS = {
     },
     "report.pages": {
         *("report.figures", "report.style", "report.html", "report.sampling"),
-        "report.sentences",
+        *("report.parameters", "report.sentences"),
     },
     "report.sentences": set(),
     "report.study": {"report.style", "report.html", "report.sentences"},
-    "io.programs": set(),
+    "io.programs": {"io.files"},
     "model.builders": {
         *("model.moving_base", "model.effect_base", "model.effects", "model.modes"),
         *("model.places", "model.potential", "model.structures"),

@@ -76,12 +76,16 @@ _EXAMPLES: dict[Callable[..., None], tuple[str, ...]] = {
     ),
 }
 _OBJECTS = 100_000  # made between two collections of rubbish, some 10 MB
+_READ_MODELS = (whole_test, check, identify, compare, diagnose, simulate, nnm)
 # What Python has another use for, or pytest.
 _NAMES = {whole_test: "test", import_: "import"}
 
 
 for _command, _examples in _EXAMPLES.items():
-    add_command(app, _command, _NAMES.get(_command, _command.__name__), _examples)
+    add_command(
+        *(app, _command, _NAMES.get(_command, _command.__name__), _examples),
+        reads_models=_command in _READ_MODELS,
+    )
 
 app.add_typer(study_app)
 

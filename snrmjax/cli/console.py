@@ -12,6 +12,7 @@ from snrmjax.report.writing import page_of
 SITE_PAGES = "notebooks/site/pages"  # of the repository; the site has no public address yet
 _FORMATS, _IMPORT = ("File formats", "formats"), ("Import a laboratory's files", "how-to/import")
 _ELEMENT = ("Place an element at a point", "how-to/element")
+_OWN = ("Add an effect of your own", "how-to/own-effect")
 _REDUCED = ("Make a reduced model", "how-to/reduced-model")
 # By the part of the package that refused an input, where a page helps: title and path.
 PAGES = {
@@ -21,6 +22,7 @@ PAGES = {
     "model.moving_base": ("Use a shaker table", "how-to/shaker-table"),
     "io.tables": _FORMATS,
     "io.models": _FORMATS,
+    "io.programs.effect_files": _OWN,
     "io.exchange": _IMPORT,
     "io.laboratory": _IMPORT,
     "pipelines.folder_contents": _IMPORT,

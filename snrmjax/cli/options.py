@@ -19,7 +19,7 @@ from snrmjax.pipelines.options import FILES, checked, flag_of
 
 Asked = TypeVar("Asked")
 
-_ALL = "help_all"
+_ALL, _EFFECTS = "help_all", "effects"
 
 Model = Annotated[
     Path,
@@ -85,7 +85,8 @@ class Command(TyperCommand):
             if further:
                 topics = "; ".join(dict.fromkeys(further))
                 shown.epilog += (
-                    f"\n\n{len(further)} more options ({topics}): {ctx.command_path} --help-all"
+                    f"\n\n{len(further)} more option{'s' if len(further) > 1 else ''} ({topics}): "
+                    f"{ctx.command_path} --help-all"
                 )
         super(Command, shown).format_help(ctx, formatter)
 
@@ -105,16 +106,45 @@ def _show_all(context: typer.Context, asked: bool) -> None:
 
 
 def add_command(
-    app: typer.Typer, command: Callable[..., None], name: str, examples: Sequence[str]
+    app: typer.Typer,
+    command: Callable[..., None],
+    name: str,
+    examples: Sequence[str],
+    *,
+    reads_models: bool = False,
 ) -> None:
-    """Give an app a command; its first example stands in `--help`, all in `--help-all`."""
+    """Give an app a command; its first example stands in `--help`, all in `--help-all`.
+
+    One that reads models takes files with a user's own effects too.
+    """
 
     @functools.wraps(command)
     def run(**stated: Any) -> None:
         del stated[_ALL]
+        files = stated.pop(_EFFECTS, ())
+        if files:
+            from snrmjax.io.programs.effect_files import load_effects
+
+            for file in files:
+                load_effects(file)
         command(**stated)
 
     signature = inspect.signature(command)
+    effects = inspect.Parameter(
+        *(_EFFECTS, inspect.Parameter.KEYWORD_ONLY),
+        default=[],
+        annotation=Annotated[
+            list[Path],
+            typer.Option(
+                "--effects",
+                help="Python file with effects of your own, which is run: models and diagnoses "
+                "know them then (repeatable).",
+                metavar="FILE",
+                rich_help_panel="Own effects",
+                show_default=False,
+            ),
+        ],
+    )
     every = inspect.Parameter(
         *(_ALL, inspect.Parameter.KEYWORD_ONLY),
         default=False,
@@ -130,7 +160,7 @@ def add_command(
         ],
     )
     run.__signature__ = signature.replace(  # type: ignore[attr-defined]
-        parameters=[*signature.parameters.values(), every]
+        parameters=[*signature.parameters.values(), *([effects] if reads_models else []), every]
     )
     text = inspect.getdoc(command) or ""
     paragraphs = (" ".join(one.split()) for one in text.split("\n\n"))  # the terminal wraps them

@@ -123,6 +123,7 @@ add_command(
         "snrmjax study run study.toml --out study.zarr",
         "snrmjax study run study.toml --out study.zarr --shard 3/4",
     ),
+    reads_models=True,
 )
 
 

@@ -72,7 +72,7 @@ def checked(options: Options) -> Options:
 _FIT = ("fit", "free", "further")
 _LOADS = ("predict_force", "predict_drive")
 _PREDICTED, _POINTS, _JOINT = (
-    *("Predicted responses", "Curves through points (without --fit)"),
+    *("Predicted responses", "Curves without --fit"),
     "Joint fit of all states",
 )
 _FOR_PREDICTIONS: dict[str, Any] = {

@@ -15,6 +15,7 @@ from concurrent.futures import (
     Future,
     wait,
 )
+from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -24,6 +25,7 @@ from threadpoolctl import threadpool_limits
 
 import snrmjax.model
 from snrmjax.io.programs.compilation_cache import WORTH_KEEPING, default_cache_folder
+from snrmjax.io.programs.effect_files import load_effects, loaded_effects
 from snrmjax.study.computations.base import COMPLETE, Failure, MemberStatus, joined, with_refused
 from snrmjax.study.store import StudyFolder, write_chunk
 from snrmjax.study.study import Ensemble
@@ -126,7 +128,7 @@ def local_processes(processes: int) -> Workers:
             processes,
             context=context,
             initializer=settle,
-            initargs=(os.getpid(), queue),
+            initargs=(os.getpid(), queue, tuple(loaded_effects())),
             timeout=None,
             env={**_ONE_THREAD, **kept},
         )
@@ -137,8 +139,14 @@ def local_processes(processes: int) -> Workers:
 def dask_cluster(address: str) -> Workers:
     """The workers of a running Dask scheduler, such as that at tcp://node1:8786.
 
-    Raises `ValueError` without the package distributed and where nothing answers there.
+    Raises `ValueError` without the package distributed, where nothing answers there, and with
+    effects of a file, which its workers do not load.
     """
+    if loaded_effects():
+        raise ValueError(
+            "a Dask cluster's workers do not load the files of `--effects`: run the study by "
+            "shards, or make your effects a package that every worker imports."
+        )
     try:
         import distributed
     except ImportError as error:
@@ -159,10 +167,11 @@ def dask_cluster(address: str) -> Workers:
     )
 
 
-def settle(parent: int, cores: Any) -> None:
+def settle(parent: int, cores: Any, effects: Sequence[Path] = ()) -> None:
     """Before the first chunk: end with the process that started this one, and stay on one core.
 
-    Arguments: `parent` is that process's number, `cores` a queue with a core for every worker.
+    Arguments: `parent` is that process's number, `cores` a queue with a core for every worker;
+    `effects` are files with a user's own effects, which are loaded here too.
     """
 
     def watch() -> None:
@@ -175,6 +184,8 @@ def settle(parent: int, cores: Any) -> None:
     core = cores.get()
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {core})
+    for file in effects:
+        load_effects(file)
 
 
 def available_cores() -> list[int]:

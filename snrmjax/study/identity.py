@@ -13,6 +13,7 @@ import numpy as np
 
 from snrmjax import __version__
 from snrmjax.condense.beam_models import BeamModels
+from snrmjax.io.programs.effect_files import loaded_effects
 from snrmjax.study.study import Study
 
 _LONGEST = 64  # numbers of an array that are written out; longer ones are known by their hash
@@ -31,12 +32,18 @@ def description(study: Study) -> dict[str, Any]:
         if field.name not in made
     }
     return {
-        "study": {**parts, "members_a_chunk": study.chunk_size},
+        "study": {**parts, "members_a_chunk": study.chunk_size, **_own_effects()},
         "versions": {
             "snrmjax": __version__,
             **{name: importlib.metadata.version(name) for name in _PACKAGES},
         },
     }
+
+
+def _own_effects() -> dict[str, Any]:
+    """Files whose effects members may have, known by what they hold; nothing without any."""
+    files = loaded_effects()
+    return {"effects": {file.name: digest[:16] for file, digest in files.items()}} if files else {}
 
 
 def differences(here: Any, there: Any) -> dict[str, tuple[object, object]]:

@@ -1,1 +1,1 @@
-"""Compiled programs on disk: the compiler's own store, and whole programs of commands."""
+"""Programs on disk: compiled ones that are kept, and Python files with a user's own effects."""
