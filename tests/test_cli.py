@@ -406,7 +406,7 @@ def test_every_option_of_identify_is_joined_to_the_others_or_tried_here(files, t
     """A new option must be said to belong to one way of identifying, or to both."""
     command = typer.main.get_command(app).commands["identify"]
     both = {"data", "model", "out", "predict_force", "predict_drive", "extrapolate", "help_all"}
-    both |= {"axis", "day_std", "self_excited", "predict_at", "modes"}
+    both |= {"axis", "day_std", "self_excited", "predict_at", "modes", "effects"}
     points = {"amplitude", "measure", "knots"}
     joint = {"fit", "free", "robust", "further"}
     assert {one.name for one in command.params} == both | points | joint

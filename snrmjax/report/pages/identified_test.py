@@ -59,7 +59,7 @@ def headline(found: IdentifiedTest) -> list[str]:
             place = f"{each.frequency / HERTZ:.5g} Hz, {each.velocity:.3g} m/s"
             damped = f"{100 * each.damping_ratio:.3g} % of critical damping"
             lines.append(f"resonance at {prediction.load}: {place}, {damped}")
-        lines.append(f"resonance at {prediction.load} {where_in_words(prediction.further)}")
+        lines.append(f"resonance at {prediction.load}: {where_in_words(prediction.further)}")
     if found.coupled is not None:
         lines += coupled_page.headline(found.coupled)
     for advised in found.advice or ():

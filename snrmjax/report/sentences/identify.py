@@ -215,13 +215,15 @@ def _resonance_range(
     words = []
     if not sure:
         words = [
-            f"within {ratio:g} times the largest measured amplitude with probability "
+            f"it lies within {ratio:g} times the largest measured amplitude with probability "
             f"{probability:.2g}, else beyond (`--extrapolate` looks farther)"
         ]
     (low, high), (slow, fast) = frequency_hz, velocity
     if np.isfinite(low) and np.isfinite(high):
-        band = f"{low:.6g} to {high:.6g} Hz, {slow:.3g} to {fast:.3g} m/s"
-        words.append(f"95 % {band} ({_errors_of_a_level(another_day)})")
+        words.append(
+            f"with 95 % probability it lies between {low:.6g} and {high:.6g} Hz, its velocity "
+            f"between {slow:.3g} and {fast:.3g} m/s ({_errors_of_a_level(another_day)} included)"
+        )
     return "; ".join(words)
 
 
