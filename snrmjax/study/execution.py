@@ -15,6 +15,7 @@ from concurrent.futures import (
     Future,
     wait,
 )
+from multiprocessing.util import Finalize
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -115,7 +116,8 @@ def local_processes(processes: int) -> Workers:
         from loky.backend import get_context
 
         context = get_context("loky")
-        queue, cores = context.Queue(), available_cores()
+        # Without a thread of its own, which would still hold its locks when this process ends.
+        queue, cores = context.SimpleQueue(), available_cores()
         for k in range(processes):
             queue.put(cores[k % len(cores)])
         # Compiled programs are kept where all of them find them.
@@ -170,8 +172,9 @@ def dask_cluster(address: str) -> Workers:
 def settle(parent: int, cores: Any, effects: Sequence[Path] = ()) -> None:
     """Before the first chunk: end with the process that started this one, and stay on one core.
 
-    Arguments: `parent` is that process's number, `cores` a queue with a core for every worker;
-    `effects` are files with a user's own effects, which are loaded here too.
+    Arguments: `parent` is that process's number, `cores` a queue with a core for every worker,
+    to which this one's goes back when it ends: loky exchanges a worker that has grown for a new
+    one; `effects` are files with a user's own effects, which are loaded here too.
     """
 
     def watch() -> None:
@@ -182,6 +185,7 @@ def settle(parent: int, cores: Any, effects: Sequence[Path] = ()) -> None:
     # First of all: a parent that is killed now leaves nobody who would fill the queue.
     threading.Thread(target=watch, daemon=True).start()
     core = cores.get()
+    Finalize(None, cores.put, (core,), exitpriority=0)
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {core})
     for file in effects:

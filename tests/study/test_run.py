@@ -1,17 +1,20 @@
 """Runs of whole studies in this process: what is computed, kept, refused and mended."""
 
+import os
 import shutil
 import subprocess
 import sys
+import threading
 import zipfile
 
 import numpy as np
 import pytest
 from filelock import FileLock
+from loky.backend import get_context
 from scipy.optimize import minimize_scalar
 
 import snrmjax as sj
-from snrmjax.study.execution import LOST, WorkerDied
+from snrmjax.study.execution import LOST, WorkerDied, available_cores, local_processes, settle
 
 from .conftest import OMEGA, InThisProcess, peak_velocity
 
@@ -233,6 +236,26 @@ def test_a_worker_ends_with_the_process_that_started_it():
     # Without anybody who would tell it its core: the queue is empty for ever.
     code = "import queue; from snrmjax.study.execution import settle; settle(2**30, queue.Queue())"
     assert subprocess.run([sys.executable, "-c", code], timeout=60, check=False).returncode == 1
+
+
+def test_a_core_goes_from_a_worker_that_ended_to_the_next_one():
+    # As where loky exchanges a worker that has grown: with no core left it would wait for ever.
+    context = get_context("loky")
+    cores = context.SimpleQueue()
+    cores.put(available_cores()[0])
+    for _ in range(2):
+        worker = context.Process(target=settle, args=(os.getpid(), cores))
+        worker.start()
+        worker.join(60)
+        assert worker.exitcode == 0
+
+
+def test_a_pool_that_is_closed_leaves_no_thread_which_holds_locks():
+    before = {*threading.enumerate()}
+    workers = local_processes(1)
+    assert workers.result(workers.submit(abs, -3)) == 3
+    workers.close()
+    assert {*threading.enumerate()} == before
 
 
 def test_a_scheduler_that_is_not_there_leaves_nothing(study_of_module, tmp_path, monkeypatch):
