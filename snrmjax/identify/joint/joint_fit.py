@@ -359,7 +359,9 @@ def _notes(
     if not fit.converged:
         notes.append(Fact("fit_not_converged", reason=fit.status.message))
     level, n_levels = np.asarray(fit.data.level), fit.data.n_levels
-    notes += notes_on_noise(fit.noise, frequency_jitter_std, stated, n_levels)
+    notes += notes_on_noise(
+        fit.noise, frequency_jitter_std, stated, np.asarray(fit.prior.level), n_levels
+    )
     if np.any((stated == 0) & (fit.noise.level_std > 0)):
         shifts = np.asarray(fit.unknowns.level) * np.asarray(fit.prior.level)
         force = [np.median(np.asarray(fit.data.force)[level == k]) for k in range(n_levels)]

@@ -43,12 +43,13 @@ def notes_on_noise(
     noise: NoiseEstimate,
     frequency_jitter_std: float,
     given: Float[np.ndarray, " error"],
+    taken: Float[np.ndarray, " error"],
     n_levels: int,
 ) -> list[Fact]:
     """Where the noise and the level-to-level variance are not as stated.
 
     Arguments: `frequency_jitter_std` 1σ of the natural frequency from state to state, relative;
-    `given` the stated 1σ of levels' errors.
+    `given` the stated 1σ of levels' errors, `taken` those that the bands hold.
     """
     notes = []
     size = {"scale": noise.scale, "scale_std": noise.scale_std}
@@ -63,7 +64,8 @@ def notes_on_noise(
         beyond = bool(noise.stated or np.any(given > 0))
         notes.append(Fact("levels_differ", std=tuple(shared.tolist()), beyond_stated=beyond))
     if n_levels < 3:
-        notes.append(Fact("few_levels", n_levels=n_levels))
+        assumed = tuple(np.where(given > 0, 0.0, taken).tolist())
+        notes.append(Fact("few_levels", n_levels=n_levels, assumed=assumed))
     return notes
 
 

@@ -95,6 +95,24 @@ def _levels_differ(std: Sequence[float], beyond_stated: bool) -> str:
     return f"{differ}{more}; the bands include this level-to-level variance."
 
 
+def _few_levels(n_levels: int, assumed: Sequence[float]) -> str:
+    if n_levels > 1:
+        return (
+            "2 levels only: the level-to-level variance rests on a single difference, and the "
+            "bands may be too narrow."
+        )
+    if not any(assumed):
+        return (
+            "1 level only: nothing shows whether its errors are as large as stated; the bands "
+            "include them as stated."
+        )
+    return (
+        "1 level only: these data do not show by how much levels differ from one another. The "
+        f"bands include what is assumed instead, {in_words(assumed)} (1σ): measure further levels, "
+        "or state it in the model's [measurement]."
+    )
+
+
 def _beyond_stated(
     error: str, stated: float, rms: float, largest: float, mean: float | None
 ) -> str:
@@ -299,12 +317,7 @@ SENTENCES: dict[str, Wording] = {
     ),
     "frequency_wanders": _wanders,
     "levels_differ": _levels_differ,
-    "few_levels": lambda n_levels: (
-        "1 level only: the level-to-level variance is unknown, and the bands do not include it."
-        if n_levels == 1
-        else "2 levels only: the level-to-level variance rests on a single difference, and the "
-        "bands may be too narrow."
-    ),
+    "few_levels": _few_levels,
     "level_beyond_stated": _beyond_stated,
     "modal_mass_moved": _mass_moved,
     "residuals_correlated": _correlated,

@@ -31,6 +31,7 @@ import snrmjax as sj
 from snrmjax.identify.curves.families import parse_family
 from snrmjax.identify.joint.free_unknowns import corrected_residuals, packed_unknowns, padded_data
 from snrmjax.identify.joint.joint_fit import fit_jointly
+from snrmjax.identify.test_model import priors
 from snrmjax.io.joint_results import (
     read_joint_fit,
     summarise_fit,
@@ -392,7 +393,14 @@ def test_too_few_states_and_one_level_are_said():
     one = level == 4
     data = stated(level[one], omega[one], force[one], velocity[one])
     found = fit_jointly(data, modes(), backbone="polynomial:1", damping="constant")
-    assert "few_levels" in kinds(found)
+    (note,) = (one for one in found.notes if one.kind == "few_levels")
+    # Student's t of two degrees of freedom, as for two levels, on what is likely beforehand.
+    assert note["assumed"] == pytest.approx(
+        [4.303 / 1.960 * prior.scale for prior in priors.LEVELS], rel=1e-2
+    )
+    # A level's own error of damping is in the band: no state of that level alone shows it.
+    values = sj.identify.fitted_values(found, np.array([found.largest[1]]))
+    assert values.damping_ratio_std / values.damping_ratio > note["assumed"][3]
 
 
 def test_states_on_one_side_and_levels_of_one_amplitude_are_said():

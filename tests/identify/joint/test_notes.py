@@ -22,16 +22,18 @@ from snrmjax.numerics.facts import Fact
 
 def test_noise_and_levels_beyond_what_is_stated_are_told():
     found = NoiseEstimate(15.0, 0.6, np.array([0.041, 0.0, 0.0, 0.0]), True)
-    kinds = [one.kind for one in notes_on_noise(found, 1.8e-4, np.zeros(4), 4)]
+    taken = np.array([0.05, 0.0, 0.01, 0.0])
+    kinds = [one.kind for one in notes_on_noise(found, 1.8e-4, np.zeros(4), taken, 4)]
     assert kinds == ["noise_exceeded", "frequency_wanders", "levels_differ"]
     unstated = dataclasses.replace(found, stated=False)
-    wanders, differ = notes_on_noise(unstated, 1.8e-4, np.zeros(4), 4)
+    wanders, differ = notes_on_noise(unstated, 1.8e-4, np.zeros(4), taken, 4)
     # The argument is final, whatever the noise.
     assert wanders == Fact("frequency_wanders", std=1.8e-4, noise_stated=False)
     assert differ == Fact("levels_differ", std=(0.041, 0.0, 0.0, 0.0), beyond_stated=False)
-    assert notes_on_noise(unstated, 0.0, np.full(4, 0.05), 4) == []
-    few = notes_on_noise(unstated, 0.0, np.full(4, 0.05), 2)
-    assert [one.kind for one in few] == ["few_levels"]
+    given = np.array([0.05, 0.05, 0.0, 0.0])
+    assert notes_on_noise(unstated, 0.0, given, taken, 4) == []
+    (few,) = notes_on_noise(unstated, 0.0, given, taken, 2)
+    assert few == Fact("few_levels", n_levels=2, assumed=(0.0, 0.0, 0.01, 0.0))
 
 
 def test_parts_of_correlated_residuals_are_named():
