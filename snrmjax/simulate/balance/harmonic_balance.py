@@ -15,7 +15,7 @@ from snrmjax.model.effect_base import AbstractHysteresis, AbstractKinked
 from snrmjax.model.elements import AlikeForces, elements_of
 from snrmjax.model.modes import phasor_of_load
 from snrmjax.model.structures import Structure, linear_terms_of
-from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.compiled import as_numpy, compiled
 from snrmjax.simulate.balance.harmonics import (
     alias_free_samples,
     harmonic_basis,
@@ -229,7 +229,7 @@ def harmonic_balance(
         model=model,
         force=jnp.asarray(force, dtype=jnp.float64),
         displacement_scale=jnp.asarray(displacement_scale, dtype=jnp.float64),
-        frequency_scale=modes.natural_frequency[modes.mode_of_interest],
+        frequency_scale=jnp.asarray(as_numpy(modes.natural_frequency)[modes.mode_of_interest]),
         harmonic_order=harmonic_order,
         n_samples=n_samples,
         cosine_only=cosine_only,

@@ -120,9 +120,8 @@ class EventEquations(eqx.Module):
         by_rate = 2 * motion[-1] * jnp.kron(jnp.asarray(basis.derivative), jnp.diag(terms.mass))
         by_rate = by_rate + jnp.kron(eye, terms.damping_matrix() / balance.frequency_scale)
         if balance.model.memoryless:
-            size, n = balance.n_coefficients, balance.model.n_modes
-            viscous = self._viscous(balance, motion).reshape(-1, n * n)
-            blocks = tangent_blocks(basis, viscous).reshape(size, size, n, n)
+            # Coefficient, coefficient, mode, mode.
+            blocks = tangent_blocks(basis, self._viscous(balance, motion))
             by_rate = by_rate + blocks.transpose(0, 2, 1, 3).reshape(by_rate.shape)
         inertia = jnp.diag(jnp.tile(terms.mass, balance.n_coefficients))
         return jacobian[:, :size] + 1j * second * by_rate - point[-2] * inertia

@@ -17,7 +17,7 @@ from snrmjax.model.structures import (
     simulated_structure,
 )
 from snrmjax.numerics.blocks import by_blocks
-from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.compiled import as_numpy, compiled
 from snrmjax.numerics.result import quantity
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, harmonic_balance
 from snrmjax.simulate.balance.harmonics import with_sines
@@ -174,10 +174,10 @@ def conservative(model: Structure) -> Structure:
         return dataclasses.replace(model, modes=modes, effects=effects)
 
     effects = tuple(effect for effect in model.effects if stays(effect))
-    ones = jnp.ones(model.n_modes)
+    ones = np.ones(model.n_modes)
     # Damping ratios that cancel what linear changes add, which depends linearly on them.
-    none, whole = (linear_terms_of(with_ratio(k * ones)).damping for k in (0.0, 1.0))
-    return with_ratio(jnp.asarray(none) / (jnp.asarray(none) - jnp.asarray(whole)))
+    none, whole = (as_numpy(linear_terms_of(with_ratio(k * ones)).damping) for k in (0.0, 1.0))
+    return with_ratio(jnp.asarray(none / (none - whole)))
 
 
 @compiled
