@@ -176,3 +176,34 @@ def growth() -> str:
         row = ["elements at points", r["n_modes"], "–", r["n_points"], "–"]
         rows.append([*row, number(r["milliseconds_a_point"])])
     return table(head, rows)
+
+
+_WORK = {
+    "responses": "responses of curved beams, with stability",
+    "points": "states inverted point by point",
+    "derivatives": "derivatives of their frequencies and damping by forces and frequencies",
+}
+
+
+def accelerator() -> str:
+    """The same work on the cores of a machine and on its graphics processor."""
+    kept = of.results("accelerator")
+    rows = []
+    for line in kept:
+        same = [r for r in kept if (r["work"], r["count"]) == (line["work"], line["count"])]
+        on = {r["platform"]: r for r in same}
+        if line["platform"] == "cpu" and "cuda" in on:
+            gpu = on["cuda"]
+            ratio = gpu["seconds"] / line["seconds"]
+            rows.append(
+                [
+                    f"{line['count']} {_WORK[line['work']]}",
+                    *(number(r["seconds"]) for r in (line, gpu)),
+                    number(ratio if ratio > 1 else 1 / ratio, 2)
+                    + (" times slower" if ratio > 1 else " times faster"),
+                    number(gpu["apart"], 2),
+                ]
+            )
+    devices = {r["platform"]: r["device"] for r in kept}
+    head = ["work", f"seconds on {devices['cpu']}", f"on {devices['cuda']}", "there", "apart"]
+    return table(head, rows)

@@ -322,6 +322,7 @@ TABLES = {
     **{"by origin": by_origin, "printed missed": printed_missed, "problems": problems},
     **{"left out": left_out, "peers": programs.peers, "beams": programs.beams},
     **{"faster": programs.faster, "methods": programs.methods, "closure": programs.closure},
+    "accelerator": programs.accelerator,
     **{"event curves": programs.event_curves, "rom": programs.rom, "growth": programs.growth},
     **{"paper errors": paper_errors, "paper resonances": paper_resonances},
     **{"paper damping": paper_damping, "left-out levels": left_out_levels, "records": records},

@@ -4,6 +4,7 @@ Each imports what it needs by itself: none waits for the imports of another.
 """
 
 import gc
+import os
 import sys
 from collections.abc import Callable
 
@@ -94,6 +95,9 @@ def main() -> None:
     """Run the commands; wrong input ends with exit code 2 and one sentence."""
     # Imports and programs stay to the end: to look for rubbish in them takes a tenth of a command.
     gc.set_threshold(_OBJECTS)
+    # Whole responses take a graphics processor many times as long as a CPU's core, and every
+    # process would take most of its memory (the site's validation page on other programs).
+    os.environ.setdefault("JAX_PLATFORMS", "cpu")
     asks_help = not {"--help", "--help-all"}.isdisjoint(sys.argv)
     if sys.argv[1:] and not asks_help:  # help does not wait for the import of JAX
         from snrmjax.io.programs.compilation_cache import use_compilation_cache

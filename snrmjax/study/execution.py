@@ -132,7 +132,8 @@ def local_processes(processes: int) -> Workers:
             initializer=settle,
             initargs=(os.getpid(), queue, tuple(loaded_effects())),
             timeout=None,
-            env={**_ONE_THREAD, **kept},
+            # Each would take most of an accelerator's memory, on which responses are slow.
+            env={"JAX_PLATFORMS": "cpu", **_ONE_THREAD, **kept},
         )
 
     return Workers(start, processes, lambda pool: pool.shutdown(wait=True, kill_workers=True))
