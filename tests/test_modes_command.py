@@ -123,7 +123,9 @@ def test_a_decay_gives_frequency_and_damping(folder, tmp_path):
     assert "not mass-normalised" in said
 
 
-@pytest.mark.parametrize("base", [False, True], ids=["force", "base"])
+@pytest.mark.parametrize(
+    "base", [pytest.param(False, id="force"), pytest.param(True, id="base", marks=pytest.mark.long)]
+)
 def test_shape_times_participation_is_the_residue_without_a_scale(base, tmp_path):
     """Two modes at two sensors, residues of either sign: the model has the response itself."""
     omega, ratio = np.array([20.0, 24.0]) * HERTZ, np.array([0.004, 0.003])

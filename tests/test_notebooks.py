@@ -7,11 +7,7 @@ import nbformat
 import pytest
 
 NOTEBOOKS = Path(__file__).resolve().parents[1] / "notebooks"
-QUICK = ("02_forced_responses",)  # the others take a minute and more
-PATHS = [
-    pytest.param(path, marks=[] if path.stem in QUICK else [pytest.mark.long], id=path.stem)
-    for path in sorted(NOTEBOOKS.glob("*.py"))
-]
+PATHS = [pytest.param(path, id=path.stem) for path in sorted(NOTEBOOKS.glob("*.py"))]
 IMAGE = re.compile(r"!\[([^\]]*)\]\(([^)]*)\)")
 
 
@@ -21,6 +17,7 @@ def site(monkeypatch):
     monkeypatch.syspath_prepend(NOTEBOOKS / "site")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("path", PATHS)
 def test_it_runs_to_its_end_and_makes_a_page(path, monkeypatch):
     from execute_notebooks import execute

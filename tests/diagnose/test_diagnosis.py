@@ -91,6 +91,7 @@ def test_the_hidden_effect_is_in_the_answer_and_the_gap_closes(name):
     assert (out.after - 1) < 0.25 * max(out.before - 1, 1.0)
 
 
+@pytest.mark.long
 def test_unseen_levels_resonate_where_the_completed_model_says():
     model, data = files("blind_12")
     found, _ = blind("blind_12")
@@ -130,6 +131,7 @@ def test_an_effect_that_no_one_knows_is_not_named():
     assert found.checks.p_value < 1e-3
 
 
+@pytest.mark.long
 def test_softening_by_many_bandwidths_is_named_whatever_power_its_curve_seems_to_have():
     """25 half-power bandwidths, levels' gains 5 % and frequencies 0.5 % off (set by another code).
 
@@ -328,6 +330,7 @@ class RootDamping(sj.model.AbstractMemoryless):
         return self.coefficient * velocity / (velocity**2 + 1e-12) ** 0.25
 
 
+@pytest.mark.long
 def test_an_effect_of_the_users_own_takes_part():
     # The fundamental of √|cos| sgn cos is 1.1128 (Γ functions): the equivalent damping is c·1.1128
     # over √(modal velocity).

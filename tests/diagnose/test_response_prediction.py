@@ -60,7 +60,8 @@ def test_resonances_of_a_linear_mode_are_its_own():
             assert found.velocity == pytest.approx(exact, rel=1e-6)
 
 
-@pytest.mark.parametrize("kinds", [FEW, pytest.param(tuple(EFFECTS), marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("kinds", [FEW, tuple(EFFECTS)])
 def test_without_strength_no_kind_counts(kinds):
     model, data = linear(), states(linear())
     same = with_idle_effects(model, kinds)

@@ -48,7 +48,9 @@ def test_a_base_whose_motion_was_not_taken_away_is_found(recorded, said, kinds):
         assert f'motion = "{recorded}"' in str(found.findings[0].advice)
 
 
-@pytest.mark.parametrize("lead", [0.0, 0.5 * np.pi, -0.5 * np.pi])
+@pytest.mark.parametrize(
+    "lead", [0.0, *(pytest.param(k * np.pi, marks=pytest.mark.long) for k in (0.5, -0.5))]
+)
 def test_phases_in_radians_of_any_motion_that_were_read_as_degrees(lead):
     level, w, force, exact = states()
     v = noisy(exact)

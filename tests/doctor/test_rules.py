@@ -35,7 +35,7 @@ def test_amplitudes_of_another_quantity_over_a_wide_band(power, kind):
     assert found.findings[0].evidence["reading"].startswith("sizes_of_")
 
 
-@pytest.mark.parametrize("factor", [0.96, 1.04])
+@pytest.mark.parametrize("factor", [0.96, pytest.param(1.04, marks=pytest.mark.long)])
 def test_an_rms_within_the_error_of_the_modal_mass(factor):
     """4 % of the modal mass are less than the 5 % (1σ) that a linear test leaves."""
     level, w, force, v = states()

@@ -55,10 +55,10 @@ def test_hardening_by_tens_and_hundreds_of_bandwidths_is_no_error(shift, apart):
 @pytest.mark.parametrize(
     ("change", "kind"),
     [
-        (lambda w, f, v: (f, v.conj()), "conjugated_response"),
+        pytest.param(lambda w, f, v: (f, v.conj()), "conjugated_response", marks=pytest.mark.long),
         (lambda w, f, v: (f, 1j * w * v), "acceleration_as_velocity"),
         (lambda w, f, v: (f, v / (1j * w)), "displacement_as_velocity"),
-        (lambda w, f, v: (f, -v), "shape_not_mass_normalised"),
+        pytest.param(lambda w, f, v: (f, -v), "shape_not_mass_normalised", marks=pytest.mark.long),
     ],
 )
 def test_errors_of_import_are_named_all_the_same(change, kind):

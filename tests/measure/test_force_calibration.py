@@ -174,7 +174,7 @@ class TestEquivalentForce:
         expected = honest.force_std * honest.misfit / np.maximum(honest.misfit, 1.0)
         np.testing.assert_allclose(found.force_std, expected, rtol=1e-5)
 
-    @pytest.mark.parametrize("stated", [True, False])
+    @pytest.mark.parametrize("stated", [True, pytest.param(False, marks=pytest.mark.long)])
     def test_stated_standard_deviations_cover(self, stated):
         # 134 tests of three levels: 402 scores scatter by 3.5 %.
         rng, scores = np.random.default_rng(2), []

@@ -38,6 +38,7 @@ def test_it_climbs_the_backbone_on_a_shaker_whose_force_drops(beam):
     assert result.test_seconds == pytest.approx(4 * 350 / 40.0, rel=1e-3)
 
 
+@pytest.mark.long
 def test_gains_do_not_move_the_answer_and_bad_ones_say_so(beam):
     lab = laboratory(beam)
     one = sj.methods.phase_locked_loop(lab, VOLTAGES[1:3])

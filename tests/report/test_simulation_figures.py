@@ -75,6 +75,7 @@ def test_normal_mode_against_frequency_and_energy(mode):
         plot.normal_mode_figure(dataclasses.replace(mode, frequency=np.zeros(0)))
 
 
+@pytest.mark.long
 def test_normal_mode_of_a_pair_shows_shares_shape_and_instability():
     """One mass hits a cubic spring: the mode leaves it to the other mass, and loses stability."""
     spring = sj.model.make_effect("cubic_stiffness", {"coefficient": 0.5}, at="x1")
@@ -99,6 +100,7 @@ def test_normal_mode_of_a_pair_shows_shares_shape_and_instability():
     assert unreadable(figure) == []
 
 
+@pytest.mark.long
 def test_events_are_drawn_over_their_parameter():
     modes = sj.model.linear_modes([1.0], [0.025], [[1.0]], [1.0])
     model = sj.model.structure(modes, sj.model.polynomial_potential({"1111": 0.025}, 1))

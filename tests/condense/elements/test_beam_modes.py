@@ -89,6 +89,7 @@ def test_frequencies_and_shapes_have_right_derivatives():
         np.testing.assert_allclose(slope, exact[:, k], rtol=1e-6, atol=1e-8 * size)
 
 
+@pytest.mark.long
 def test_derivatives_by_springs_and_point_masses_are_rayleighs():
     # ∂ω²/∂k = (φ there)² and ∂ω²/∂m = −ω² (φ there)², by each direction's own shape.
     def told(numbers):

@@ -58,6 +58,7 @@ def test_a_law_of_a_time_integrated_set_is_drawn_with_its_band():
     assert found.completed.effects[0].kind == "uneven_stiffness_law"
 
 
+@pytest.mark.long
 def test_the_law_stands_in_the_summary_and_the_model_returns_from_its_file(tmp_path):
     found = slack()
     entry = summarise_diagnosis(found)

@@ -232,6 +232,7 @@ def test_a_table_of_amplitudes_is_diagnosed(tmp_path):
         assert misfit.chi_square(rows - misfit.base) == pytest.approx(need, rel=0.1), kind
 
 
+@pytest.mark.long
 def test_states_with_and_without_phases_stand_side_by_side():
     model = linear_model()
     found = sj.diagnose_model(model, without_phases(balanced(quadratic), slice(0, None, 2)))

@@ -66,6 +66,7 @@ def refined(misfit, fit, data):
     return Search(scales_of(misfit.predictions), (), {}, data).refined(misfit, fit)
 
 
+@pytest.mark.long
 def test_large_errors_of_levels_beside_a_steep_curve_are_found():
     data = hardening(0.3)  # 75 bandwidths
     misfit = weighted_misfit(at_reference(with_reference(compared(data)), data))
@@ -210,6 +211,7 @@ def test_errors_of_levels_pass_on_harmonics_and_not_their_noise():
     np.testing.assert_allclose(by_error[:, 2:], 0.0, atol=2e-5)
 
 
+@pytest.mark.long
 def test_a_gain_beside_levels_that_may_differ_does_not_explain_the_noise_of_harmonics():
     """Errors of levels as large as −100 % would, and noise far below the stated beside them."""
     data = hardening(0.0, gain=0 * GAIN + np.log(0.88), phase=0 * PHASE, noise=NOISE)

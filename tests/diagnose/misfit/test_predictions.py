@@ -19,7 +19,7 @@ from snrmjax.identify.calibrate.inverse_force import inverse_force
 from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
 
 OMEGA, ZETA = 300.0, 0.01
-QUICK = ("gap_stiffness", "iwan_microslip", "internal_resonance_1_3", "mode_shape_change")
+QUICK = ("iwan_microslip", "internal_resonance_1_3", "mode_shape_change")
 EVERY = [k if k in QUICK else pytest.param(k, marks=pytest.mark.long) for k in EFFECTS]
 
 
@@ -58,7 +58,7 @@ def own_friction(predictions):
     del EFFECTS["smooth_friction"]
 
 
-@pytest.mark.parametrize("registered", ["before", "after"])
+@pytest.mark.parametrize("registered", [pytest.param("before", marks=pytest.mark.long), "after"])
 def test_an_effect_of_ones_own_is_treated_alike_whenever_it_is_registered(
     predictions, registered, monkeypatch
 ):

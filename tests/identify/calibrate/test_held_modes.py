@@ -11,7 +11,9 @@ KEYS = ("1111", "1112", "1122")
 NAMES = [f"potential.{key}" for key in KEYS]
 
 
-@pytest.mark.parametrize("sensors", [("a", "b"), ("a",)])
+@pytest.mark.parametrize(
+    "sensors", [pytest.param(("a", "b"), marks=pytest.mark.long), ("a",)], ids=["two", "one"]
+)
 def test_coefficients_come_back(sensors):
     data = steady_states(TERMS, sensors=sensors)
     fit = sj.calibrate_model(

@@ -18,8 +18,11 @@ ONE = {(4, 0): 2e4, (3, 1): 1e4, (2, 2): 5e4, (0, 4): 1e4}
 
 @pytest.mark.parametrize(
     ("terms", "modes", "ratio"),
-    [(THREE, OMEGA, 3), (ALONE, OMEGA, None), (ONE, CLOSE, 1)],
-    ids=["1:3", "none", "1:1"],
+    [
+        pytest.param(THREE, OMEGA, 3, id="1:3"),
+        pytest.param(ALONE, OMEGA, None, id="none"),
+        pytest.param(ONE, CLOSE, 1, id="1:1", marks=pytest.mark.long),
+    ],
 )
 def test_the_interaction_is_recognised(terms, modes, ratio):
     data = steady_states(terms, noise=3e-3, seed=1, modes=modes)
@@ -63,6 +66,7 @@ def test_evidence_of_terms_is_that_of_integrals():
     assert chosen.coupled == pytest.approx(with_first / (with_first + without), rel=1e-6)
 
 
+@pytest.mark.long
 def test_the_bias_of_one_mode_is_that_of_a_backbone_of_two():
     data, model = steady_states(ONE, modes=CLOSE), structure(modes=CLOSE)
     coupled = sj.identify.coupled_modes(data, model, harmonic_order=5)

@@ -112,6 +112,7 @@ def test_folds_are_where_the_frequency_turns(exact_fit):
     np.testing.assert_allclose(sorted(p.frequency for p in found), sorted(turns), rtol=1e-6)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["resonance", "fold"])
 def test_slopes_of_points_are_central_differences(fit, kind):
     curve = sj.identify.fitted_response(fit, FORCE, of=ON_THE_CURVES)[0]

@@ -99,6 +99,7 @@ def test_a_band_along_a_response_holds_the_levels_errors(fit):
     assert extra[10] < 0.01
 
 
+@pytest.mark.long
 def test_a_record_of_the_force_brings_the_gain(fit):
     driven_fit = sj.fit_jointly(driven(60), modes(), **TRUE)
     force = 2.0
@@ -163,6 +164,7 @@ def test_left_out_levels_lie_inside_their_bands():
     assert np.all((share >= 0.90) & (share <= 0.99))
 
 
+@pytest.mark.long
 def test_a_force_at_another_point_moves_the_same_mode_otherwise():
     # A second linear mode at 900 rad/s; the test's force acts at `a`, where the modes' shapes are
     # those of the sensor, the predicted one at `b`.

@@ -113,6 +113,7 @@ def steady(extra, force, omega, cycles=120):
     return 2 * np.mean(solved.y[0] * np.exp(-1j * omega * times))
 
 
+@pytest.mark.long
 def test_a_law_simulates_what_its_formula_does_in_time():
     """A spring that saturates, k w tanh(q/w) less its slope at rest: softening by 12 %."""
     spring = lambda q, v: 0.25 * (0.5 * np.tanh(q / 0.5) - q)  # noqa: E731

@@ -60,7 +60,13 @@ def contact(**changed):
     return sj.model.make_effect("friction_contact", values | changed, at="x", normal_at="y")
 
 
-@pytest.mark.parametrize("effect", [bouc_wen(), contact()], ids=["bouc_wen", "friction_contact"])
+@pytest.mark.parametrize(
+    "effect",
+    [
+        pytest.param(bouc_wen(), id="bouc_wen", marks=pytest.mark.long),
+        pytest.param(contact(), id="friction_contact"),
+    ],
+)
 def test_derivatives_are_those_of_differences(effect):
     x, v = map(jnp.asarray, path(TAU))
     if len(effect.rows) == 2:

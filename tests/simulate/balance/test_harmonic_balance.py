@@ -123,7 +123,8 @@ def test_jacobian_of_every_force_is_exact(kind):
     assert change > 1e-2 if kind != "static_preload" else change == 0
 
 
-@pytest.mark.parametrize("cosine_only", [False, pytest.param(True, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("cosine_only", [False, True])
 def test_jacobian_of_all_effects_together_is_exact(cosine_only):
     model = two_modes_with_effects(others=tuple(OTHERS))
     assert model.n_modes == 3  # with the mode of the internal resonance

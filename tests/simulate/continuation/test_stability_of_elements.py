@@ -65,6 +65,7 @@ def advanced(omega, x, v, z):
     return x, v, z
 
 
+@pytest.mark.long
 def test_multipliers_with_friction_and_a_stop_at_several_points(motion):
     omega, points, found = motion
     orders = np.arange(1, (len(points) - 1) // 2 + 1)

@@ -72,24 +72,25 @@ def test_a_window_that_shows_all_is_not_doubted(ends):
     assert hidden_branches(model, curves, *window, settings=settings) == []
 
 
-def test_a_simulation_says_which_elements_do_nothing():
-    slider = sj.model.make_effect(
-        "jenkins_slider", {"stiffness": 0.1 * OMEGA**2, "slip_displacement": 1e-3}
+@pytest.mark.parametrize("slides", [True, pytest.param(False, marks=pytest.mark.long)])
+def test_a_simulation_says_which_elements_do_nothing(slides):
+    kind, parameters = (
+        ("jenkins_slider", {"stiffness": 0.1 * OMEGA**2, "slip_displacement": 1e-3})
+        if slides
+        else ("one_sided_stop", {"stiffness": OMEGA**2, "gap": 1e-3})
     )
-    stop = sj.model.make_effect("one_sided_stop", {"stiffness": OMEGA**2, "gap": 1e-3})
     modes = sj.model.linear_modes([OMEGA], [RATIO], [[1.0]], [1.0])
     window = 0.8 * OMEGA / HERTZ, 1.2 * OMEGA / HERTZ
     # Before any slip or contact the mode is linear: Q = F/(2ζω²) = 1e-3 at F = 5.
-    for effect, slides in ((slider, True), (stop, False)):
-        model = sj.model.structure(modes, effects=[effect])
-        for force, idle in ((4.0, True), (6.0, False)):
-            found = simulate_responses(model, [force], *window, harmonics=3)
-            notes = [n for n in found.notes if n.kind == "element_idle"]
-            assert len(notes) == idle
-            if idle:
-                assert notes[0]["slides"] == slides
-                assert notes[0]["share"] == pytest.approx(0.8, rel=2e-3)
-                assert "more force" in str(notes[0])
+    model = sj.model.structure(modes, effects=[sj.model.make_effect(kind, parameters)])
+    for force, idle in ((4.0, True), (6.0, False)):
+        found = simulate_responses(model, [force], *window, harmonics=3)
+        notes = [n for n in found.notes if n.kind == "element_idle"]
+        assert len(notes) == idle
+        if idle:
+            assert notes[0]["slides"] == slides
+            assert notes[0]["share"] == pytest.approx(0.8, rel=2e-3)
+            assert "more force" in str(notes[0])
 
 
 def test_friction_that_holds_asks_for_more_force():

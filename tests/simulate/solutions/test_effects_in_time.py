@@ -333,10 +333,15 @@ def tolerance(group, kind):
     return COULOMB if kind == "coulomb_friction" else TOLERANCE[group]
 
 
-ALL = [(group, kind) for group, kinds in GROUPS.items() for kind in kinds]
+SLOW = ("bilinear_stiffness", "iwan_microslip", "internal_resonance_1_3")  # to compile
+ALL = [
+    pytest.param(group, kind, id=kind, marks=[pytest.mark.long] * (kind in SLOW))
+    for group, kinds in GROUPS.items()
+    for kind in kinds
+]
 
 
-@pytest.mark.parametrize(("group", "kind"), ALL, ids=[kind for _, kind in ALL])
+@pytest.mark.parametrize(("group", "kind"), ALL)
 def test_harmonic_balance_is_the_settled_motion(group, kind):
     wanted = truth(kind)
     model = model_with(group, kind)
@@ -370,4 +375,4 @@ def test_the_packages_integration_settles_there_too(kind):
 def test_no_effect_with_a_force_is_left_out():
     silent = {"force_gain_error", "force_offset_error", "sensor_gain_error", "sensor_phase_error"}
     silent |= {"residual_mode", "mode_shape_change", "close_mode"}
-    assert {kind for _, kind in ALL} == set(EFFECTS) - silent
+    assert {kind for kinds in GROUPS.values() for kind in kinds} == set(EFFECTS) - silent

@@ -104,6 +104,7 @@ def test_springs_at_points_are_polynomials_of_the_modes():
     assert energies[0] > 0.1
 
 
+@pytest.mark.long
 def test_derivatives_by_the_numbers_of_elements():
     chain = sj.model.chain([1.0, 1.0], [1.0, 1.0, 1.0], [0.02, 0.01, 0.02])
     spring = element("cubic_stiffness", sj.model.between("x1", "x2"), coefficient=0.7)

@@ -225,6 +225,7 @@ def test_folds_lead_to_the_isolated_response():
             np.testing.assert_allclose(np.sort(tip[k]), (0.03926, 0.04355), rtol=5e-3)
 
 
+@pytest.mark.long
 def test_resonances_lead_to_the_isolated_response():
     model, load = cantilever(), 1e-4
     start = event_of(model, load, (6.95, 7.05), "phase_resonance")

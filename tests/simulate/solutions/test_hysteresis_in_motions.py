@@ -115,7 +115,10 @@ def stepped(force, omega, periods=40, steps=2000):
     return np.fft.rfft(np.roll(kept, 1, axis=0), axis=0) / steps
 
 
-@pytest.mark.parametrize("normal_force", [0.1, 1.5], ids=["pressed", "parting"])
+@pytest.mark.parametrize(
+    "normal_force",
+    [pytest.param(0.1, id="pressed", marks=pytest.mark.long), pytest.param(1.5, id="parting")],
+)
 def test_a_contact_slips_with_its_normal_force_and_parts(normal_force):
     model, omega = surface(normal_force), 3.5
     force = 100.0

@@ -198,6 +198,7 @@ def test_first_and_second_derivatives_of_a_linear_resonance_are_exact():
     np.testing.assert_allclose(hessian[1], 0.0, atol=1e-8)
 
 
+@pytest.mark.long
 def test_second_derivatives_of_a_fold_against_differences(curve):
     start, _ = start_and_value(curve, "fold")
 

@@ -74,6 +74,7 @@ def test_a_motion_is_the_one_that_scipy_finds(pair):
     np.testing.assert_allclose(size.min(axis=1), branch.least_amplitude[place], rtol=0.03)
 
 
+@pytest.mark.long
 def test_responses_are_simulated_with_their_quasi_periodic_motions(pair, tmp_path):
     """Both ends of the window are Neimark-Sacker points: one branch, in a table and a figure."""
     model, _, branch = pair
