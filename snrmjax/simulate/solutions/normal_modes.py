@@ -169,7 +169,7 @@ def conservative(model: Structure) -> Structure:
         of_place = shape is not None and shape.argument is Argument.DISPLACEMENT
         return isinstance(effect, AbstractMemoryless) and of_place
 
-    def with_ratio(ratio: Array) -> Structure:
+    def with_ratio(ratio: Array | np.ndarray) -> Structure:
         modes = dataclasses.replace(model.modes, damping_ratio=ratio, damping_coupling=None)
         return dataclasses.replace(model, modes=modes, effects=effects)
 
