@@ -169,12 +169,12 @@ def conservative(model: Structure) -> Structure:
         of_place = shape is not None and shape.argument is Argument.DISPLACEMENT
         return isinstance(effect, AbstractMemoryless) and of_place
 
-    def with_ratio(ratio: Array | np.ndarray) -> Structure:
+    def with_ratio(ratio: Array) -> Structure:
         modes = dataclasses.replace(model.modes, damping_ratio=ratio, damping_coupling=None)
         return dataclasses.replace(model, modes=modes, effects=effects)
 
     effects = tuple(effect for effect in model.effects if stays(effect))
-    ones = np.ones(model.n_modes)
+    ones = as_numpy(np.ones(model.n_modes))
     # Damping ratios that cancel what linear changes add, which depends linearly on them.
     none, whole = (as_numpy(linear_terms_of(with_ratio(k * ones)).damping) for k in (0.0, 1.0))
     return with_ratio(jnp.asarray(none / (none - whole)))
