@@ -207,7 +207,8 @@ def errors_from_scatter(
 ) -> BackbonePoints:
     """Points whose standard deviations come from the scatter, shared by level or not.
 
-    Arguments: `noise` of amplitude and phase at resonance, relative; `level_gain` (relative) and
+    Arguments: `noise` of force, amplitude and phase each at resonance, relative, as a joint fit
+    finds it where none is stated (`balance_data`); `level_gain` (relative) and
     `level_phase` (rad), where known, are 1σ of the errors of velocity and phase that all states of
     a level share; `frequency_std` (rad/s) and `damping_std` what the natural frequency and the
     damping ratio differ by from state to state; `modal_mass_std` (relative) is 1σ of the modal
@@ -216,7 +217,7 @@ def errors_from_scatter(
     sensitivity = np.asarray(points.sensitivity)
     scale = noise * off_resonance_error_factor(np.asarray(points.mode_velocity))
     shared = np.array([0.0, level_gain, level_phase])
-    spread = np.hypot(scale[:, None, None] * np.array([0.0, 1.0, 1.0]), shared)
+    spread = np.hypot(scale[:, None, None], shared)
     variances = np.sum((sensitivity[:, :2] * spread) ** 2, axis=2)
     natural, damping = np.asarray(points.natural_frequency), np.asarray(points.damping_ratio)
     natural_std = np.hypot(np.sqrt(variances[:, 0]) / (2 * natural), frequency_std)
