@@ -127,7 +127,7 @@ def contributions(fit: JointFit) -> Contributions:
     levels = inverse[:, p - n_linear - n_levels * len(LEVEL_ERRORS) : p - n_linear]
     levels = levels.reshape(p, n_levels, len(LEVEL_ERRORS))
     for k, kind in enumerate(LEVEL_ERRORS):
-        if fit.noise.level_std[k] > 0:
+        if np.asarray(fit.prior.level)[k] > 0:
             rows += [
                 (f"{kind} of level {number}", f"{kind} of levels", levels[:, m, k : k + 1])
                 for m, number in enumerate(fit.level_numbers)

@@ -25,34 +25,52 @@ def test_contributions_sum_to_one_and_name_the_level_errors(fit):
     # At resonance a level's gain counts as the velocities of its nine states do together; states
     # off resonance tell it, since stiffness against frequency has the same factor.
     near = contributions(sj.fit_jointly(noisy(1, widest=4), modes(), level_gain_std=0.01, **TRUE))
-    gains, far = (
+    at_resonance, off_it = (
         sum(row.damping_share for row in found if row.source.startswith("gain"))
+        / sum(row.damping_share for row in found if row.source == "random error of velocity")
         for found in (near, rows)
     )
-    (velocity,) = (r.damping_share for r in near if r.source == "random error of velocity")
-    assert gains / velocity == pytest.approx(9, rel=0.1)
-    assert far < 0.5 * gains
+    assert at_resonance == pytest.approx(9, rel=0.1)
+    assert off_it < 0.5 * at_resonance
 
 
-@pytest.mark.long
-def test_contributions_near_resonance_of_a_linear_mode_are_known():
+ALIKE = dict.fromkeys(("level_gain_std", "level_phase_std", "level_damping_std"), 1e-8)
+ALIKE["level_frequency_std"] = 1e-8 * OMEGA
+
+
+@pytest.mark.parametrize("levels", [{}, ALIKE], ids=["levels may differ", "levels are alike"])
+def test_contributions_near_resonance_of_a_linear_mode_are_known(levels):
     rng, n, constant = np.random.default_rng(3), 60, 12.0
-    omega = OMEGA + 0.5 * constant * np.tan(np.radians(np.linspace(-4, 4, n)))
-    force = np.full(n, 2.0)
+    level, tangent = np.arange(n) % 5, np.tan(np.radians(np.repeat(np.linspace(-4, 4, n // 5), 5)))
+    omega, force = OMEGA + 0.5 * constant * tangent, np.linspace(1.0, 3.0, 5)[level]
     velocity = 1j * omega * CONSTANT * force / (OMEGA**2 - omega**2 + 1j * omega * constant)
     own = NOISE["velocity"] * rng.normal(size=n) + 1j * NOISE["phase"] * rng.normal(size=n)
-    data = stated(np.arange(n) % 5, omega, force, velocity * np.exp(own))
-    rows = contributions(sj.fit_jointly(data, modes(), backbone="polynomial:0", damping="constant"))
-    shares = {row.source.removeprefix("random error of "): row for row in rows}
-    # 2ζω = A F cos φ/v: shares as the squares of 0.3 and 1 %, and of 4° of phase at most.
-    assert shares["force"].damping_share / shares["velocity"].damping_share == pytest.approx(
-        (NOISE["force"] / NOISE["velocity"]) ** 2, rel=0.01
-    )
-    # Beside them stands what levels seem to scatter: shares are compared with one another.
-    assert shares["phase"].damping_share < 0.01 * shares["velocity"].damping_share
-    # tan φ = (ω² − Ω²)/(Ω 2ζω): the natural frequency hinges on the phase.
-    for other in ("force", "velocity"):
-        assert shares[other].frequency_share < 0.01 * shares["phase"].frequency_share
+    force = force * np.exp(NOISE["force"] * rng.normal(size=n))
+    data = stated(level, omega, force, velocity * np.exp(own))
+    structure = sj.model.structure(modes(), **levels)
+    fit = sj.fit_jointly(data, structure, backbone="polynomial:0", damping="constant")
+    shares = {row.source.removeprefix("random error of "): row for row in contributions(fit)}
+    values = sj.identify.fitted_values(fit, np.array([1.0]))
+    lost = float((values.modal_damping_std / values.modal_damping)[0]) ** 2
+    moved = float((values.natural_frequency_std / values.natural_frequency)[0]) ** 2
+    # 2ζω = A F cos φ/v: the mean of all states has their errors' over √n. Shares are of the band
+    # itself, whatever levels add to it.
+    for kind in ("velocity", "force"):
+        assert shares[kind].damping_share * lost == pytest.approx(NOISE[kind] ** 2 / n, rel=0.1)
+    # tan φ = (ω² − Ω²)/(Ω 2ζω): the natural frequency hinges on the phase, by half a bandwidth.
+    by_phase = (NOISE["phase"] * 0.5 * constant / OMEGA) ** 2 / n
+    assert shares["phase"].frequency_share * moved == pytest.approx(by_phase, rel=0.1)
+    if levels:
+        # Of weighted means, to first order in tan φ: across, errors count as its mean square.
+        across, along = NOISE["phase"] ** 2, NOISE["velocity"] ** 2 + NOISE["force"] ** 2
+        tilt = np.mean(tangent**2) * along**2 / (across * NOISE["velocity"] ** 2)
+        ratio = shares["phase"].damping_share / shares["velocity"].damping_share
+        assert ratio == pytest.approx(tilt, rel=0.02)
+        tilt = np.mean(tangent**2) * across * NOISE["velocity"] ** 2 / along**2
+        ratio = shares["velocity"].frequency_share / shares["phase"].frequency_share
+        assert ratio == pytest.approx(tilt, rel=0.02)
+    else:
+        assert shares["velocity"].damping_share + shares["force"].damping_share < 0.5
 
 
 def test_the_bootstrap_knows_the_states_but_not_what_levels_share():
