@@ -137,8 +137,10 @@ def next_measurements(
     Candidates are the stable states of the fitted responses within 70° of resonance; left out are
     isolated branches, which no sweep reaches, states within 0.2 % of a fold, where a test jumps
     off, and amplitudes that the fit has not seen. Every force counts as a level with its own
-    errors. The expected information comes from the fit's balance, linearised at the state; bands
-    are those of the families taken, without what the choice among families leaves open.
+    errors. The expected information comes from the fit's balance, linearised at the state, with the
+    sizes of noise and of levels' errors that the fit has: where nobody stated what levels differ
+    by, a further level tells that too, and the band gets narrower than expected. Bands are those
+    of the families taken, without what the choice among families leaves open.
 
     Arguments: `target` is the band to narrow: of both curves (relative), of natural frequency or
     damping alone.
