@@ -144,8 +144,8 @@ ALIKE = sj.model.structure(
 
 
 class TestBands:
-    # 95 % are meant, and 100 seeds know it to 2 %. A size that is found from six levels is taken for
-    # one more uncertain, as Student has it: nearer to all of them where no level lies far out.
+    # 95 % are meant, and 100 seeds know it to 2 %. A size that is found from six levels is taken
+    # for one more uncertain, as Student has it: nearer to all of them where no level lies far out.
     @pytest.mark.long
     @pytest.mark.parametrize(("modes", "levels"), [(MODES, PUBLISHED), (ALIKE, (0.0,) * 4)])
     def test_bands_of_stated_noise_cover_the_truth(self, modes, levels):
