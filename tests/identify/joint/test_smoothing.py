@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 from truths.exact_states import CONSTANT, NOISE, OMEGA, modes, stated
 from truths.sizes import repeats
 
@@ -12,6 +13,7 @@ from snrmjax.identify.joint.joint_fit import fit_jointly
 from snrmjax.io.joint_results import read_joint_fit, write_joint_fit
 
 KNOTS = np.array([0.0, 0.02, 0.05, 0.2, 0.3, 0.7, 1.0])
+AT = np.linspace(3.2e-4, 1.95e-3, 40)  # m
 
 
 def curve(values, bend_std=1.0):
@@ -60,23 +62,36 @@ def fits():
     """Noisy tests of a curve that few knots cannot follow, families chosen by the data."""
     return [
         fit_jointly(near_resonance(seed), modes(), level_gain_std=0.01)
-        for seed in range(repeats(1, 3))
+        for seed in range(repeats(1, 12))
     ]
+
+
+def inside(fit):
+    """Where the band of 95 % holds the curve."""
+    values = sj.identify.fitted_values(fit, displacement=AT)
+    off = np.asarray(values.natural_frequency) - np.sqrt(dipping(AT))
+    return np.abs(off / np.asarray(values.natural_frequency_std)) < 1.96
 
 
 @pytest.mark.long
 def test_bands_hold_a_curve_that_few_knots_cannot_follow(fits):
-    at = np.linspace(3.2e-4, 1.95e-3, 40)
-    inside = []
     for fit in fits:
+        curve = fit.unknowns.squared_frequency
         assert fit.converged
-        assert isinstance(fit.unknowns.squared_frequency, SmoothingSpline)
-        assert "levels_differ" not in {note.kind for note in fit.notes}
-        values = sj.identify.fitted_values(fit, displacement=at)
-        off = np.asarray(values.natural_frequency) - np.sqrt(dipping(at))
-        inside.append(np.abs(off / np.asarray(values.natural_frequency_std)) < 1.96)
-    # Four free knots leave 38 % of these amplitudes outside.
-    assert np.mean(inside) > 0.9
+        assert isinstance(curve, SmoothingSpline)
+        # Knots are a tenth of the amplitude apart and the dip as wide: what the best curve through
+        # them misses of it passes for levels whose stiffness differs, and no more than that.
+        scale, knots = float(curve.scale), np.asarray(curve.knots)
+        best = CubicSpline(knots, dipping(scale * np.sqrt(knots)), bc_type="natural")
+        missed = np.abs(best((AT / scale) ** 2) / dipping(AT) - 1).max()
+        assert fit.noise.level_std[2] < missed < 0.03
+    # The gain of a level moves the curve beside it: all amplitudes of a test are off together, and
+    # twelve tests know the share to some 3 %.
+    assert np.mean([inside(fit) for fit in fits]) > 0.9
+    few = fit_jointly(
+        near_resonance(0), modes(), level_gain_std=0.01, backbone="spline:4", damping="constant"
+    )
+    assert np.mean(inside(few)) < 0.5
 
 
 @pytest.mark.long
