@@ -197,7 +197,8 @@ def accelerator() -> str:
             ratio = gpu["seconds"] / line["seconds"]
             rows.append(
                 [
-                    f"{line['count']} {_WORK[line['work']]}",
+                    _WORK[line["work"]],
+                    f"{line['count']:,}".replace(",", " "),
                     *(number(r["seconds"]) for r in (line, gpu)),
                     number(ratio if ratio > 1 else 1 / ratio, 2)
                     + (" times slower" if ratio > 1 else " times faster"),
@@ -205,5 +206,12 @@ def accelerator() -> str:
                 ]
             )
     devices = {r["platform"]: r["device"] for r in kept}
-    head = ["work", f"seconds on {devices['cpu']}", f"on {devices['cuda']}", "there", "apart"]
+    head = [
+        "work",
+        "number",
+        f"seconds on {devices['cpu']}",
+        f"on {devices['cuda']}",
+        "there",
+        "apart",
+    ]
     return table(head, rows)
