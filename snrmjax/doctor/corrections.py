@@ -13,6 +13,9 @@ from snrmjax.doctor.priors import CLEARLY, FORCE_FALLS, GAIN_MATTERS, MOVES, OTH
 from snrmjax.identify.test_model.states import TestStates
 
 
+_LEFT = (0.2, 0.45, 0.7, 0.85)  # of what a step changes, at its end
+
+
 class TestCorrection(NamedTuple):
     """A table read with one thing undone."""
 
@@ -121,10 +124,11 @@ def unclipped(
 
 
 def _unsettled(seen: CheckedStates, states: TestStates, base: Judged) -> Iterator[TestCorrection]:
-    """What is left of the motion of the state before, decaying and turning at the mode's own pace.
+    """What is left of the state before: of the mode's motion, or in the analyser's average.
 
-    In a frame that turns with the force, V_n = V + (V_{n−1} − V) e^{(−δ/2 + i(ω̃ − Ω))T} after a
-    dwell T.
+    In a frame that turns with the force, V_n = V + (V_{n−1} − V) r after a dwell T: of a motion,
+    which decays and turns at the mode's own pace, r = e^{(−δ/2 + i(ω̃ − Ω))T}; of an average with
+    a time constant, as a lock-in amplifier has, r is the same real number at every state.
     """
     damping = np.abs(base.damping)
     omega = np.sqrt(np.maximum(base.stiffness, 0.25 * states.frequency**2))
@@ -134,19 +138,18 @@ def _unsettled(seen: CheckedStates, states: TestStates, base: Judged) -> Iterato
         of_level = np.flatnonzero(states.level == k)
         of_level = of_level[np.argsort(seen.order[of_level], kind="stable")]
         before[of_level[1:]] = of_level[:-1]
-    first = before < 0
-    tried = []
-    for share in (0.2, 0.45, 0.7, 0.85):  # of a transient that are left at the end of a step
-        rate = -np.log(share) / typical if typical > 0 else 0.0
-        left = np.exp((-damping / 2 + 1j * (omega - states.frequency)) * rate)
-        left = np.where(first, 0.0, left)
-        true = (states.velocity - left * states.velocity[before]) / (1 - left)
-        stretch = np.abs(states.velocity / (true * (1 - left)))
-        errors = states.errors * np.column_stack([np.ones_like(stretch), stretch, stretch])
-        moved = states._replace(velocity=true, errors=errors)
-        tried.append(Tried(share, moved, 2 * float(np.sum(np.log(stretch)))))
-    value, judged = likeliest(base, tried)
-    yield TestCorrection("unsettled_steps", judged, value)
+    pace = (-damping / 2 + 1j * (omega - states.frequency)) / typical if typical > 0 else 0.0
+    for decay in (pace, -1.0):
+        tried = []
+        for share in _LEFT:
+            left = np.where(before < 0, 0.0, np.exp(-np.log(share) * decay))
+            true = (states.velocity - left * states.velocity[before]) / (1 - left)
+            stretch = np.abs(states.velocity / (true * (1 - left)))
+            errors = states.errors * np.column_stack([np.ones_like(stretch), stretch, stretch])
+            moved = states._replace(velocity=true, errors=errors)
+            tried.append(Tried(share, moved, 2 * float(np.sum(np.log(stretch)))))
+        value, judged = likeliest(base, tried)
+        yield TestCorrection("unsettled_steps", judged, value)
 
 
 def _noisy_force(states: TestStates, base: Judged) -> Iterator[TestCorrection]:
