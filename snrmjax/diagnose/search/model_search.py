@@ -169,6 +169,14 @@ def _compared_with(
         return found
     best = _best([fit, *fits])
     table = (*found.table, _table(found.baseline, fits))
+    if len(best.kinds) == 2 and close.kind in best.kinds:
+        # What is kept beside the mode is chosen anew.
+        mode = _where({close.kind: close}, best, close.kind)
+        alone = unfitted(misfit, mode)
+        rivals = [c for c in _promising(misfit, candidates, alone) if c.kind not in best.kinds]
+        again = fit_effects(misfit, [(mode, started(one)) for one in rivals], _hopeless(best))
+        table, fits = (*table, _table(alone, [best, *again])), [*fits, *again]
+        best = _best([best, *again])
     return found._replace(fit=best, table=table, considered=(*found.considered, *fits))
 
 
