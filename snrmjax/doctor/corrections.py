@@ -12,7 +12,6 @@ from snrmjax.doctor.judgement import CheckedStates, Judged, judge, likelier
 from snrmjax.doctor.priors import CLEARLY, FORCE_FALLS, GAIN_MATTERS, MOVES, OTHER_GAIN, SCATTER
 from snrmjax.identify.test_model.states import TestStates
 
-
 _LEFT = (0.2, 0.45, 0.7, 0.85)  # of what a step changes, at its end
 
 
