@@ -371,13 +371,26 @@ def test_errors_of_the_baseline_are_passed_on_as_the_effect_passes_them():
 
 
 @pytest.mark.long
-def test_levels_whose_mode_differs_are_no_effect_once_that_is_stated():
-    data = balanced(lambda v: 0.0 * v, shift=1e-3)
+def test_levels_whose_mode_differs_are_no_effect_whether_that_is_stated_or_not():
+    data = balanced(lambda v: 0.0 * v, shift=3e-3, seed=4)
+    drawn = 3e-3 * np.random.default_rng([4, 1]).normal(size=5)  # as `balanced` draws them
     unaware = sj.diagnose_model(linear_model(), data)
-    assert unaware.gap.before > 1.3
-    told = sj.diagnose_model(linear_model(level_frequency_std=1e-3 * OMEGA), data)
-    assert told.verdict == "none"
+    assert (unaware.verdict, unaware.effects) == ("none", ())
+    assert unaware.gap.before == pytest.approx(1.0, abs=0.15)
+    differ = said_of_levels(unaware)
+    assert differ["frequency"] == pytest.approx(np.std(drawn, ddof=1), rel=0.2)
+    told = sj.diagnose_model(linear_model(level_frequency_std=3e-3 * OMEGA), data)
+    assert (told.verdict, told.effects) == ("none", ())
     assert told.gap.before == pytest.approx(1.0, abs=0.15)
+    assert said_of_levels(told) is None
+    alike = sj.diagnose_model(linear_model(), balanced(lambda v: 0.0 * v, seed=4))
+    assert said_of_levels(alike) is None
+
+
+def said_of_levels(found):
+    """The note that levels differ, by what the data themselves show."""
+    notes = [n for n in found.notes if getattr(n, "kind", "") == "levels_not_stated"]
+    return next((note for note in notes if note["of_data"]), None)
 
 
 def test_a_completed_model_has_the_baseline_that_the_data_know_better():
