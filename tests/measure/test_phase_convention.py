@@ -178,9 +178,10 @@ def test_the_joint_fit_says_it():
 @pytest.mark.long
 @pytest.mark.parametrize("how", ["conjugated", "opposite"])
 def test_the_diagnosis_says_it(how):
-    """Of opposite signs it ended in a minimum of nothing."""
+    """Of opposite signs rounding says in which minimum of nothing it ends: none is an answer."""
     found = sj.diagnose_model(linear_model(), recorded(balanced(quadratic), how))
-    assert found.verdict == "unknown"
+    assert found.verdict in ("unknown", "noise_rejected")
+    assert found.gap.after > 2  # times the noise, of which right phases leave one
     (fact,) = wrong_phases(recorded(balanced(quadratic), how), linear_model())
     check_named([fact], how)
     assert str(found.notes[0]) == str(fact)
