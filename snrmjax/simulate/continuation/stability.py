@@ -3,18 +3,15 @@
 from enum import IntEnum
 from functools import partial
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
 from snrmjax.model.structures import Structure
-from snrmjax.numerics.blocks import by_member, mapped, over_cores, padded
+from snrmjax.numerics.blocks import by_member, mapped, stacked
 from snrmjax.numerics.compiled import compiled
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance
 from snrmjax.simulate.continuation.monodromy import monodromy
 
-_BLOCKS = ((1, 128), (2, 64))  # modes, and points whose linearised motions are side by side
-_BLOCK = 32  # of more modes
 STEPS_PER_CYCLE = 6  # of the fastest tangent frequency
 MARGIN = 1e-6  # beyond the unit circle: what the multipliers of a conservative motion may err by
 
@@ -50,31 +47,32 @@ def floquet_multipliers(
     """
     values = np.asarray(coefficients, dtype=np.float64)
     omega = np.asarray(frequency, dtype=np.float64)
-    if not len(values):
-        return np.zeros((0, 2 * model.n_modes), dtype=np.complex128)
-
-    size = dict(_BLOCKS).get(model.n_modes, _BLOCK)
-
-    def block(begin: int) -> np.ndarray:
-        here = slice(begin, begin + size)
-        rows, speed = padded(values[here], size), padded(omega[here], size)
-        found = monodromy(model, rows, speed, float(steps_per_cycle))
-        maps = np.asarray(found)[: len(values[here])]
-        known = np.all(np.isfinite(values[here]), axis=(1, 2))[:, None, None]
-        return _eigenvalues(np.where(known, maps, np.nan), 2 * model.n_modes)
-
-    return np.concatenate(over_cores(block, range(0, len(values), size)))
+    owner = np.zeros(len(values), dtype=int)
+    return _multipliers(stacked([model]), owner, values, omega, float(steps_per_cycle))
 
 
 def many_multipliers(
     balances: HarmonicBalance, owner: np.ndarray, points: Float[np.ndarray, "point unknown"]
 ) -> Complex[np.ndarray, "point multiplier"]:
     """Floquet multipliers of scaled points of several structures: `owner` says of which."""
-    if not len(points):
-        return np.zeros((0, 2 * balances.model.n_modes), dtype=np.complex128)
-    coefficients, frequency = balances.motions(points, owner)
-    maps = by_member(_monodromies, balances.model, owner, coefficients, frequency)
-    return _eigenvalues(maps, 2 * balances.model.n_modes)
+    return _multipliers(balances.model, owner, *balances.motions(points, owner), STEPS_PER_CYCLE)
+
+
+def _multipliers(
+    models: Structure,
+    owner: np.ndarray,
+    coefficients: np.ndarray,
+    frequency: np.ndarray,
+    steps_per_cycle: float,
+) -> Complex[np.ndarray, "point multiplier"]:
+    found = np.full((len(owner), 2 * models.n_modes), np.nan, dtype=np.complex128)
+    # The steps of points side by side are as many as one of them needs.
+    known = np.all(np.isfinite(coefficients), axis=(1, 2)) & np.isfinite(frequency)
+    if known.any():
+        steps, rows = np.array(float(steps_per_cycle)), (coefficients[known], frequency[known])
+        maps = by_member(lambda *given: _monodromies(*given, steps), models, owner[known], *rows)
+        found[known] = _eigenvalues(maps, found.shape[1])
+    return found
 
 
 @partial(compiled, long_loops=True)
@@ -82,9 +80,10 @@ def _monodromies(
     models: Structure,
     coefficients: Float[Array, "row point coefficient mode"],
     frequency: Float[Array, "row point"],
+    steps_per_cycle: Float[Array, ""],
 ) -> Float[Array, "row point state state"]:
     def of_row(model: Structure, coefficients: Array, frequency: Array) -> Array:
-        return monodromy(model, coefficients, frequency, jnp.array(float(STEPS_PER_CYCLE)))
+        return monodromy(model, coefficients, frequency, steps_per_cycle)
 
     return mapped(of_row, models, coefficients, frequency)
 
