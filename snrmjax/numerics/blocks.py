@@ -62,7 +62,8 @@ def by_member(
         for group in groups
         for part in np.split(group, range(_ROW, len(group), _ROW))
     ]
-    size = max(size for size in _MEMBERS if size <= len(parts))
+    # By the members, not their rows: a curve of another length is no other program.
+    size = max(size for size in _MEMBERS if size <= len(groups))
 
     def block(begin: int) -> tuple[np.ndarray, np.ndarray]:
         index = np.stack(parts[begin : begin + size])
