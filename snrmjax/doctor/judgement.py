@@ -87,8 +87,9 @@ class Judged(NamedTuple):
     def beats(self, recorded: "Judged", *, beside: bool = True) -> bool:
         """Whether it fits in itself, and the table as recorded clearly less.
 
-        Odds count by the share of states that tell something of their own: where neighbours still
-        miss the curves alike, what was undone is not what is wrong.
+        What states say counts by the share of them that tell something of their own: where
+        neighbours still miss the curves alike, what was undone is not what is wrong. What levels
+        say, of which each is one, counts whole.
         """
         return self.fits and self.explains(recorded, beside=beside)
 
@@ -101,7 +102,9 @@ class Judged(NamedTuple):
         """
 
         def clearly(here: "Judged", there: "Judged") -> bool:
-            return here.leaves_less(there) and here.share * here.gain(there) > CLEARLY
+            of_states = max(here.told - there.told, 0.0)
+            odds = here.gain(there) - (1 - here.share) * of_states
+            return here.leaves_less(there) and odds > CLEARLY
 
         if not clearly(self, recorded):
             return False
@@ -111,6 +114,11 @@ class Judged(NamedTuple):
         if beside:
             here, there = (one._from(None, discrepancy=True) for one in (here, there))
         return clearly(here, there)
+
+    @property
+    def told(self) -> float:
+        """What states alone say of it: ln of their density about its curves and levels."""
+        return self.evidence - self.posterior.log_evidence + self.posterior.log_likelihood
 
     @property
     def share(self) -> float:

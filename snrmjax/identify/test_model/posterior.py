@@ -48,7 +48,7 @@ from snrmjax.identify.test_model.linear_gaussian import (
     laplace_evidence,
 )
 from snrmjax.identify.test_model.states import TestStates
-from snrmjax.identify.test_model.walk import Rounds, likeliest_walk
+from snrmjax.identify.test_model.walk import Reached, Rounds, likeliest_walk
 from snrmjax.numerics.blocks import on_one_core
 
 _ALL = Rounds()
@@ -74,6 +74,7 @@ class TestPosterior(NamedTuple):
     covariance: Float[np.ndarray, "unknown unknown"]
     hyper: Hyper
     log_evidence: float
+    log_likelihood: float  # of the states alone, at the most likely unknowns
     corrections: Float[np.ndarray, "state input"]  # most likely errors, subtracted from the record
     residuals: Float[np.ndarray, "state part"]  # whitened: of unit variance where all is right
     arms_of_stiffness: Float[np.ndarray, "state part"]  # how a relative change of ω̃² moves them
@@ -212,6 +213,7 @@ def fit_test(
         summary.covariance,
         hyper_at(point, basis),
         laplace_evidence(objective, reached.point, bounds),
+        _log_likelihood(reached),
         reached.errors,
         reached.residuals * np.exp(reached.point[NOISE] - point[NOISE]),
         last.arms_of_stiffness,
@@ -222,6 +224,13 @@ def fit_test(
         reached.equations.share,
         walk.still,
     )
+
+
+def _log_likelihood(reached: Reached) -> float:
+    """ln of the density of the records, were the most likely unknowns the true ones."""
+    left, noise = reached.residuals, float(reached.point[NOISE])
+    each = np.log(2 * np.pi) + 2 * noise
+    return reached.equations.offset - 0.5 * float(np.sum(left**2) + left.size * each)
 
 
 def students_factor(freedom: float) -> float:
