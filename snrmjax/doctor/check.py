@@ -15,7 +15,7 @@ from snrmjax.doctor.judgement import (
     leading_sensor,
     usable_rows,
 )
-from snrmjax.doctor.priors import FEWEST_STATES, FITS_WELL, GAIN_MATTERS, MOVED_MATTERS, NO_MODE
+from snrmjax.doctor.priors import FEWEST_STATES, FITS_WELL, GAIN_MATTERS, MOVED_MATTERS
 from snrmjax.doctor.readings import OPPOSITE, best_reading, misread
 from snrmjax.doctor.record_checks import record_findings
 from snrmjax.doctor.scale_findings import is_other_scale, scale_findings, shaker_damping
@@ -136,8 +136,6 @@ def mode_findings(
 
 def _likeliest(seen: CheckedStates, base: Judged) -> TestCorrection | None:
     """The likeliest correction that matters."""
-    if base.misfit > NO_MODE:
-        return None
     mattering = (
         correction
         for correction in corrections(seen, base.states, base)

@@ -9,7 +9,15 @@ from jaxtyping import Float
 from snrmjax.doctor.findings import Kind
 from snrmjax.doctor.force_checks import deepest_fall
 from snrmjax.doctor.judgement import CheckedStates, Judged, judge, likelier
-from snrmjax.doctor.priors import CLEARLY, FORCE_FALLS, GAIN_MATTERS, MOVES, OTHER_GAIN, SCATTER
+from snrmjax.doctor.priors import (
+    CLEARLY,
+    FORCE_FALLS,
+    GAIN_MATTERS,
+    MOVES,
+    NO_MODE,
+    OTHER_GAIN,
+    SCATTER,
+)
 from snrmjax.identify.test_model.states import TestStates
 
 _LEFT = (0.2, 0.45, 0.7, 0.85)  # of what a step changes, at its end
@@ -31,12 +39,14 @@ def corrections(seen: CheckedStates, states: TestStates, base: Judged) -> Iterat
 
     Arguments: `states` as they are read; `base` how they fit.
     """
-    yield TestCorrection("drift", *_moving(states, base, seen.order - 0.5))
     for k, levels in enumerate(seen.files):
         if k > 0 or len(seen.files) > 2:  # of two the first differs as the second from it
             member = np.isin(states.level, levels)
             moved = _moving(states, base, member - float(np.mean(member)))
             yield TestCorrection("different_structures", *moved, file=k + 1)
+    if base.misfit > NO_MODE:
+        return
+    yield TestCorrection("drift", *_moving(states, base, seen.order - 0.5))
     gains = base.posterior.level_errors[:, 0]
     if states.n_levels > 1 and (base.misfit > SCATTER or np.ptp(gains) > GAIN_MATTERS):
         std = (OTHER_GAIN, *states.level_std[1:])
@@ -56,7 +66,8 @@ def _freer(states: TestStates, base: Judged) -> Judged:
 def _moving(states: TestStates, base: Judged, along: np.ndarray) -> tuple[Judged, float]:
     """A natural frequency that changes in proportion to something, and by how much (relative)."""
     judged = _freer(states._replace(trend=along, trend_std=MOVES), base)
-    return judged, 0.5 * judged.posterior.trend[0]
+    stiffness = np.maximum(1 + judged.posterior.trend[0] * along, 1e-6)  # over the mean one
+    return judged, float(np.sqrt(stiffness[np.argmax(along)] / stiffness[np.argmin(along)])) - 1
 
 
 class Tried(NamedTuple):

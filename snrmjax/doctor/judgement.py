@@ -102,8 +102,9 @@ class Judged(NamedTuple):
         """
 
         def clearly(here: "Judged", there: "Judged") -> bool:
-            of_states = max(here.told - there.told, 0.0)
-            odds = here.gain(there) - (1 - here.share) * of_states
+            gain, of_states = here.gain(there), max(here.told - there.told, 0.0)
+            # Where levels and curves are no gain but a cost, fewer states pay less of it.
+            odds = max(here.share * gain, gain - (1 - here.share) * of_states)
             return here.leaves_less(there) and odds > CLEARLY
 
         if not clearly(self, recorded):

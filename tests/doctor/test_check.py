@@ -167,12 +167,18 @@ def test_good_tables_are_silent():
 
 
 @pytest.mark.long
-def test_files_of_two_structures_are_told_apart():
+@pytest.mark.parametrize("ratio", [1.04, 0.5])
+def test_files_of_two_structures_are_told_apart(ratio):
+    tests = []
+    for seed, one in enumerate((1.0, ratio)):
+        level, w, force, exact = states(ratio=one)
+        tests.append(table(level, w, force, noisy(exact, seed)))
+    found = sj.doctor.check_test(tests, model())
+    assert raised(found) == ["different_structures"]
+    assert abs(found.findings[0].evidence["change"] - (ratio - 1)) < 0.002
     level, w, force, exact = states()
-    one, other = (table(level, f * w, force, noisy(exact, k)) for k, f in enumerate((1.0, 1.04)))
-    assert raised(sj.doctor.check_test([one, other], model())) == ["different_structures"]
-    again = table(level, w, force, noisy(exact, 5))
-    assert sj.doctor.check_test([one, again], model()).kinds == ()
+    tests[1] = table(level, w, force, noisy(exact, 5))
+    assert sj.doctor.check_test(tests, model()).kinds == ()
 
 
 def harmonic_table(ratio):

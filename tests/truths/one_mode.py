@@ -10,14 +10,18 @@ CUBIC = 0.1 * OMEGA**2  # of the displacement over its largest: frequencies rise
 STEEP = 4 * CUBIC  # by 14 %, seven bandwidths
 
 
-def states(n=15):
-    """Level, Ω, F, V of ω² + ¾γa², exactly: |F| gives two frequencies at every amplitude."""
+def states(n=15, ratio=1.0):
+    """Level, Ω, F, V of ω² + ¾γa², exactly: |F| gives two frequencies at every amplitude.
+
+    `ratio` of both frequencies, ω and √γ, to these at the same damping 2ζω of motions alike.
+    """
     rows = []
     for level, top in enumerate((0.3, 0.6, 1.0)):
         a = top * np.sin(np.linspace(0.25, np.pi - 0.25, n))
         side = np.sign(np.linspace(-1, 1, n) + 1e-9)
-        k = OMEGA**2 + 0.75 * CUBIC * a**2
-        force = 2 * ZETA * OMEGA * np.sqrt(OMEGA**2 + 0.75 * CUBIC * top**2) * top
+        k = ratio**2 * (OMEGA**2 + 0.75 * CUBIC * a**2)
+        peak = ratio * np.sqrt(OMEGA**2 + 0.75 * CUBIC * top**2)
+        force = 2 * ZETA * OMEGA * peak * top
         w = np.sqrt(k)
         for _ in range(40):
             w = np.sqrt(
