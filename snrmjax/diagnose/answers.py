@@ -1,6 +1,6 @@
 """Answers under some errors: what a search finds, weighed, and found again where it misfits."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -52,15 +52,7 @@ class Search(NamedTuple):
 
     def among(self, answered: Answered, n: int) -> "Search":
         """A search among the effects of the `n` best answers so far."""
-        return self._among(answer.kinds for answer in answered.weights.answers[:n])
-
-    def near(self, found: FoundEffects) -> "Search":
-        """A search among the effects of the answers that fit best so far."""
-        ranked = sorted(found.considered, key=lambda fit: fit.criterion)
-        return self._among(fit.kinds for fit in ranked[: priors.NEAR_ANSWERS])
-
-    def _among(self, answers: Iterable[Iterable[str]]) -> "Search":
-        near = {kind for kinds in answers for kind in kinds}
+        near = {kind for answer in answered.weights.answers[:n] for kind in answer.kinds}
         return self._replace(kinds=tuple(kind for kind in self.kinds if kind in near))
 
     def answered(self, predictions: Predictions) -> Answered:
@@ -86,9 +78,7 @@ class Search(NamedTuple):
             if priors.SAME_NOISE < factor < 1 / priors.SAME_NOISE:
                 break
             misfit = weighted_misfit(misfit.predictions.with_errors_scaled(factor))
-            # Smaller noise may need effects that larger noise hid; larger noise needs no others.
-            search = self.near(found) if factor > 1 else self
-            found, winner = find_effects(misfit, *search[:3]), None
+            found, winner = find_effects(misfit, *self[:3]), None
         best = found.fit
 
         def refined(misfit: WeightedMisfit, fit: EffectFit) -> tuple[WeightedMisfit, EffectFit]:
@@ -143,8 +133,7 @@ def best_answer(search: Search, predictions: Predictions) -> Answered:
     if stated or predictions.reference is None or not (alike or leaves_more_than_noise(answered)):
         return answered
     now = (answered.coarse or answered.found).misfit.predictions
-    near = search.among(answered, priors.NEAR_ANSWERS)
-    apart = near.answered(with_unstated_level_errors(now))
+    apart = search.answered(with_unstated_level_errors(now))
     apart = with_more_harmonics(apart, search.among(apart, priors.NEAREST_ANSWERS))
     odds = float(np.log(priors.LEVELS_APART))
     weights = evidence.either(answered.weights, apart.weights, odds)

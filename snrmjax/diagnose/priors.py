@@ -163,9 +163,9 @@ with two simple ones; and effects of an answer: three can follow most laws."""
 FEW_EFFECTS = 2
 """Of an answer beside which no law is drawn."""
 
-REFINED, NEAR_ANSWERS, NEAREST_ANSWERS = 8, 12, 4
-"""Likeliest answers that are corrected for their own errors; whose effects are looked for again
-where noise or levels change; and with many harmonics, which cost most."""
+REFINED, NEAREST_ANSWERS = 8, 4
+"""Likeliest answers that are corrected for their own errors; and whose effects are looked for again
+with many harmonics, which cost most."""
 
 SAME_NOISE = 0.8
 """Share of a size of noise that is as much."""
