@@ -137,9 +137,12 @@ def test_a_diagnosis_looks_for_an_own_effect_and_a_simulation_has_it(folder):
     )
     sj.io.write_steady_states("measured.csv", test.steady_states)
     words = "measured.csv", "--model", "model.toml", "--effects", "damping.py", "--no-responses"
-    assert run("diagnose", *words, "--out", "out") == 0
+    assert run("diagnose", *words, "--effects", "own.py", "--out", "out") == 0
     found = json.loads((folder / "out" / "diagnosis.json").read_text())
     assert found["effects"] == ["own_root_damping"]
+    # Whoever brings an effect sees it fitted, even where its start promises nothing.
+    tried = [one["effect"] for step in found["tried"] for one in step]
+    assert {"own_root_damping", "own_quintic"} <= {*tried}
     one = found["parameters"]["own_root_damping.coefficient"]
     assert abs(one["value"] - 0.6) < 4 * one["std"]
     # What it wrote is a model for other commands.

@@ -24,7 +24,7 @@ from snrmjax.identify.calibrate.calibration_states import ASSUMED_ERROR
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.effect_base import AbstractHysteresis, AbstractKinked
 from snrmjax.model.effect_metadata import MotionScales
-from snrmjax.model.effects import EFFECTS
+from snrmjax.model.effects import EFFECTS, is_own
 
 _WITHOUT_LAST_HARMONIC = (AbstractKinked, AbstractHysteresis)
 
@@ -51,9 +51,11 @@ class Search(NamedTuple):
     data: SteadyStates  # as it was measured
 
     def among(self, answered: Answered, n: int) -> "Search":
-        """A search among the effects of the `n` best answers so far."""
+        """A search among the effects of the `n` best answers so far, and those of the user."""
         near = {kind for answer in answered.weights.answers[:n] for kind in answer.kinds}
-        return self._replace(kinds=tuple(kind for kind in self.kinds if kind in near))
+        return self._replace(
+            kinds=tuple(kind for kind in self.kinds if kind in near or is_own(kind))
+        )
 
     def answered(self, predictions: Predictions) -> Answered:
         """What is missing; where no noise is stated, with noise as large as what is left.

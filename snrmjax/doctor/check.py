@@ -15,7 +15,13 @@ from snrmjax.doctor.judgement import (
     leading_sensor,
     usable_rows,
 )
-from snrmjax.doctor.priors import FEWEST_STATES, FITS_WELL, GAIN_MATTERS, MOVED_MATTERS
+from snrmjax.doctor.priors import (
+    FEWEST_STATES,
+    FITS_WELL,
+    GAIN_MATTERS,
+    MOVED_MATTERS,
+    OTHER_GAIN,
+)
 from snrmjax.doctor.readings import OPPOSITE, best_reading, misread
 from snrmjax.doctor.record_checks import record_findings
 from snrmjax.doctor.scale_findings import is_other_scale, scale_findings, shaker_damping
@@ -157,7 +163,12 @@ def _matters(one: TestCorrection, base: Judged) -> bool:
         width = float(np.median(one.judged.damping / base.states.frequency))
         return abs(one.value) > MOVED_MATTERS * width
     if one.kind == "volts_as_force":
-        return float(np.ptp(one.gains)) > GAIN_MATTERS
+        gains = np.array(one.gains)
+        off = np.sort(np.abs(gains - np.median(gains)))
+        # Several levels on other ranges, by ten and more, are no states that one mode explains:
+        # steep damping, as of friction, is flattened by such gains.
+        flattened = base.fits and off[-2] > 6 * OTHER_GAIN
+        return float(np.ptp(gains)) > GAIN_MATTERS and not flattened
     # A force that lies within the noise of its cell is none.
     return one.kind != "force_dropout" or one.value < base.states.force.min()
 

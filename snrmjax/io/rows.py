@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from snrmjax.io.files import FilePath, file_name, read_text, shown
+from snrmjax.io.files import FilePath, file_name, read_bytes, read_text, shown
 from snrmjax.numerics.rules import Rule
 
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
@@ -122,8 +122,9 @@ def read_cells(path: FilePath) -> Cells:
 
 
 def header_of(path: FilePath) -> list[str]:
-    """The names in the first line of a CSV that says something, without reading on."""
-    first = read_text(path).lstrip().split("\n", 1)[0]
+    """The names in the first line of a CSV that says something, in whatever letters."""
+    text = read_bytes(path).decode("utf-8-sig", errors="replace")
+    first = text.lstrip().split("\n", 1)[0]
     return [name for field in first.split(",") if (name := field.strip().strip('"').strip())]
 
 

@@ -190,6 +190,11 @@ def effect_class(kind: str) -> type[AbstractEffect]:
     return known_effects()[kind]
 
 
+def is_own(kind: str) -> bool:
+    """Whether an effect is one that a user registered."""
+    return not effect_class(kind).__module__.startswith("snrmjax.")
+
+
 def known_effects() -> dict[str, type[AbstractEffect]]:
     """All classes of effects by their kinds: `EFFECTS`, `ELEMENTS` and `LAWS`."""
     return {**EFFECTS, **ELEMENTS, **LAWS}

@@ -23,7 +23,7 @@ from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
 from snrmjax.model.effect_base import AbstractEffect
 from snrmjax.model.effect_metadata import VISIBLE_CHANGE, MotionScales
 from snrmjax.model.effect_shape import shape_of, starts_of
-from snrmjax.model.effects import EFFECTS, effect_parameters
+from snrmjax.model.effects import EFFECTS, effect_parameters, is_own
 from snrmjax.numerics.blocks import over_cores
 from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
 
@@ -210,7 +210,8 @@ def _promising(
 ) -> list[EffectCandidate]:
     """The candidates of which one start, scaled, is expected to explain most of what is left.
 
-    Starts are coarse: a candidate with a quarter of the largest expected gain may still win.
+    Starts are coarse: a candidate with a quarter of the largest expected gain may still win, and
+    whoever brings an effect wants it fitted.
     """
     others = [c for kind, c in candidates.items() if kind not in before.kinds]
     over_cores(misfit.start_changes, others)  # many short programs
@@ -221,7 +222,8 @@ def _promising(
     few = 4.0  # of χ², that is worth a fit; beyond the first eight such a share of the largest
     least = max(few, share * max((gain for gain, _ in changes), default=0.0))
     worth = [*[few] * 8, *[least] * len(changes)][: len(changes)]
-    return [c for (gain, c), need in zip(changes, worth, strict=True) if gain > need]
+    judged = zip(changes, worth, strict=True)
+    return [c for (gain, c), need in judged if gain > need or is_own(c.kind)]
 
 
 def _tried(
