@@ -1,14 +1,17 @@
 """Every kind of computation for members whose results are known in closed form."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 import snrmjax as sj
 from snrmjax.numerics.facts import Fact
 from snrmjax.report.study.study_report import members_ended
+from snrmjax.simulate.solutions.forced_response import _summary
 from snrmjax.study.analysis.digest import digest
 from snrmjax.study.computations.base import MemberStatus
-from snrmjax.study.computations.responses import velocity_bounds
+from snrmjax.study.computations.responses import peak_status, velocity_bounds
 
 from .conftest import OMEGA, PARTICIPATION, SHAPE, InThisProcess
 
@@ -153,6 +156,19 @@ def test_a_range_without_the_resonance_has_a_status_of_its_own(linear_model, tmp
     row = next(s for s in found.summaries if s.scalar.name == "peak_frequency_hz")
     assert (row.members, row.missing, row.below, row.above) == (3, 0, 1, 1)
     assert row.quantiles[[0, 2, 4]].tolist() == [-np.inf, data.peak_frequency_hz[0], np.inf]
+
+
+def test_a_response_that_is_highest_where_no_peak_was_located_has_no_peak(linear_model):
+    """Its peak forgotten, a resonance curve is highest at an unnamed point all the same."""
+    (whole,) = sj.forced_response(linear_model, 0.5, 0.8 * OMEGA, 1.2 * OMEGA, harmonic_order=1)
+    assert peak_status([whole], "upper_end") == "upper_end"
+    events = tuple("" if kind == "peak" else kind for kind in whole.event)
+    forgotten = dataclasses.replace(whole, event=events)
+    assert peak_status([forgotten], "upper_end") == MemberStatus.PEAK_NOT_LOCATED
+    for curve, missed in ((whole, 0), (forgotten, 1)):
+        row = _summary((curve,))
+        assert row["n_not_located"] == missed
+        assert bool(np.isnan(row["peak_velocity"])) == bool(missed)
 
 
 def test_a_peak_below_the_response_at_the_end_of_the_range_is_not_the_highest(tmp_path):

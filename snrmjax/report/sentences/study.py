@@ -97,6 +97,10 @@ SENTENCES: dict[str, Wording] = {
         "highest peak (status highest_at_range_end): widen the range, or narrow it to leave the "
         "other resonance out"
     ),
+    "peak_not_located": (
+        "{n_members:#member} with a response whose peak is there but was not located (status "
+        "peak_not_located), and which have no peak: take more harmonics"
+    ),
     "rows_without_value": (
         "{output} has no value in {share:%.2g} of the rows: its indices are of the others alone"
     ),

@@ -173,6 +173,9 @@ def _summary(parts: tuple[ResponseCurve, ...]) -> dict[str, float]:
                 velocity = float(np.abs(part.velocity[k, 1, 0]))
                 if not velocity <= height:
                     best[kind], height = (float(part.frequency[k]), velocity), velocity
+    n_not_located = sum(len(part.not_located) for part in parts)
+    if has_higher_point(parts, best["peak"][1]):
+        best["peak"], n_not_located = (np.nan, np.nan), n_not_located + 1
     # A second branch that stopped early is the member's failure too.
     stopped = [part.status for part in parts if part.status not in _WHOLE]
     return {
@@ -183,8 +186,22 @@ def _summary(parts: tuple[ResponseCurve, ...]) -> dict[str, float]:
         "resonance_frequency": best["phase_resonance"][0],
         "resonance_velocity": best["phase_resonance"][1],
         "n_folds": sum(part.at_events("fold").size for part in parts),
-        "n_not_located": sum(len(part.not_located) for part in parts),
+        "n_not_located": n_not_located,
     }
+
+
+def has_higher_point(parts: Sequence[ResponseCurve], peak: float) -> bool:
+    """Whether curves are highest between their ends, and higher than the highest `peak` of them.
+
+    That is the velocity (m/s), NaN where there is none. A peak is there then that was not located.
+    """
+    for part in parts:
+        speed = np.abs(part.velocity[:, 1, 0])
+        k = int(np.argmax(speed)) if len(speed) else 0
+        inside = 0 < k < len(speed) - 1
+        if inside and not speed[k] <= peak * (1 + 1e-6):
+            return True
+    return False
 
 
 def _chunk_of_curves(

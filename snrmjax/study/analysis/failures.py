@@ -51,6 +51,9 @@ class Failures(NamedTuple):
         if MemberStatus.HIGHEST_AT_END in counts:
             n_members = counts[MemberStatus.HIGHEST_AT_END]
             facts.append(Fact("highest_at_range_end", n_members=n_members))
+        if MemberStatus.PEAK_NOT_LOCATED in counts:
+            n_members = counts[MemberStatus.PEAK_NOT_LOCATED]
+            facts.append(Fact("peak_not_located", n_members=n_members))
         return tuple(facts)
 
 

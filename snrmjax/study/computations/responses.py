@@ -10,7 +10,11 @@ from jaxtyping import Bool, Float, Int
 from snrmjax.simulate.balance.labelled import HERTZ
 from snrmjax.simulate.continuation.continuation import CurveStatus
 from snrmjax.simulate.continuation.response_curve import ResponseCurve
-from snrmjax.simulate.solutions.forced_response import ResponseSettings, forced_response_batch
+from snrmjax.simulate.solutions.forced_response import (
+    ResponseSettings,
+    forced_response_batch,
+    has_higher_point,
+)
 from snrmjax.study.computations.base import (
     COMPLETE,
     PEAK_SIDE,
@@ -95,7 +99,8 @@ class Peaks(AbstractResponses):
 
     A member whose response has no peak between the ends of the range has the status
     `no_peak_in_range`; one whose response is higher at an end than at its highest peak has
-    `highest_at_range_end`: the resonance lies outside, and a wider range would have it.
+    `highest_at_range_end`: the resonance lies outside, and a wider range would have it. One that is
+    higher somewhere between its ends has `peak_not_located`, and no peak.
 
     `forces` in N; None: `force_n` varies. With `grid_points` also the highest and the lowest
     velocity of the response at that many frequencies: what the response bands of a report are made
@@ -194,10 +199,12 @@ def peak_status(curves: Sequence[ResponseCurve], status: str) -> str:
         return status
     speed = [np.abs(curve.velocity[:, 1, 0]) for curve in curves]
     peaks = [v[one.at_events("peak")] for v, one in zip(speed, curves, strict=True)]
-    highest = max(np.concatenate(peaks), default=None)
-    if highest is None:
-        missed = any("peak" in curve.not_located for curve in curves)
-        return MemberStatus.PEAK_NOT_LOCATED if missed else MemberStatus.NO_PEAK
+    highest = max(np.concatenate(peaks), default=np.nan)
+    missed = np.isnan(highest) and any("peak" in curve.not_located for curve in curves)
+    if missed or has_higher_point(curves, highest):
+        return MemberStatus.PEAK_NOT_LOCATED
+    if np.isnan(highest):
+        return MemberStatus.NO_PEAK
     open_ended = [v for v, c in zip(speed, curves, strict=True) if c.status != CurveStatus.CLOSED]
     at_ends = max((max(v[0], v[-1]) for v in open_ended), default=0.0)
     return MemberStatus.HIGHEST_AT_END if at_ends > highest else status
