@@ -20,7 +20,7 @@ from snrmjax.doctor.priors import (
     FITS_WELL,
     GAIN_MATTERS,
     MOVED_MATTERS,
-    OTHER_GAIN,
+    OTHER_RANGE,
 )
 from snrmjax.doctor.readings import OPPOSITE, best_reading, misread
 from snrmjax.doctor.record_checks import record_findings
@@ -165,9 +165,7 @@ def _matters(one: TestCorrection, base: Judged) -> bool:
     if one.kind == "volts_as_force":
         gains = np.array(one.gains)
         off = np.sort(np.abs(gains - np.median(gains)))
-        # Several levels on other ranges, by ten and more, are no states that one mode explains:
-        # steep damping, as of friction, is flattened by such gains.
-        flattened = base.fits and off[-2] > 6 * OTHER_GAIN
+        flattened = base.fits and off[-2] > OTHER_RANGE
         return float(np.ptp(gains)) > GAIN_MATTERS and not flattened
     # A force that lies within the noise of its cell is none.
     return one.kind != "force_dropout" or one.value < base.states.force.min()

@@ -36,6 +36,10 @@ joints run in, masses are added or a room warms up."""
 OTHER_GAIN = 0.4
 """1σ of the force's gain of a level on another range, or in volts."""
 
+OTHER_RANGE = 2.4
+"""|ln| of a gain, beyond a range's factor of ten, that two levels do not have where one mode fits
+them as recorded: such gains flatten steep damping, as of dry friction."""
+
 OTHER_SCALE = 0.125
 """|ln κ| from which on a modal mass is no linear test's: 2.5 times its 5 %."""
 

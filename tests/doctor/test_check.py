@@ -5,11 +5,11 @@ import json
 import numpy as np
 import pytest
 from scipy.signal import lsim
-from truths.one_mode import CUBIC, OMEGA, SHAPE, ZETA, model, noisy, states, table
+from truths.one_mode import CUBIC, OMEGA, SHAPE, ZETA, model, noisy, rubbing_test, states, table
 
 import snrmjax as sj
 from snrmjax.cli import app
-from snrmjax.measure import Channel, steady_states, time_recording
+from snrmjax.measure import Channel, time_recording
 
 
 def wrapped(v):
@@ -183,25 +183,7 @@ def test_files_of_two_structures_are_told_apart(ratio):
 
 def test_friction_is_no_wrong_scale_of_forces():
     """Damping that falls as 1/a, exactly: without a model no force looks like volts for it."""
-    rng, rows = np.random.default_rng(3), []
-    for level, force in enumerate((0.05, 0.2, 0.8, 2.0, 4.0)):
-        phase = np.radians(np.linspace(-70, 70, 17))
-        # F cos φ = 2ζω₀m v + (8/3π) q v² + 4R/π: the balance of one harmonic in phase with v.
-        viscous, square, slip = 2 * 0.004 * 295.31 * 1.8, 8 * 4.0 / (3 * np.pi), 4 * 0.02 / np.pi
-        part = np.maximum(force * np.cos(phase) - slip, 0)
-        v = (np.sqrt(viscous**2 + 4 * square * part) - viscous) / (2 * square)
-        keep = v > 1e-4
-        phase, v, w = phase[keep], v[keep], np.full(keep.sum(), 295.31)
-        for _ in range(200):  # F sin φ = (k(a) − m w²) v/w
-            stiffness = 1.8 * 295.31**2 + 0.75 * 4e9 * (v / w) ** 2
-            s = -force * np.sin(phase) / v
-            w = (s + np.sqrt(s**2 + 4 * 1.8 * stiffness)) / 3.6
-        rows.append((np.full(len(v), level), w, np.full(len(v), force), v * np.exp(1j * phase)))
-    level, w, force, v = (np.concatenate(one) for one in zip(*rows, strict=True))
-    force = force * np.exp(0.004 * rng.normal(size=len(v)))
-    v = v * np.exp(0.004 * (rng.normal(size=len(v)) + 1j * rng.normal(size=len(v))))
-    data = steady_states(level + 1, w, force, v, sensors=("tip",))
-    assert sj.doctor.check_test(data).kinds == ()
+    assert sj.doctor.check_test(rubbing_test(3)).kinds == ()
 
 
 def harmonic_table(ratio):
