@@ -1,13 +1,20 @@
 """What the commands say on standard error, and how they end."""
 
+import logging
+import os
+import signal
+import socket
+import threading
+import time
 import traceback
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
-from snrmjax.report.writing import page_of
+from snrmjax.report.writing import discard_unfinished, page_of
 
 SITE_PAGES = "notebooks/site/pages"  # of the repository; the site has no public address yet
 _FORMATS, _IMPORT = ("File formats", "formats"), ("Import a laboratory's files", "how-to/import")
@@ -35,6 +42,10 @@ PAGES = {
     "io.calculix": _REDUCED,
     "study": ("Run a study of 1 000 members", "how-to/study"),
 }
+
+INTERRUPTED = 130  # the exit code of a process that ended on Ctrl-C, as shells have it
+_PATIENCE = 0.5  # s after Ctrl-C in which a command may end by itself
+_QUIET = 5.0  # s of work before the first line, and at least between two lines
 
 console = Console(stderr=True, highlight=False, soft_wrap=True)
 
@@ -80,3 +91,64 @@ def tell(result: Any, notes: Iterable[object] | None = None) -> None:
 def written(out: Path, page: str = "report.html") -> None:
     """Where the results are."""
     say(f"written to {out}: open {out / page}" if page else f"written to {out}")
+
+
+class _Latest(logging.Handler):
+    """The last message that the package logged."""
+
+    message = ""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.message = record.getMessage()
+
+
+@contextmanager
+def supervised() -> Iterator[None]:
+    """Report the stage of a command every few seconds, and end it soon after Ctrl-C.
+
+    Python raises `KeyboardInterrupt` only once the main thread is back from a compiled program,
+    which may take minutes, and then waits for the other threads' programs. So a thread of its own
+    learns of the signal and, where the command has not ended by itself, removes what it has
+    written so far and ends the process.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield  # signals are the main thread's
+        return
+    logger, latest = logging.getLogger("snrmjax"), _Latest(logging.INFO)
+    logger.addHandler(latest)
+    logger.setLevel(logging.INFO)
+    logger.propagate = False  # stages are no warnings: JAX's handlers would print them again
+    hears, told = socket.socketpair()
+    told.setblocking(False)
+    former = signal.set_wakeup_fd(told.fileno(), warn_on_full_buffer=False)
+    threading.Thread(target=_supervise, args=(hears, latest), daemon=True).start()
+    try:
+        yield
+    finally:
+        signal.set_wakeup_fd(former)
+        told.close()
+        logger.removeHandler(latest)
+
+
+def _supervise(hears: socket.socket, latest: _Latest) -> None:
+    hears.settimeout(_QUIET)
+    began, said = time.monotonic(), ""
+    while True:
+        try:
+            received = hears.recv(1)
+        except TimeoutError:
+            if latest.message and latest.message != said:
+                said = latest.message
+                say(f"{time.monotonic() - began:.0f} s: {said} …")
+            continue
+        if not received:
+            return
+        if received[0] == signal.SIGINT:
+            break
+    time.sleep(_PATIENCE)
+    try:
+        discard_unfinished()
+        console.show_cursor(True)
+        say("stopped.")
+    finally:
+        os._exit(INTERRUPTED)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from snrmjax.cli.console import console, say, warn
+from snrmjax.cli.console import INTERRUPTED, console, say, warn
 from snrmjax.cli.options import FILES, Out, add_command, asked_for, with_options
 from snrmjax.pipelines.options import option
 from snrmjax.report.writing import staged
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from snrmjax.study.study import Study
 
 _QUIET_SECONDS = 30.0  # between lines of progress in a log
-_INTERRUPTED = 130
+
 _ROWS_SAID = 12  # of the summary on the screen
 
 study_app = typer.Typer(
@@ -108,7 +108,7 @@ def run(
             )
     except KeyboardInterrupt:
         warn("stopped; the same command continues.")
-        sys.exit(_INTERRUPTED)
+        sys.exit(INTERRUPTED)
     except ClusterGone as error:
         warn(f"{error}; what is done stays, and the same command continues with a new one.")
         sys.exit(1)

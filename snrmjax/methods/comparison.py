@@ -1,5 +1,6 @@
 """The methods that tables of steady states and time records allow, side by side."""
 
+import logging
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -30,6 +31,8 @@ from snrmjax.methods.steady.phase_resonance import phase_resonance
 from snrmjax.methods.steady.rct import rct
 from snrmjax.model.modes import LinearModes
 from snrmjax.numerics.facts import Fact
+
+_log = logging.getLogger(__name__)
 
 _SAMPLES = 41  # of the curves that the inverse method gives
 
@@ -146,6 +149,7 @@ def compare_methods(
     stopped: dict[str, str] = {}
     absent: dict[str, str] = {}  # methods without data of their kind
     for name in names:
+        _log.info("runs the method %s", name)
         if name in RECORD_METHODS:
             found = run_record_method(name, read.tests, modes)
             if found.result is not None:

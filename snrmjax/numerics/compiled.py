@@ -1,5 +1,6 @@
 """Programs of many small steps, compiled to run one step after the other."""
 
+import warnings
 from collections.abc import Callable
 from functools import cache, wraps
 from threading import Lock
@@ -14,6 +15,15 @@ from snrmjax.numerics.kept_programs import NotKept, ProgramKeeper, program_keepe
 P = ParamSpec("P")
 R = TypeVar("R")
 T = TypeVar("T")
+
+# pyproject.toml excludes them; who installs one all the same learns why a program stands still.
+if (0, 10) <= jax.__version_info__ < (0, 11, 1):
+    warnings.warn(
+        f"jax {jax.__version__} can stand still for ever in batched linear algebra on a CPU: "
+        "install 0.9.2, or 0.11.1 or newer.",
+        RuntimeWarning,
+        stacklevel=2,
+    )
 
 _EMITTERS = "xla_cpu_use_fusion_emitters"
 _LEVEL = "xla_backend_optimization_level"

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import logging
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -42,6 +43,8 @@ from snrmjax.pipelines.predictions import (
 )
 from snrmjax.simulate.solutions.forced_response import ResponseCurve
 from snrmjax.simulate.solutions.normal_modes import NormalModeBranch
+
+_log = logging.getLogger(__name__)
 
 BACKBONE_POINTS = 200
 """Amplitudes at which curves are written."""
@@ -164,6 +167,7 @@ def _by_joint_fit(data: SteadyStates, model: Structure, options: IdentifyOptions
         damping=names[1] if len(names) == 2 else "auto",
         free=[name for several in options.free for name in several.split(",")],
     )
+    _log.info("fits backbone and damping curves to %d states", len(data.frequency))
     fit = fitted(robust=options.robust)
     # Curves that outliers have bent may miss other states: a fit in which they weigh little tells.
     telling = fit if options.robust or not outlying_states(fit).size else fitted(robust=True)
@@ -171,6 +175,7 @@ def _by_joint_fit(data: SteadyStates, model: Structure, options: IdentifyOptions
     data = corrected_states(data, fit)
     found = identification_of_fit(data, fit)
     predictions, trends = predictions_of_fit(fit, options)
+    _log.info("compares further measurements")
     advice = next_measurements(fit, options.further) if options.further else None
     doubts = () if "force_gain" in fit.names() else doubt(data, model, found.points)
     reach = np.linspace(0.0, reach_of(options) if predictions else 1.0, _LOOKED_AT) * fit.largest[0]

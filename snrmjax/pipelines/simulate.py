@@ -1,5 +1,6 @@
 """Simulation of a model: responses and nonlinear normal mode, with what they do not show."""
 
+import logging
 from collections.abc import Callable, Iterator, Sequence
 from typing import Literal, NamedTuple
 
@@ -25,6 +26,8 @@ from snrmjax.simulate.solutions.quasi_periodic import (
     check_quasi_periodic,
     quasi_periodic_branch,
 )
+
+_log = logging.getLogger(__name__)
 
 _TRUNCATED = 0.02  # share of the velocity that harmonics left out may have, without a note
 _SAME_EVENT = 1e-6  # of the frequency, between an event of a response and a curve of events
@@ -90,6 +93,7 @@ def simulate_responses(
         main = forced_response(model, [force], *ends, harmonic_order=harmonics)
         mine = [*main]
         if isolated:
+            _log.info("searches for isolated responses at %g %s", force, model.modes.force_unit)
             further = isolated_responses(model, force, *ends, known=main, settings=settings)
             mine += further
             notes.append(
@@ -115,6 +119,7 @@ def simulate_responses(
     events: list[EventCurve] = []
     if to is not None:
         for kind in follow:
+            _log.info("follows the events %s over %s", kind, parameter)
             found = _followed(model, curves, kind, parameter, to)
             notes += [] if found else [Fact("no_event_to_follow", event=kind)]
             events += found
@@ -134,6 +139,7 @@ def _tori(
     found: list[QuasiPeriodicBranch] = []
     notes: list[Fact] = []
     places = [(curve, k) for curve in curves for k in curve.at_events("neimark_sacker")]
+    _log.info("follows quasi-periodic motions from %d Neimark-Sacker points", len(places))
     for curve, k in places:
         frequency = float(curve.frequency[k])
         if any(b.force == curve.force and b.ends_at(frequency) for b in found):

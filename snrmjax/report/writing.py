@@ -4,7 +4,7 @@ import importlib
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
@@ -12,6 +12,7 @@ from typing import Any
 
 from snrmjax.io.files import FilePath
 
+_unfinished: list[Callable[[], None]] = []  # how to remove each folder that is being written
 # By the names of classes: no page is imported before there is a result of it.
 _PAGES = {
     "Checkup": "checkup",
@@ -63,6 +64,14 @@ def staged(out: Path) -> Iterator[Path]:
     except OSError as error:
         raise ValueError(f"--out {out} cannot be written: {error.strerror}.") from error
     done = False
+
+    def discard() -> None:
+        shutil.rmtree(staging)
+        if not done:
+            for folder in made:
+                folder.rmdir()
+
+    _unfinished.append(discard)
     try:
         yield staging
         for file in sorted(one for one in staging.rglob("*") if one.is_file()):
@@ -71,7 +80,11 @@ def staged(out: Path) -> Iterator[Path]:
             os.replace(file, target)
         done = True
     finally:
-        shutil.rmtree(staging)
-        if not done:
-            for folder in made:
-                folder.rmdir()
+        _unfinished.remove(discard)
+        discard()
+
+
+def discard_unfinished() -> None:
+    """Remove what is staged and not yet in its place: for a process that ends at once."""
+    while _unfinished:
+        _unfinished.pop()()

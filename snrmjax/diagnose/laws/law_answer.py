@@ -1,6 +1,7 @@
 """Where no effect of the library explains the data, an answer by a law that is drawn from them."""
 
 import dataclasses
+import logging
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -37,6 +38,8 @@ from snrmjax.model.parameters import with_parameters
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.facts import Fact
 
+_log = logging.getLogger(__name__)
+
 
 class LawAnswer(NamedTuple):
     """A law that passed all checks, and what it makes of the model."""
@@ -63,6 +66,7 @@ def law_answer(found: FoundEffects, model: Structure) -> LawAnswer | None:
     others that was left out of the fit is predicted; and where the effects do not fit, its evidence
     must be better than theirs.
     """
+    _log.info("draws a force law from the data")
     try:
         fit = fit_laws(found.misfit)
     except np.linalg.LinAlgError:  # errors as a law passes them on leave nothing that was measured

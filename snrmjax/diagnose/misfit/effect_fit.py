@@ -7,6 +7,7 @@ priors (orthogonal distance regression: Boggs, Byrd & Schnabel, doi:10.1137/0908
 """
 
 import dataclasses
+import logging
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -20,6 +21,8 @@ from snrmjax.diagnose.misfit.weighted_misfit import ErrorPropagation, WeightedMi
 from snrmjax.measure.states import SteadyStates
 from snrmjax.numerics.blocks import over_cores
 from snrmjax.numerics.levenberg_marquardt import MinimisationStatus, StepRule, minimise
+
+_log = logging.getLogger(__name__)
 
 # Of a fit: an evaluation costs many motions, and rivals far behind need not be known to digits.
 _RULE = StepRule(
@@ -168,6 +171,8 @@ def fit_effects(
     hopeless: float = np.inf,
 ) -> list[EffectFit]:
     """The best fit of every candidate beside what was fitted before, over the cores."""
+    kinds = " and ".join(jobs[0][1].kinds) if jobs else ""
+    _log.info("fits %d effects%s", len(jobs), f" in addition to {kinds}" if kinds else "")
     return over_cores(lambda job: fit_effect(misfit, *job, hopeless), jobs)
 
 
