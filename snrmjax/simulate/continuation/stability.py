@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
 from snrmjax.model.structures import Structure
-from snrmjax.numerics.blocks import by_member, mapped, stacked
+from snrmjax.numerics.blocks import by_member, mapped, on_one_core, stacked
 from snrmjax.numerics.compiled import compiled
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance
 from snrmjax.simulate.continuation.monodromy import monodromy
@@ -24,6 +24,7 @@ class Stability(IntEnum):
     STABLE = 1
 
 
+@on_one_core
 def floquet_multipliers(
     model: Structure,
     coefficients: Float[Array | np.ndarray, "point coefficient mode"],

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from snrmjax.model.elements import elements_of
 from snrmjax.model.structures import Structure, linear_terms_of, simulated_structure
+from snrmjax.numerics.blocks import on_one_core
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.result import quantity
 from snrmjax.simulate.balance.given_numbers import frequency_range, positive
@@ -55,6 +56,7 @@ class ControlledCurve(MotionCurve):
     force: Float[np.ndarray, " point"] = quantity("point", "N", "force amplitude")
 
 
+@on_one_core
 def damped_normal_mode(
     model: Structure,
     largest_velocity: float,
@@ -154,6 +156,7 @@ def _trace_damped(
     return trace_curve(linearised, start, outward, within, steps, start_across=outward)
 
 
+@on_one_core
 def phase_controlled(
     model: Structure,
     largest_force: float,
@@ -222,6 +225,7 @@ def _trace_phase(
     return trace_curve(linearised, start, rising, CurveRange(lower=0.0, upper=1.0), steps)
 
 
+@on_one_core
 def response_controlled(
     model: Structure,
     velocity: float,

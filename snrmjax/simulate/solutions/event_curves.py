@@ -8,6 +8,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from snrmjax.model.parameters import checked_names, parameter_unit, parameter_value
 from snrmjax.model.structures import Structure, simulated_structure
+from snrmjax.numerics.blocks import on_one_core
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.result import Variable, quantity, setting
 from snrmjax.numerics.status import Status
@@ -139,6 +140,7 @@ class EventCurve(MotionCurve):
         ]
 
 
+@on_one_core
 def follow_event(
     model: Structure,
     force: float,
@@ -214,6 +216,7 @@ def follow_event(
     )
 
 
+@on_one_core
 def starts_beside_folds(model: Structure, folds: EventCurve, value: float) -> list[Start]:
     """Motions beside the folds at one value of a fold curve's parameter, for `IsolatedSearch`.
 

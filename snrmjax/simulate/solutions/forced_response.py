@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from snrmjax.model.structures import Structure, simulated_structure
-from snrmjax.numerics.blocks import mapped, taken
+from snrmjax.numerics.blocks import mapped, on_one_core, taken
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.lanes import lanes_for
 from snrmjax.numerics.result import AbstractResult, quantity
@@ -37,6 +37,7 @@ class ResponseSettings(eqx.Module):
 DEFAULT_SETTINGS = ResponseSettings()
 
 
+@on_one_core
 def forced_response(
     model: Structure,
     forces: float | Sequence[float] | Float[ArrayLike, " force"],
@@ -105,6 +106,7 @@ class ResponseBatch(AbstractResult):
     n_not_located: Int[np.ndarray, " member"] = quantity("member", "1", "events not located")
 
 
+@on_one_core
 def forced_response_batch(
     models: Structure | Sequence[Structure],
     forces: float | Sequence[float] | Float[ArrayLike, " member"],
@@ -308,6 +310,7 @@ def _no_curve(model: Structure, force: float, harmonic_order: int) -> ResponseCu
     )
 
 
+@on_one_core
 def solve_at_frequency(
     model: Structure,
     force: float | Float[ArrayLike, "*state"],

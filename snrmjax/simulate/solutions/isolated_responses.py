@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from snrmjax.model.structures import Structure, equilibria, simulated_structure
-from snrmjax.numerics.blocks import as_arrays, padded, taken
+from snrmjax.numerics.blocks import as_arrays, on_one_core, padded, taken
 from snrmjax.numerics.result import AbstractResult, Variable, setting
 from snrmjax.simulate.balance.given_numbers import frequency_range, positive
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, linear_coefficients
@@ -91,6 +91,7 @@ class IsolatedResponses(AbstractResult):
         }
 
 
+@on_one_core
 def isolated_responses(
     model: Structure,
     force: float,

@@ -9,7 +9,7 @@ from jaxtyping import Array, ArrayLike, Float
 from snrmjax.model.effect_base import AbstractHysteresis
 from snrmjax.model.modes import have_values
 from snrmjax.model.structures import Structure, simulated_structure
-from snrmjax.numerics.blocks import mapped
+from snrmjax.numerics.blocks import mapped, on_one_core
 from snrmjax.numerics.compiled import jitted
 from snrmjax.simulate.balance.given_numbers import positive
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, harmonic_balance
@@ -21,6 +21,7 @@ _LATE = 0.5  # correction over step beyond which the step may have gone to anoth
 _TURN = 0.2  # of the frequency, likewise
 
 
+@on_one_core
 def normal_mode_at_velocities(
     model: Structure,
     velocities: float | Float[ArrayLike, " velocity"],

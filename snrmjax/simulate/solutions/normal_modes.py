@@ -16,7 +16,7 @@ from snrmjax.model.structures import (
     linear_terms_of,
     simulated_structure,
 )
-from snrmjax.numerics.blocks import by_blocks
+from snrmjax.numerics.blocks import by_blocks, on_one_core
 from snrmjax.numerics.compiled import as_numpy, compiled
 from snrmjax.numerics.result import quantity
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, harmonic_balance
@@ -90,6 +90,7 @@ class NormalModeBranch(MotionCurve):
         )
 
 
+@on_one_core
 def nonlinear_normal_mode(
     model: Structure,
     to_frequency: float,

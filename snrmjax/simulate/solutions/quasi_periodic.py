@@ -9,6 +9,7 @@ from jaxtyping import Array, Complex, Float
 
 from snrmjax.model.moving_base import BaseMotion
 from snrmjax.model.structures import Structure, simulated_structure
+from snrmjax.numerics.blocks import on_one_core
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.result import AbstractResult, quantity, setting
 from snrmjax.numerics.status import Status
@@ -112,6 +113,7 @@ class QuasiPeriodicBranch(AbstractResult):
         )
 
 
+@on_one_core
 def quasi_periodic_branch(
     model: Structure,
     response: ResponseCurve,

@@ -1,11 +1,14 @@
 """Forced responses against linear formulas, closed orbits in time, and the paper's numbers."""
 
+import sys
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.optimize import brentq
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from snrmjax.model.effect_base import AbstractMemoryless
 from snrmjax.model.effects import EFFECTS, make_effect
@@ -435,3 +438,22 @@ def test_damping_by_an_effect_alone_limits_a_resonance():
     wanted = np.sqrt(0.2 * 1.5 * 3 * np.pi / (8 * 0.6))
     assert np.abs(curve.velocity[k, 1, 0]) == pytest.approx(wanted, rel=2e-3)
     assert np.abs(curve.velocity[:, 1, 0]).max() == pytest.approx(wanted, rel=2e-3)
+
+
+def test_curves_use_one_thread_of_blas_and_leave_its_setting(monkeypatch):
+    """More wait for each other at full speed: 185 unknowns took 26 times the CPU time."""
+
+    def threads() -> set[int]:
+        return {one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas"}
+
+    module, seen = sys.modules[sj.forced_response.__module__], []
+    traced = module.trace_from_rest
+    monkeypatch.setattr(
+        module, "trace_from_rest", lambda *a, **k: seen.append(threads()) or traced(*a, **k)
+    )
+    with threadpool_limits(2, "blas"):
+        sj.forced_response(sj.model.flat_beam(), [2e-4], 480.0, 520.0, harmonic_order=1)
+        left = threads()
+    assert seen
+    assert all(found == {1} for found in seen)
+    assert left == {2}
