@@ -47,6 +47,9 @@ from snrmjax.numerics.rendering import shown_by
 # Before any array is made: earlier ones would be float32. JAX reads the variable as it is imported;
 # to import it here would cost `snrmjax --help` two thirds of its time.
 os.environ["JAX_ENABLE_X64"] = "1"
+# Up to jaxlib 0.9, XLA reports each program that is read back from disk as an error, because of
+# preferences of its compiler that it takes for features of the processor.
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 if "jax" in sys.modules:
     import jax
 

@@ -98,9 +98,6 @@ def main() -> None:
     # Whole responses take a graphics processor many times as long as a CPU's core, and every
     # process would take most of its memory (the site's validation page on other programs).
     os.environ.setdefault("JAX_PLATFORMS", "cpu")
-    # Up to jaxlib 0.9, XLA reports each program that is read back from disk as an error, because
-    # of preferences of its compiler that it takes for features of the processor.
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     asks_help = not {"--help", "--help-all"}.isdisjoint(sys.argv)
     if sys.argv[1:] and not asks_help:  # help does not wait for the import of JAX
         from snrmjax.io.programs.compilation_cache import use_compilation_cache

@@ -13,9 +13,12 @@ from snrmjax.model.structures import Structure, equilibria, simulated_structure
 from snrmjax.numerics.facts import Fact
 from snrmjax.simulate.continuation.continuation import CurveStatus
 from snrmjax.simulate.continuation.event_equations import FORCE, EventKind
-from snrmjax.simulate.continuation.response_curve import Branch, ResponseCurve
+from snrmjax.simulate.continuation.response_curve import (
+    Branch,
+    ResponseCurve,
+    without_stable_response,
+)
 from snrmjax.simulate.continuation.stability import Stability
-from snrmjax.simulate.solutions.branches_beyond import hidden_branches
 from snrmjax.simulate.solutions.elements_at_work import Hold, friction_hold, idle_elements
 from snrmjax.simulate.solutions.event_curves import EventCurve, follow_event
 from snrmjax.simulate.solutions.forced_response import ResponseSettings, forced_response
@@ -106,7 +109,7 @@ def simulate_responses(
                 )
             )
         notes += list(dict.fromkeys(n for curve in mine for n in _notes_on_curve(curve, hold)))
-        notes += _notes_on_force(model, mine, ends, settings)
+        notes += _notes_on_force(model, mine, ends, isolated)
         curves += mine
     if not any(len(curve.frequency) for curve in curves):
         held = [str(note) for note in notes if note.kind == "held_by_friction"]
@@ -228,28 +231,16 @@ def _sensor(model: Structure) -> str:
 
 
 def _notes_on_force(
-    model: Structure,
-    curves: Sequence[ResponseCurve],
-    ends: tuple[float, float],
-    settings: ResponseSettings,
+    model: Structure, curves: Sequence[ResponseCurve], ends: tuple[float, float], isolated: bool
 ) -> Iterator[Fact]:
-    """What the responses to one force do not show: hidden branches, and elements without effect."""
+    """Where no stable response to one force is known, and elements without effect."""
     shown, unit = [c for c in curves if len(c.frequency)], model.modes.force_unit
     if not shown:
         return
     at = {"force": curves[0].force, "unit": unit}
-    sensor = model.modes.sensors.index(_sensor(model))
-    for one in hidden_branches(model, curves, *ends, settings=settings):
-        yield Fact(
-            "hidden_branch",
-            **at,
-            begins=bool(one.found_from < ends[0]),
-            at_hz=one.at_frequency / HERTZ,
-            to_hz=one.to_frequency / HERTZ,
-            velocity=float(one.amplitude[sensor]),
-            sensor=model.modes.sensors[sensor],
-            from_hz=one.found_from / HERTZ,
-        )
+    for first, last in without_stable_response(shown, *ends):
+        hertz = {"from_hz": first / HERTZ, "to_hz": last / HERTZ}
+        yield Fact("no_stable_response", **at, **hertz, isolated=isolated)
     for idle in idle_elements(model, shown):
         yield Fact("element_idle", **at, **idle._asdict())
 

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 import snrmjax as sj
 from snrmjax.io.results import write_response
 from snrmjax.io.units import HERTZ
-from snrmjax.simulate.solutions import forced_response
+from snrmjax.simulate.solutions import forced_response, from_rest
 
 FORCE, ENDS = 0.12, (1.0, 4.0)
 
@@ -220,13 +220,13 @@ def test_a_branch_that_has_no_start_is_named(monkeypatch):
     # Stiffening carries the resonance beyond the upper end, where the low branch comes in.
     ends, settings = (1.0, 2.15), {"harmonic_order": 3, "stability": False}
     assert len(sj.forced_response(oscillator(), FORCE, *ends, **settings)) == 2
-    plain = forced_response.trace_from_rest
+    plain = from_rest.trace_from_rest
 
     def upward_only(*arguments, downward, **named):
         traced = plain(*arguments, downward=downward, **named)
         empty = {"points": np.zeros((0, 8)), "status": sj.simulate.CurveStatus.NO_START}
         return [one._replace(**empty) for one in traced] if downward else traced
 
-    monkeypatch.setattr(forced_response, "trace_from_rest", upward_only)
+    monkeypatch.setattr(from_rest, "trace_from_rest", upward_only)
     (curve,) = sj.forced_response(oscillator(), FORCE, *ends, **settings)
     assert curve.not_located == ("branch",)

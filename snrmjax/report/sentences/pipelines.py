@@ -28,21 +28,13 @@ def _load(force: float, drive: float | None, at: str | None = None, unit: str = 
     return newtons if at is None else f"{newtons} at {at}"
 
 
-def _hidden_branch(
-    force: float,
-    unit: str,
-    begins: bool,
-    at_hz: float,
-    to_hz: float,
-    velocity: float,
-    sensor: str,
-    from_hz: float,
+def _no_stable_response(
+    force: float, unit: str, from_hz: float, to_hz: float, isolated: bool
 ) -> str:
-    end, option = ("begins", "--from-hz") if begins else ("ends", "--to-hz")
+    further = "" if isolated else "; `--isolated` searches for further responses"
     return (
-        f"force {force:g} {unit}: the range {end} inside a hysteresis: another stable response, of "
-        f"{velocity:.4g} m/s at {sensor} at {at_hz:.5g} Hz and on to {to_hz:.5g} Hz, is not shown; "
-        f"`{option} {from_hz:.4g}` shows both (traced from there)."
+        f"force {force:g} {unit}: no stable response with the period of the force was found from "
+        f"{from_hz:.5g} to {to_hz:.5g} Hz: a sweep leaves the curves there{further}."
     )
 
 
@@ -137,7 +129,7 @@ SENTENCES: dict[str, Wording] = {
         "leave it there"
     ),
     "mode_not_followed": _not_followed,
-    "hidden_branch": _hidden_branch,
+    "no_stable_response": _no_stable_response,
     "element_idle": _element_idle,
     "held_by_friction": _held,
     "curve_ended": _ended,

@@ -66,24 +66,45 @@ def trace_from_rest(
     lanes: int,
     *,
     downward: bool,
-    ramp: bool = False,
+    starts: Float[np.ndarray, "member unknown"] | None = None,
 ) -> list[TracedCurve]:
-    """The curves of the members `index`, so many side by side.
+    """The curves of the members `index` from an end of the range (rad/s), so many side by side.
 
-    From the linear response at an end of the range (rad/s), or with `ramp` from the response to a
-    force that rises from zero at the lower end; that leads nowhere where the start is NaN.
+    From the scaled `starts` (NaN leads nowhere), by default from the linear response.
     """
     if not len(index):
         return []
-    mine, starts = taken(balances, index), None
-    if ramp:
-        risen = _walked(mine, ends, steps, None, lanes, downward=downward, way="rising")
-        starts = np.full((len(index), balances.size + 1), np.nan)
-        for start, curve in zip(starts, risen, strict=True):
-            if curve.status == CurveStatus.UPPER_END:
-                start[:-1] = curve.points[-1, :-1]
-        starts[:, -1] = ends[0] / np.asarray(mine.frequency_scale)
-    return _walked(mine, ends, steps, starts, lanes, downward=downward)
+    return _walked(taken(balances, index), ends, steps, starts, lanes, downward=downward)
+
+
+def under_rising_force(
+    balances: HarmonicBalance,
+    index: np.ndarray,
+    end: float,
+    steps: StepControl,
+    lanes: int,
+    *,
+    rest: Float[np.ndarray, "member mode"] | None = None,
+) -> Float[np.ndarray, "member unknown"]:
+    """Where motions of the members `index` arrive as the force rises from zero, scaled.
+
+    At the frequency `end` (rad/s), from the equilibria at `rest` (kg^1/2 m), by default from zero.
+    NaN where the curve over the force turns back to none.
+    """
+    mine = taken(balances, index)
+    starts = np.full((len(index), balances.size + 1), np.nan)
+    if not len(index):
+        return starts
+    begins = np.zeros_like(starts)
+    if rest is not None:  # the mean comes first among the coefficients
+        begins[:, : rest.shape[1]] = rest / np.asarray(mine.displacement_scale)[:, None]
+    at = np.array([end, end])
+    risen = _walked(mine, at, steps, begins, lanes, downward=False, way="rising")
+    for start, curve in zip(starts, risen, strict=True):
+        if curve.status == CurveStatus.UPPER_END:
+            start[:-1] = curve.points[-1, :-1]
+    starts[:, -1] = end / np.asarray(mine.frequency_scale)
+    return starts
 
 
 def trace_through(
@@ -109,7 +130,7 @@ def _walked(
     downward: bool,
     way: _Way = "from_end",
 ) -> list[TracedCurve]:
-    """Curves from given starts, or from the linear response; or under a rising force."""
+    """Curves from given starts, or from the linear response; or over a rising force."""
     walk = (np.asarray(ends), steps, np.array(downward))
     further, length = (_advanced_alone, _ALONE) if lanes == 1 else (_advanced_together, TOGETHER)
 
@@ -147,9 +168,7 @@ def _tracer(balance: HarmonicBalance, ends: Array, steps: StepControl, way: _Way
 def _first(job: tuple, ends: Array, steps: StepControl, downward: Array, way: _Way) -> Tracing:
     """The walk of one job before its first point."""
     balance, start = job
-    if way == "rising":
-        start = jnp.zeros(balance.size + 1)
-    elif start is None:
+    if start is None:
         begin = jnp.where(downward, ends[1], ends[0])
         order = balance.harmonic_order
         linear = linear_coefficients(balance.model, balance.force, begin, order)

@@ -30,6 +30,8 @@ from snrmjax.simulate.continuation.stability import (
     stability_of,
 )
 
+_NARROW = 1e-4  # relative width of a gap between stable points that is no step's
+
 
 class MotionCurve(AbstractResult):
     """Periodic motions in order along a curve."""
@@ -88,7 +90,9 @@ class Branch(StrEnum):
     MAIN = "main"  # from rest
     GIVEN_START = "isolated, from a given start"
     PHASE_RESONANCE = "isolated, from a phase resonance"
-    EQUILIBRIUM = "about another equilibrium"
+    EQUILIBRIUM = "from another equilibrium"
+    BEYOND = "from beyond a resonance outside the range"
+    REST = "isolated, from a motion about rest"
     RANDOM_START = "isolated, from a random start"
 
 
@@ -242,3 +246,27 @@ def _truncation_errors(
         return np.zeros(0)
     coefficients, frequency = balances.motions(points, owner)
     return by_member(_truncations, balances, owner, coefficients, frequency)
+
+
+def without_stable_response(
+    curves: Sequence[ResponseCurve], from_frequency: float, to_frequency: float
+) -> list[tuple[float, float]]:
+    """Parts of a range (rad/s) in which no curve has a stable point.
+
+    Sweeps leave the curves there: for a response that no curve shows, or for none of the force's
+    period. Empty where the stability of a point is not known.
+    """
+    if any(np.any(curve.stability == int(Stability.NOT_COMPUTED)) for curve in curves):
+        return []
+    spans = []
+    for curve in curves:
+        stable = curve.stability == int(Stability.STABLE)
+        both = stable[1:] & stable[:-1]
+        pair = np.stack([curve.frequency[:-1], curve.frequency[1:]], axis=1)[both]
+        spans += np.sort(pair, axis=1).tolist()
+    gaps, reached = [], from_frequency
+    for first, last in [*sorted(spans), [to_frequency, to_frequency]]:
+        if first > reached * (1 + _NARROW):
+            gaps.append((reached, first))
+        reached = max(reached, last)
+    return gaps

@@ -15,11 +15,12 @@ from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.lanes import lanes_for
 from snrmjax.numerics.result import AbstractResult, quantity
 from snrmjax.simulate.balance.given_numbers import frequency_range, positive
-from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, harmonic_balance
-from snrmjax.simulate.continuation.continuation import CurveStatus, StepControl, TracedCurve
-from snrmjax.simulate.continuation.curve_tracing import response_balances, trace_from_rest
+from snrmjax.simulate.balance.harmonic_balance import harmonic_balance
+from snrmjax.simulate.continuation.continuation import CurveStatus, StepControl
+from snrmjax.simulate.continuation.curve_tracing import response_balances
 from snrmjax.simulate.continuation.newton import correct
 from snrmjax.simulate.continuation.response_curve import ResponseCurve, assembled
+from snrmjax.simulate.solutions.from_rest import curves_from_rest
 
 DEFAULT_STEPS = StepControl()
 _WHOLE = (CurveStatus.UPPER_END, CurveStatus.LOWER_END, CurveStatus.CLOSED)
@@ -223,77 +224,24 @@ def _chunk_of_curves(
         results[k].append(_no_curve(models[k], float(forces[k]), settings.harmonic_order))
     if not good:
         return [tuple(curves) for curves in results]
-    balances = response_balances(
-        [models[k] for k in good], forces[good], settings.harmonic_order, settings.n_samples
-    )
-    walk = (ends, settings.steps, 1 if alone else lanes_for(balances.size + 1))
-    upward = trace_from_rest(balances, np.arange(len(good)), *walk, downward=False)
-
-    def ends_well(k: int) -> bool:
-        curve = upward[k]
-        reached = curve.status == CurveStatus.UPPER_END
-        return reached and _ends_near_rest(balances, k, curve)
-
-    # Below a strong softening the lower end has several solutions and the upper end has one; and
-    # where a resonance reaches beyond the upper end, another branch comes in there.
-    doubtful = [k for k in range(len(good)) if not ends_well(k)]
-    found = trace_from_rest(balances, np.array(doubtful, dtype=int), *walk, downward=True)
-    downward = dict(zip(doubtful, found, strict=True))
-    # Beside a superharmonic resonance the linear response is no start: let the force rise.
-    lost = [
-        k
-        for k, back in downward.items()
-        if upward[k].status == CurveStatus.NO_START and back.status != CurveStatus.LOWER_END
-    ]
-    again = trace_from_rest(balances, np.array(lost, dtype=int), *walk, downward=False, ramp=True)
-    for k, curve in zip(lost, again, strict=True):
-        upward[k] = curve
-        if ends_well(k):
-            del downward[k]
-    owner: list[int] = []
-    without_branch: list[int] = []
-    parts: list[TracedCurve] = []
-    for k, curve in enumerate(upward):
-        pieces = [curve]
-        if k in downward:
-            back = downward[k]
-            if curve.status == CurveStatus.UPPER_END:
-                started = len(back.points) > 0
-                known = started and _same_point(back.points[0], curve.points[-1])
-                pieces = [curve, back] if started and not known else [curve]
-                without_branch += [] if started else [good[k]]
-            else:
-                whole = back.status == CurveStatus.LOWER_END
-                pieces = [back.reversed()] if whole else [curve, back.reversed()]
-        owner += [k] * len(pieces)
-        parts += pieces
+    some = [models[k] for k in good]
+    balances = response_balances(some, forces[good], settings.harmonic_order, settings.n_samples)
+    lanes = 1 if alone else lanes_for(balances.size + 1)
+    found = curves_from_rest(some, balances, ends, settings.steps, lanes)
+    owner = [k for k, one in enumerate(found) for _ in one.curves]
+    parts = [curve for one in found for curve in one.curves]
+    branches = [branch for one in found for branch in one.branches]
     responses = assembled(
         taken(balances, np.array(owner)), parts, settings.steps, stability=settings.stability
     )
-    for k, response in zip(owner, responses, strict=True):
-        results[good[k]].append(response)
-    for k in without_branch:
-        first = results[k][0]
-        missed = (*first.not_located, "branch")
-        results[k][0] = dataclasses.replace(first, not_located=missed)
+    for k, branch, response in zip(owner, branches, responses, strict=True):
+        results[good[k]].append(dataclasses.replace(response, branch=branch))
+    for k, one in zip(good, found, strict=True):
+        if one.has_no_start:
+            first = results[k][0]
+            missed = (*first.not_located, "branch")
+            results[k][0] = dataclasses.replace(first, not_located=missed)
     return [tuple(curves) for curves in results]
-
-
-def _ends_near_rest(balances: HarmonicBalance, member: int, curve: TracedCurve) -> bool:
-    """Whether a curve's last point is about the linear response there: then it is alone."""
-    model, j = balances.model, balances.model.modes.mode_of_interest
-    omega = float(curve.points[-1, -1])  # over the natural frequency
-    damping = model.modes.damping_ratio.item(member, j)
-    natural = model.modes.natural_frequency.item(member, j)
-    load = float(balances.force[member]) * model.modes.participation.item(member, j)
-    linear = load / (natural**2 * (1 - omega**2 + 2j * damping * omega))
-    x = curve.points[-1, :-1].reshape(balances.n_coefficients, -1)[1:3, j]
-    last = complex(x[0], -x[1]) * float(balances.displacement_scale[member])
-    return abs(last - linear) < 0.5 * abs(linear)
-
-
-def _same_point(first: np.ndarray, second: np.ndarray) -> bool:
-    return bool(np.max(np.abs(first - second)) < 1e-5)
 
 
 def _no_curve(model: Structure, force: float, harmonic_order: int) -> ResponseCurve:

@@ -180,11 +180,12 @@ def _starts(
         for well in wells:
             x = np.zeros((n, model.n_modes))
             x[0] = well.displacement
-            rows.append((x.copy(), float(frequency), Branch.EQUILIBRIUM))
+            origin = Branch.EQUILIBRIUM if np.any(well.displacement) else Branch.REST
+            rows.append((x.copy(), float(frequency), origin))
             linear = linear_coefficients(
                 model, balance.force, jnp.asarray(frequency), balance.harmonic_order
             )
-            rows.append((x + np.asarray(linear), float(frequency), Branch.EQUILIBRIUM))
+            rows.append((x + np.asarray(linear), float(frequency), origin))
     for k in range(search.n_starts):
         frequency = rng.uniform(ends[0], ends[1])
         amplitude = scale * 10 ** rng.uniform(-1.5, 0.5)

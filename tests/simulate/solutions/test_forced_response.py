@@ -1,7 +1,5 @@
 """Forced responses against linear formulas, closed orbits in time, and the paper's numbers."""
 
-import sys
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -16,6 +14,7 @@ from snrmjax.model.modes import linear_modes, linear_response
 from snrmjax.model.potential import polynomial_potential
 from snrmjax.model.structures import structure
 from snrmjax.simulate.continuation.continuation import CurveStatus, StepControl
+from snrmjax.simulate.solutions import from_rest
 from snrmjax.simulate.solutions.forced_response import forced_response, solve_at_frequency
 from snrmjax.simulate.solutions.periodic_motion import periodic_motion
 
@@ -446,13 +445,12 @@ def test_curves_use_one_thread_of_blas_and_leave_its_setting(monkeypatch):
     def threads() -> set[int]:
         return {one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas"}
 
-    module, seen = sys.modules[sj.forced_response.__module__], []
-    traced = module.trace_from_rest
+    seen, traced = [], from_rest.trace_from_rest
     monkeypatch.setattr(
-        module, "trace_from_rest", lambda *a, **k: seen.append(threads()) or traced(*a, **k)
+        from_rest, "trace_from_rest", lambda *a, **k: seen.append(threads()) or traced(*a, **k)
     )
     with threadpool_limits(2, "blas"):
-        sj.forced_response(sj.model.flat_beam(), [2e-4], 480.0, 520.0, harmonic_order=1)
+        forced_response(one_mode(), [1e-2], 1.5, 2.5, harmonic_order=1)
         left = threads()
     assert seen
     assert all(found == {1} for found in seen)

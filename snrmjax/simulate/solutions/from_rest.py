@@ -1,0 +1,226 @@
+"""The curves that a response to one force is made of: what slow sweeps through a range would show.
+
+A sweep begins in one of the structure's stable equilibria, at an end of the range or beyond a
+resonance outside it. Two of these motions may lie on one curve.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from snrmjax.model.structures import Structure, equilibria
+from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance
+from snrmjax.simulate.continuation.continuation import CurveStatus, StepControl, TracedCurve
+from snrmjax.simulate.continuation.curve_tracing import trace_from_rest, under_rising_force
+from snrmjax.simulate.continuation.response_curve import Branch
+
+_N_STARTS = 24  # of the search for further equilibria: each response of a study pays for it
+_NEAR_LINEAR = 0.5  # of the linear response: the motion that differs by less is the one from rest
+# A resonance outside the range is passed where its hysteresis may reach into it: a mode of which
+# little is left softens by a third; hardening has no such limit.
+_REACH_OF_MODE_ABOVE, _REACH_OF_MODE_BELOW = 1.5, 2.5  # ratios of frequencies
+_SAME = 1e-5  # distance of scaled points that are one
+
+
+class CurvesFromRest(NamedTuple):
+    """The curves of one member, each once, the one from rest at the lower end first."""
+
+    curves: list[TracedCurve]
+    branches: list[Branch]
+    has_no_start: bool  # a branch comes in at the upper end whose start was not found
+
+
+def curves_from_rest(
+    models: Sequence[Structure],
+    balances: HarmonicBalance,
+    ends: Float[np.ndarray, " end"],
+    steps: StepControl,
+    lanes: int,
+) -> list[CurvesFromRest]:
+    """The curves of every member through a range (rad/s).
+
+    A curve is traced from the linear response, and where that is not near or leads nowhere, from
+    the motion under a force that rises from zero. From the upper end it is traced where the
+    curve from the lower end does not end near the linear response there. Further curves come from
+    further stable equilibria, and from beyond resonances of modes outside the range.
+    """
+    walk = (balances, ends, steps, lanes)
+    upward = _from_end(*walk, np.arange(len(models)), downward=False)
+    doubtful = [k for k, curve in enumerate(upward) if not _ends_near_rest(balances, k, curve)]
+    backward = dict.fromkeys(range(len(models)))
+    backward |= zip(doubtful, _from_end(*walk, np.array(doubtful, int), downward=True), strict=True)
+    found = []
+    for curve, back in zip(upward, backward.values(), strict=True):
+        parts = [curve] if back is None else _joined(curve, back)
+        lost = back is not None and not len(back.points) and _is_whole(curve)
+        found.append(CurvesFromRest(parts, [Branch.MAIN] * len(parts), lost))
+    _add_other_rests(models, found, *walk)
+    for downward in (False, True):
+        _add_from_beyond(found, *walk, downward=downward)
+    return found
+
+
+def _from_end(
+    balances: HarmonicBalance,
+    ends: Float[np.ndarray, " end"],
+    steps: StepControl,
+    lanes: int,
+    index: Int[np.ndarray, " member"],
+    *,
+    downward: bool,
+) -> list[TracedCurve]:
+    """From an end: the linear response there, or what the motion from rest is instead."""
+    walk = (ends, steps, lanes)
+    curves = trace_from_rest(balances, index, *walk, downward=downward)
+    # Where the linear response is large, Newton's method goes from it to another solution.
+    far = [
+        i
+        for i, k in enumerate(index)
+        if not len(curves[i].points) or not _is_near_rest(balances, k, curves[i].points[0])
+    ]
+    starts = under_rising_force(balances, index[far], float(ends[int(downward)]), steps, lanes)
+    new = [
+        j
+        for j, i in enumerate(far)
+        if np.isfinite(starts[j]).all() and not _passes(curves[i], starts[j])
+    ]
+    again = trace_from_rest(
+        *(balances, index[far][new], *walk), downward=downward, starts=starts[new]
+    )
+    for j, curve in zip(new, again, strict=True):
+        if len(curve.points):
+            curves[far[j]] = curve
+    return curves
+
+
+def _joined(curve: TracedCurve, back: TracedCurve) -> list[TracedCurve]:
+    """The curve from the lower end and the one from the upper end, which may be the same."""
+    if not len(back.points):
+        return [curve] if _is_whole(curve) else [curve, back]
+    if not len(curve.points) and back.status != CurveStatus.LOWER_END:
+        return [curve, back.reversed()]
+    if not len(curve.points) or _passes(back, curve.points[0]):
+        return [back.reversed()]
+    if _passes(curve, back.points[0]):
+        return [curve]
+    return [curve, back if _is_whole(curve) else back.reversed()]
+
+
+def _add_other_rests(
+    models: Sequence[Structure],
+    found: list[CurvesFromRest],
+    balances: HarmonicBalance,
+    ends: Float[np.ndarray, " end"],
+    steps: StepControl,
+    lanes: int,
+) -> None:
+    """Curves from further stable equilibria, from both ends, that are not among those found."""
+    owners, rests = [], []
+    for k, model in enumerate(models):
+        for other in equilibria(model, n_starts=_N_STARTS)[1:]:
+            if other.stable:
+                owners.append(k)
+                rests.append(other.displacement)
+    if not owners:
+        return
+    index, rest, walk = np.array(owners), np.array(rests), (balances, ends, steps, lanes)
+    for downward in (False, True):
+        end = float(ends[int(downward)])
+        starts = under_rising_force(balances, index, end, steps, lanes, rest=rest)
+        _add(found, owners, starts, Branch.EQUILIBRIUM, *walk, downward=downward)
+
+
+def _add_from_beyond(
+    found: list[CurvesFromRest],
+    balances: HarmonicBalance,
+    ends: Float[np.ndarray, " end"],
+    steps: StepControl,
+    lanes: int,
+    *,
+    downward: bool,
+) -> None:
+    """Curves that enter at the lower (upper) end from below (above) a resonance outside."""
+    end = float(ends[int(downward)])
+    natural = np.asarray(balances.model.modes.natural_frequency)  # of every member
+    ratio = natural / end if downward else end / natural
+    reach = _REACH_OF_MODE_ABOVE if downward else _REACH_OF_MODE_BELOW
+    near = (ratio > 1) & (ratio < reach)
+    owners = np.flatnonzero(near.any(axis=1)).tolist()
+    if not owners:
+        return
+    # One frequency for all: far beyond the resonances that may reach in, and short of the next.
+    farthest = float(np.max(ratio[near]))
+    others = ratio[owners][(ratio[owners] > farthest)]
+    away = farthest * np.sqrt(min(np.min(others, initial=2 * farthest) / farthest, 2.0))
+    begin = end * away if downward else end / away
+    outside = trace_from_rest(
+        *(balances, np.array(owners), np.sort([begin, end]), steps, lanes), downward=downward
+    )
+    starts = np.full((len(owners), balances.size + 1), np.nan)
+    for start, curve in zip(starts, outside, strict=True):
+        if curve.status == (CurveStatus.LOWER_END if downward else CurveStatus.UPPER_END):
+            start[:] = curve.points[-1]
+    walk = (balances, ends, steps, lanes)
+    _add(found, owners, starts, Branch.BEYOND, *walk, downward=downward)
+
+
+def _add(
+    found: list[CurvesFromRest],
+    owners: Sequence[int],
+    starts: Float[np.ndarray, "start unknown"],
+    branch: Branch,
+    balances: HarmonicBalance,
+    ends: Float[np.ndarray, " end"],
+    steps: StepControl,
+    lanes: int,
+    *,
+    downward: bool,
+) -> None:
+    """Curves through starts at an end that lie on no curve of their owners."""
+
+    def is_new(owner: int, start: np.ndarray) -> bool:
+        finite = bool(np.isfinite(start).all())
+        return finite and not any(_passes(one, start) for one in found[owner].curves)
+
+    new = [i for i, k in enumerate(owners) if is_new(k, starts[i])]
+    index = np.array(owners, dtype=int)[new]
+    curves = trace_from_rest(
+        *(balances, index, ends, steps, lanes), downward=downward, starts=starts[new]
+    )
+    for k, curve in zip(index.tolist(), curves, strict=True):
+        if len(curve.points) and is_new(k, curve.points[0]):
+            found[k].curves.append(curve.reversed() if downward else curve)
+            found[k].branches.append(branch)
+
+
+def _is_whole(curve: TracedCurve) -> bool:
+    return curve.status == CurveStatus.UPPER_END
+
+
+def _passes(curve: TracedCurve, point: Float[np.ndarray, " unknown"]) -> bool:
+    """Whether a curve begins or ends at a point, which lies at an end of the range."""
+    return any(
+        np.max(np.abs(curve.points[k] - point)) < _SAME for k in (0, -1) if len(curve.points)
+    )
+
+
+def _ends_near_rest(balances: HarmonicBalance, member: int, curve: TracedCurve) -> bool:
+    """Whether a curve goes through the range to about the linear response: then it is alone."""
+    return _is_whole(curve) and _is_near_rest(balances, member, curve.points[-1])
+
+
+def _is_near_rest(
+    balances: HarmonicBalance, member: int, point: Float[np.ndarray, " unknown"]
+) -> bool:
+    """Whether a point is about the linear response there."""
+    model, j = balances.model, balances.model.modes.mode_of_interest
+    omega = float(point[-1])  # over the natural frequency
+    damping = model.modes.damping_ratio.item(member, j)
+    natural = model.modes.natural_frequency.item(member, j)
+    load = float(balances.force[member]) * model.modes.participation.item(member, j)
+    linear = load / (natural**2 * (1 - omega**2 + 2j * damping * omega))
+    x = point[:-1].reshape(balances.n_coefficients, -1)[1:3, j]
+    fundamental = complex(x[0], -x[1]) * float(balances.displacement_scale[member])
+    return abs(fundamental - linear) < _NEAR_LINEAR * abs(linear)

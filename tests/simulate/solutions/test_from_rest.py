@@ -1,0 +1,141 @@
+"""All curves of a range, against one-term balance of Duffing's oscillator in closed form."""
+
+import numpy as np
+import pytest
+
+import snrmjax as sj
+from snrmjax.pipelines.simulate import simulate_responses
+
+OMEGA, RATIO, HERTZ = 500.0, 0.01, 2 * np.pi
+
+
+def oscillator(coefficient):
+    """q̈ + 2ζωq̇ + ω²q + 4 c q³ = F cos Ωt."""
+    modes = sj.model.linear_modes([OMEGA], [RATIO], [[1.0]], [1.0])
+    return sj.model.structure(modes, sj.model.polynomial_potential({(0,) * 4: coefficient}, 1))
+
+
+def amplitudes(coefficient, force, omega):
+    """Velocity amplitudes of all solutions with one harmonic, the smallest first.
+
+    (ω² − Ω² + 3cQ²)²Q² + (2ζωΩQ)² = F², a cubic in Q².
+    """
+    a, b = 3 * coefficient, OMEGA**2 - omega**2
+    roots = np.roots([a**2, 2 * a * b, b**2 + (2 * RATIO * OMEGA * omega) ** 2, -(force**2)])
+    real = roots[np.abs(roots.imag) < 1e-9 * np.abs(roots)].real
+    return omega * np.sqrt(np.sort(real[real > 0]))
+
+
+@pytest.mark.parametrize(
+    ("coefficient", "force", "ends", "at"),
+    [
+        (1e9, 60.0, (1.1, 1.5), 0),
+        (1e9, 60.0, (1.1, 1.16), 0),
+        (1e9, 60.0, (0.8, 1.16), 1),
+        (-4e9, 10.0, (0.8, 0.93), 1),
+        (-4e9, 10.0, (0.94, 1.1), 0),
+    ],
+    ids=[
+        "hardening from within the hysteresis",
+        "hardening between the folds",
+        "hardening to within the hysteresis",
+        "softening to within the hysteresis",
+        "softening from within the hysteresis",
+    ],
+)
+def test_all_responses_at_an_end_between_the_folds_are_there(coefficient, force, ends, at):
+    model, window = oscillator(coefficient), [OMEGA * r for r in ends]
+    exact = amplitudes(coefficient, force, window[at])
+    assert len(exact) == 3
+    (curves,) = sj.simulate.forced_response_batch(
+        *(model, [force], *window), settings=sj.simulate.ResponseSettings(harmonic_order=1)
+    ).curves
+    found = [
+        np.abs(curve.velocity[k, 1, 0])
+        for curve in curves
+        for k in (0, -1)
+        if curve.frequency[k] == pytest.approx(window[at], rel=1e-12)
+    ]
+    # The unstable one ends at the other end where no fold lies between.
+    assert exact[0] == pytest.approx(min(found), rel=1e-6)
+    assert exact[2] == pytest.approx(max(found), rel=1e-6)
+    stable = [exact[0], exact[2]]
+    between = [one for one in found if not np.isclose(one, stable, rtol=1e-6).any()]
+    assert np.allclose(between, exact[1], rtol=1e-6)
+    assert len(found) == len(set(np.round(found, 6)))
+
+
+@pytest.mark.parametrize("ends", [(0.8, 1.5), (1.45, 1.6)])
+def test_a_range_around_a_response_or_beyond_it_has_one_curve(ends):
+    model, window = oscillator(1e9), [OMEGA * r for r in ends]
+    assert len(sj.forced_response(model, [60.0], *window, harmonic_order=3)) == 1
+
+
+def escaping():
+    """ÿ + 0.1 ẏ + y + y² = F cos Ωt, which escapes beyond y = −1."""
+    modes = sj.model.linear_modes([1.0], [0.05], [[1.0]], [1.0])
+    return sj.model.structure(modes, sj.model.polynomial_potential({(0, 0, 0): 1 / 3}, 1))
+
+
+def test_an_escaping_oscillator_keeps_its_response_from_rest():
+    """Time integration of the equation escapes at 0.1268 Hz as the frequency rises slowly."""
+    found = simulate_responses(escaping(), [0.1], 0.05, 0.2, harmonics=9)
+    (first, *_) = found.curves
+    (fold,) = first.at_events("fold")
+    assert first.frequency[fold] / HERTZ == pytest.approx(0.1268, abs=1e-4)
+    assert np.all(first.stability[:fold] == 1)
+    assert np.abs(first.velocity[0, 1, 0]) == pytest.approx(0.03585, rel=1e-3)
+    (left,) = [note for note in found.notes if note.kind == "no_stable_response"]
+    assert left["from_hz"] == pytest.approx(0.1268, abs=1e-4)
+    batch = sj.simulate.forced_response_batch(escaping(), [0.08, 0.1], 0.05 * HERTZ, 0.2 * HERTZ)
+    assert batch.n_folds.tolist() == [1, 1]
+
+
+def test_each_stable_rest_has_its_response():
+    """ÿ + 2ζẏ − y/2 + y³/2 about y = 1: the other well is the mirror image."""
+    modes = sj.model.linear_modes([1.0], [0.02], [[1.0]], [1.0])
+    wells = sj.model.polynomial_potential({(0, 0, 0): 0.5, (0, 0, 0, 0): 0.125}, 1)
+    curves = sj.forced_response(sj.model.structure(modes, wells), [0.01], 0.6, 1.3)
+    here, there = curves[0], next(c for c in curves if c.branch == "from another equilibrium")
+    assert here.coefficients[0, 0, 0] == pytest.approx(0.0, abs=0.01)
+    assert there.coefficients[0, 0, 0] == pytest.approx(-2.0, abs=0.01)
+    # Under the force reversed in time by half a period the wells change places.
+    peaks = [np.abs(c.velocity[:, 1, 0]).max() for c in (here, there)]
+    assert peaks[0] == pytest.approx(peaks[1], rel=1e-4)
+
+
+@pytest.mark.parametrize("slides", [True, pytest.param(False, marks=pytest.mark.long)])
+def test_a_simulation_says_which_elements_do_nothing(slides):
+    kind, parameters = (
+        ("jenkins_slider", {"stiffness": 0.1 * OMEGA**2, "slip_displacement": 1e-3})
+        if slides
+        else ("one_sided_stop", {"stiffness": OMEGA**2, "gap": 1e-3})
+    )
+    modes = sj.model.linear_modes([OMEGA], [RATIO], [[1.0]], [1.0])
+    window = 0.8 * OMEGA / HERTZ, 1.2 * OMEGA / HERTZ
+    # Before any slip or contact the mode is linear: Q = F/(2ζω²) = 1e-3 at F = 5.
+    model = sj.model.structure(modes, effects=[sj.model.make_effect(kind, parameters)])
+    for force, idle in ((4.0, True), (6.0, False)):
+        found = simulate_responses(model, [force], *window, harmonics=3)
+        notes = [n for n in found.notes if n.kind == "element_idle"]
+        assert len(notes) == idle
+        if idle:
+            assert notes[0]["slides"] == slides
+            assert notes[0]["share"] == pytest.approx(0.8, rel=2e-3)
+            assert "more force" in str(notes[0])
+
+
+def test_friction_that_holds_asks_for_more_force():
+    """Two masses: the held one feels k F/(k₁ + k − Ω²m) through the spring between them."""
+    structure = sj.model.from_matrices(
+        *(np.eye(2), np.eye(2), np.array([[2e5, -1e5], [-1e5, 2e5]])),
+        points=("a", "b"),
+        force="a",
+        effects=[sj.model.make_effect("coulomb_friction", {"force": 1.0}, at="b")],
+    )
+    low, high = 20.0, 40.0
+    with pytest.raises(ValueError, match="raise the force") as told:
+        simulate_responses(structure, [0.1], low, high, harmonics=3)
+    held = abs(2e5 - (high * HERTZ) ** 2 + 1j * high * HERTZ) / 1e5
+    assert f"slides from about {held:.3g} N on" in str(told.value)
+    assert "lower the force" not in str(told.value)
