@@ -330,7 +330,7 @@ def equilibria(model: Structure, *, n_starts: int = 512, seed: int = 0) -> list[
             polynomial[len(monomial) - 1] += len(monomial) * value
         roots = np.polynomial.polynomial.polyroots(np.trim_zeros(polynomial, "b"))
         scale = max(1.0, float(np.max(np.abs(roots), initial=0.0)))
-        real = np.abs(roots.imag) < 1e-9 * np.maximum(np.abs(roots), 1e-300)
+        real = np.abs(roots.imag) <= 1e-9 * np.abs(roots)
         candidates = np.unique(roots.real[real])[:, None]
         tolerance = 1e-12 * scale
     else:

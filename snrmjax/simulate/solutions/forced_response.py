@@ -87,7 +87,7 @@ def forced_response(
 
 
 class ResponseBatch(AbstractResult):
-    """Forced responses of many members; NaN where a member has no such point."""
+    """Forced responses of many members; NaN where a member has no such point, or stopped early."""
 
     curves: tuple[tuple[ResponseCurve, ...], ...]  # empty without `keep_curves`
     status: Int[np.ndarray, " member"] = quantity(
@@ -103,7 +103,7 @@ class ResponseBatch(AbstractResult):
     resonance_velocity: Float[np.ndarray, " member"] = quantity(
         "member", "m/s", "strongest phase resonance"
     )
-    n_folds: Int[np.ndarray, " member"] = quantity("member", "1", "folds")
+    n_folds: Int[np.ndarray, " member"] = quantity("member", "1", "folds of all its curves")
     n_not_located: Int[np.ndarray, " member"] = quantity("member", "1", "events not located")
 
 
@@ -168,27 +168,28 @@ def _paired(
 
 
 def _summary(parts: tuple[ResponseCurve, ...]) -> dict[str, float]:
-    """The numbers of one member, named as in `ResponseBatch`."""
+    """The numbers of one member, named as in `ResponseBatch`: none where a curve stopped early."""
+    stopped = [part.status for part in parts if part.status not in _WHOLE]
     best = {"peak": (np.nan, np.nan), "phase_resonance": (np.nan, np.nan)}
-    for part in parts:
+    whole = () if stopped else parts
+    for part in whole:
         for kind, (_, height) in list(best.items()):
             for k in part.at_events(kind):
                 velocity = float(np.abs(part.velocity[k, 1, 0]))
                 if not velocity <= height:
                     best[kind], height = (float(part.frequency[k]), velocity), velocity
     n_not_located = sum(len(part.not_located) for part in parts)
-    if has_higher_point(parts, best["peak"][1]):
+    if has_higher_point(whole, best["peak"][1]):
         best["peak"], n_not_located = (np.nan, np.nan), n_not_located + 1
-    # A second branch that stopped early is the member's failure too.
-    stopped = [part.status for part in parts if part.status not in _WHOLE]
     return {
+        # A second branch that stopped early is the member's failure too.
         "status": int(stopped[0] if stopped else parts[0].status),
         "n_points": sum(len(part.frequency) for part in parts),
         "peak_frequency": best["peak"][0],
         "peak_velocity": best["peak"][1],
         "resonance_frequency": best["phase_resonance"][0],
         "resonance_velocity": best["phase_resonance"][1],
-        "n_folds": sum(part.at_events("fold").size for part in parts),
+        "n_folds": sum(part.at_events("fold").size for part in whole),
         "n_not_located": n_not_located,
     }
 

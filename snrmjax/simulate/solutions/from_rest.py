@@ -59,7 +59,7 @@ def curves_from_rest(
     _add_other_rests(models, found, *walk)
     for downward in (False, True):
         _add_from_beyond(found, *walk, downward=downward)
-    return found
+    return [_without_empty(one) for one in found]
 
 
 def _from_end(
@@ -108,6 +108,23 @@ def _joined(curve: TracedCurve, back: TracedCurve) -> list[TracedCurve]:
     return [curve, back if _is_whole(curve) else back.reversed()]
 
 
+def _without_empty(found: CurvesFromRest) -> CurvesFromRest:
+    """The same without a curve that has no start, where another begins or ends at the lower end.
+
+    A motion that leaves its rest under the rising force settles on one of the others.
+    """
+    at_lower_end = [
+        one.status == CurveStatus.LOWER_END or branch is not Branch.MAIN
+        for one, branch in zip(found.curves, found.branches, strict=True)
+    ]
+    if not any(at_lower_end):
+        return found
+    kept = [k for k, one in enumerate(found.curves) if len(one.points)]
+    return found._replace(
+        curves=[found.curves[k] for k in kept], branches=[found.branches[k] for k in kept]
+    )
+
+
 def _add_other_rests(
     models: Sequence[Structure],
     found: list[CurvesFromRest],
@@ -119,8 +136,8 @@ def _add_other_rests(
     """Curves from further stable equilibria, from both ends, that are not among those found."""
     owners, rests = [], []
     for k, model in enumerate(models):
-        for other in equilibria(model, n_starts=_N_STARTS)[1:]:
-            if other.stable:
+        for other in equilibria(model, n_starts=_N_STARTS):
+            if other.stable and np.any(other.displacement):
                 owners.append(k)
                 rests.append(other.displacement)
     if not owners:

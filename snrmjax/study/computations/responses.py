@@ -88,8 +88,9 @@ class AbstractResponses(AbstractComputation):
             name: self.forces.shaped(np.asarray(one.values))
             for name, one in batch.variables().items()
         }
-        folds = np.concatenate([_at_folds(parts) for parts in batch.curves], axis=1)
-        ends = zip(batch.curves, rows["status"].ravel().tolist(), strict=True)
+        ends = list(zip(batch.curves, rows["status"].ravel().tolist(), strict=True))
+        whole = [parts if status in COMPLETE else () for parts, status in ends]
+        folds = np.concatenate([_at_folds(parts) for parts in whole], axis=1)
         rows[PEAK_SIDE] = self.forces.shaped(np.array([peak_side(*e) for e in ends], dtype="i1"))
         return batch.curves, {**rows, "fold_frequency_hz": folds[0], "fold_velocity_m_s": folds[1]}
 
@@ -134,10 +135,15 @@ class Peaks(AbstractResponses):
     def rows(self, members: Members) -> dict[str, np.ndarray]:
         """See `AbstractComputation.rows`."""
         curves, rows = self.traced(members)
-        ends = zip(curves, rows["status"].ravel().tolist(), strict=True)
+        batch_status = rows["status"].ravel().tolist()
+        ends = zip(curves, batch_status, strict=True)
         rows["status"] = self.forces.shaped(np.array([peak_status(*end) for end in ends]))
         if self.grid_points:
-            bounds = np.array([velocity_bounds(parts, self._grid) for parts in curves])
+            # Of a curve that stopped early nobody knows the rest.
+            whole = zip(curves, batch_status, strict=True)
+            bounds = np.array(
+                [velocity_bounds(c if s in COMPLETE else (), self._grid) for c, s in whole]
+            )
             rows["upper_velocity_m_s"] = self.forces.shaped(bounds[:, 1])
             rows["lower_velocity_m_s"] = self.forces.shaped(bounds[:, 0])
         return rows
@@ -233,6 +239,8 @@ def velocity_bounds(
     curves: Sequence[ResponseCurve], frequencies: Float[np.ndarray, " frequency"]
 ) -> Float[np.ndarray, "bound frequency"]:
     """Lowest and highest velocity of a response at given frequencies (rad/s), NaN outside it."""
+    if not curves:
+        return np.full((2, len(frequencies)), np.nan)
     x = np.concatenate([curve.frequency for curve in curves])
     speed = np.concatenate([np.abs(curve.velocity[:, 1, 0]) for curve in curves])
     begins = np.concatenate([np.arange(len(curve.frequency)) == 0 for curve in curves])
@@ -272,5 +280,7 @@ def bounds_over(
 def _at_folds(curves: Sequence[ResponseCurve]) -> Float[np.ndarray, "quantity fold"]:
     """Frequency in Hz and velocity in m/s of all folds of a response."""
     folds = [(curve, curve.at_events("fold")) for curve in curves]
+    if not folds:
+        return np.zeros((2, 0))
     frequency = np.concatenate([curve.frequency[at] for curve, at in folds]) / HERTZ
     return np.array([frequency, np.concatenate([np.abs(c.velocity[at, 1, 0]) for c, at in folds])])
