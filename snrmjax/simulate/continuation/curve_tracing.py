@@ -30,7 +30,11 @@ from snrmjax.simulate.continuation.continuation import (
     Tracing,
 )
 
-_Way = Literal["from_end", "rising", "through"]  # an end of the range, a force, or a point
+# From an end of the range, over a force that rises from zero to its value or past it, or through
+# a point.
+_Way = Literal["from_end", "rising", "past", "through"]
+_PAST = 4.0  # times the force: motions that begin at a larger one come back to it
+_NEAR = 5e-3  # distance in scaled unknowns below which a motion lies on a known curve
 _ALONE = 512  # points of a single curve before the host sees them
 
 
@@ -107,6 +111,65 @@ def under_rising_force(
     return starts
 
 
+def at_force(
+    balances: HarmonicBalance, member: int, frequency: float, steps: StepControl, lanes: int
+) -> Float[np.ndarray, "motion unknown"]:
+    """Motions of one member at a frequency (rad/s) that a rising force connects with rest, scaled.
+
+    The force goes to several times its value and back around its folds: every passing of its value
+    is one. They lie between two points of a curve and are not corrected.
+    """
+    mine = taken(balances, np.array([member]))
+    at, begin = np.array([frequency, frequency]), np.zeros((1, balances.size + 1))
+    (curve,) = _walked(mine, at, steps, begin, lanes, downward=False, way="past")
+    beyond = curve.points[:, -1] > 1
+    k = np.flatnonzero(beyond[1:] != beyond[:-1])
+    here, there = curve.points[k], curve.points[k + 1]
+    fraction = (1 - here[:, -1:]) / (there[:, -1:] - here[:, -1:])
+    motions = here + fraction * (there - here)
+    motions[:, -1] = frequency / float(np.asarray(mine.frequency_scale)[0])
+    return motions
+
+
+def trace_both_ways(
+    balances: HarmonicBalance,
+    point: Float[np.ndarray, " unknown"],
+    ends: Float[np.ndarray, " end"],
+    steps: StepControl,
+) -> TracedCurve:
+    """The curve through a point of a single member: once around, or from one end to the other."""
+    ways = []
+    for downward in (False, True):
+        way = trace_through(balances, ends, steps, downward=downward, starts=point[None])[0]
+        ways.append(way)
+        if way.status == CurveStatus.CLOSED:
+            return way
+    up, down = ways
+    back = down.reversed()
+    solves = up.n_solves + down.n_solves
+    if not len(up.points) or not len(back.points):
+        whole = up if len(up.points) else back
+        return whole._replace(n_solves=solves)
+    status = up.status if up.status != CurveStatus.UPPER_END else back.status
+    return TracedCurve(
+        np.concatenate([back.points[:-1], up.points]),
+        np.concatenate([back.tangents[:-1], up.tangents]),
+        status,
+        solves,
+    )
+
+
+def lies_on(
+    point: Float[np.ndarray, " unknown"], curve: Float[np.ndarray, "point unknown"]
+) -> bool:
+    """Whether a scaled point lies on the polyline through a curve's points."""
+    begin, step = curve[:-1], np.diff(curve, axis=0)
+    square = np.maximum(np.sum(step**2, axis=1), 1e-300)
+    along = np.clip(np.sum((point - begin) * step, axis=1) / square, 0.0, 1.0)
+    nearest = np.linalg.norm(begin + along[:, None] * step - point, axis=1)
+    return bool(np.min(nearest, initial=np.inf) < _NEAR)
+
+
 def trace_through(
     balances: HarmonicBalance,
     ends: Float[np.ndarray, " end"],
@@ -151,7 +214,7 @@ def _walked(
 def _tracer(balance: HarmonicBalance, ends: Array, steps: StepControl, way: _Way) -> CurveTracer:
     """Along the response, or along that at the lower end to a force that rises from zero."""
     lower, upper = ends / balance.frequency_scale
-    if way != "rising":
+    if way not in ("rising", "past"):
         groups, closes = (balance.n_coefficients, balance.model.n_modes), way == "through"
         return CurveTracer(balance.linearised, CurveRange(lower, upper), steps, groups, closes)
     load = balance.force * balance.load()
@@ -162,7 +225,13 @@ def _tracer(balance: HarmonicBalance, ends: Array, steps: StepControl, way: _Way
         residual, jacobian = now.linearised(point.at[-1].set(lower))
         return residual, jacobian.at[:, -1].set(-load)
 
-    return CurveTracer(linearised, CurveRange(lower=-1.0, upper=1.0), steps, None, False)
+    return CurveTracer(
+        linearised,
+        CurveRange(lower=-1.0, upper=_PAST if way == "past" else 1.0),
+        steps,
+        None,
+        False,
+    )
 
 
 def _first(job: tuple, ends: Array, steps: StepControl, downward: Array, way: _Way) -> Tracing:
@@ -173,7 +242,7 @@ def _first(job: tuple, ends: Array, steps: StepControl, downward: Array, way: _W
         order = balance.harmonic_order
         linear = linear_coefficients(balance.model, balance.force, begin, order)
         start = balance.point(linear, begin)
-    sense = 1.0 if way == "rising" else jnp.where(downward, -1.0, 1.0)
+    sense = 1.0 if way in ("rising", "past") else jnp.where(downward, -1.0, 1.0)
     direction = jnp.zeros_like(start).at[-1].set(sense)
     return _tracer(balance, ends, steps, way).begun(start, direction)
 

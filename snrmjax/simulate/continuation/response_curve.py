@@ -92,6 +92,7 @@ class Branch(StrEnum):
     PHASE_RESONANCE = "isolated, from a phase resonance"
     EQUILIBRIUM = "from another equilibrium"
     BEYOND = "from beyond a resonance outside the range"
+    LANDING = "where a sweep lands"
     REST = "isolated, from a motion about rest"
     RANDOM_START = "isolated, from a random start"
 

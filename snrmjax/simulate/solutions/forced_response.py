@@ -19,10 +19,16 @@ from snrmjax.simulate.balance.harmonic_balance import harmonic_balance
 from snrmjax.simulate.continuation.continuation import CurveStatus, StepControl
 from snrmjax.simulate.continuation.curve_tracing import response_balances
 from snrmjax.simulate.continuation.newton import correct
-from snrmjax.simulate.continuation.response_curve import ResponseCurve, assembled
-from snrmjax.simulate.solutions.from_rest import curves_from_rest
+from snrmjax.simulate.continuation.response_curve import (
+    Branch,
+    ResponseCurve,
+    assembled,
+    without_stable_response,
+)
+from snrmjax.simulate.solutions.from_rest import curves_from_rest, curves_where_sweeps_land
 
 DEFAULT_STEPS = StepControl()
+_AT_FOLD = 1e-3  # of the frequency: the last stable point before a fold is as near
 _WHOLE = (CurveStatus.UPPER_END, CurveStatus.LOWER_END, CurveStatus.CLOSED)
 
 
@@ -237,12 +243,31 @@ def _chunk_of_curves(
     )
     for k, branch, response in zip(owner, branches, responses, strict=True):
         results[good[k]].append(dataclasses.replace(response, branch=branch))
-    for k, one in zip(good, found, strict=True):
+    for i, (k, one) in enumerate(zip(good, found, strict=True)):
+        folds = _left_folds(results[k], ends)
+        if folds:
+            new = curves_where_sweeps_land(*(balances, i, one.curves, folds, ends, settings.steps))
+            own = taken(balances, np.full(len(new), i))
+            landed = assembled(own, new, settings.steps, branch=Branch.LANDING) if new else []
+            results[k] += [curve for curve in landed if np.any(curve.is_stable)]
         if one.has_no_start:
             first = results[k][0]
             missed = (*first.not_located, "branch")
             results[k][0] = dataclasses.replace(first, not_located=missed)
     return [tuple(curves) for curves in results]
+
+
+def _left_folds(
+    curves: Sequence[ResponseCurve], ends: Float[np.ndarray, " end"]
+) -> list[tuple[float, float]]:
+    """Folds beyond which no curve has a stable point, and how far that goes (rad/s)."""
+    at = np.concatenate([curve.frequency[curve.at_events("fold")] for curve in curves])
+    return [
+        (edge, other)
+        for first, last in without_stable_response(curves, *ends)
+        for edge, other in ((first, last), (last, first))
+        if np.any(np.isclose(edge, at, rtol=_AT_FOLD))
+    ]
 
 
 def _no_curve(model: Structure, force: float, harmonic_order: int) -> ResponseCurve:

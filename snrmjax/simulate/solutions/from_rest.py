@@ -11,9 +11,16 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from snrmjax.model.structures import Structure, equilibria
+from snrmjax.numerics.blocks import taken
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance
 from snrmjax.simulate.continuation.continuation import CurveStatus, StepControl, TracedCurve
-from snrmjax.simulate.continuation.curve_tracing import trace_from_rest, under_rising_force
+from snrmjax.simulate.continuation.curve_tracing import (
+    at_force,
+    lies_on,
+    trace_both_ways,
+    trace_from_rest,
+    under_rising_force,
+)
 from snrmjax.simulate.continuation.response_curve import Branch
 
 _N_STARTS = 24  # of the search for further equilibria: each response of a study pays for it
@@ -21,6 +28,7 @@ _NEAR_LINEAR = 0.5  # of the linear response: the motion that differs by less is
 # A resonance outside the range is passed where its hysteresis may reach into it: a mode of which
 # little is left softens by a third; hardening has no such limit.
 _REACH_OF_MODE_ABOVE, _REACH_OF_MODE_BELOW = 1.5, 2.5  # ratios of frequencies
+_INSIDE = 0.02  # of a gap between stable responses: how far in a further one is looked for
 _SAME = 1e-5  # distance of scaled points that are one
 
 
@@ -60,6 +68,34 @@ def curves_from_rest(
     for downward in (False, True):
         _add_from_beyond(found, *walk, downward=downward)
     return [_without_empty(one) for one in found]
+
+
+def curves_where_sweeps_land(
+    balances: HarmonicBalance,
+    member: int,
+    known: Sequence[TracedCurve],
+    folds: Sequence[tuple[float, float]],
+    ends: Float[np.ndarray, " end"],
+    steps: StepControl,
+) -> list[TracedCurve]:
+    """Further curves of one member where a sweep leaves a fold for none of the known ones.
+
+    They need not reach an end of the range. Arguments: `folds` are frequencies (rad/s) of folds
+    and of the other end of the part without a stable response. Motions are looked for just beyond
+    the fold, over a force that rises past its value.
+    """
+    curves: list[TracedCurve] = []
+    own = taken(balances, np.array([member]))
+    for fold, beyond in folds:
+        for point in at_force(own, 0, fold + _INSIDE * (beyond - fold), steps, 1):
+            if any(lies_on(point, one.points) for one in (*known, *curves)):
+                continue
+            found = trace_both_ways(own, point, ends, steps)
+            # The point lies between two of a curve: what is traced from it may be known.
+            middle = found.points[len(found.points) // 2 :][:1]
+            if len(middle) and not any(lies_on(middle[0], one.points) for one in (*known, *curves)):
+                curves.append(found)
+    return curves
 
 
 def _from_end(

@@ -15,8 +15,12 @@ from snrmjax.numerics.result import AbstractResult, Variable, setting
 from snrmjax.simulate.balance.given_numbers import frequency_range, positive
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, linear_coefficients
 from snrmjax.simulate.balance.labelled import HERTZ
-from snrmjax.simulate.continuation.continuation import CurveStatus, StepControl, TracedCurve
-from snrmjax.simulate.continuation.curve_tracing import response_balances, trace_through
+from snrmjax.simulate.continuation.continuation import CurveStatus
+from snrmjax.simulate.continuation.curve_tracing import (
+    lies_on,
+    response_balances,
+    trace_both_ways,
+)
 from snrmjax.simulate.continuation.response_curve import Branch, ResponseCurve, assembled
 from snrmjax.simulate.solutions.controlled import phase_controlled
 from snrmjax.simulate.solutions.forced_response import (
@@ -26,7 +30,6 @@ from snrmjax.simulate.solutions.forced_response import (
     solve_at_frequency,
 )
 
-_NEAR = 5e-3  # distance in scaled unknowns below which a motion lies on a known curve
 Start = tuple[Float[np.ndarray, "coefficient mode"], float]
 
 
@@ -137,10 +140,10 @@ def isolated_responses(
     found: list[ResponseCurve] = []
     n_known, n_not_traced = solved.n_outside, 0
     for point, origin in zip(solved.points, solved.origins, strict=True):
-        if any(_distance(point, curve) < _NEAR for curve in curves):
+        if any(lies_on(point, curve) for curve in curves):
             n_known += 1
             continue
-        traced = _both_ways(balances, point, ends, settings.steps)
+        traced = trace_both_ways(balances, point, ends, settings.steps)
         if len(traced.points) < 2:
             n_not_traced += 1
             continue
@@ -254,39 +257,3 @@ def _scaled(balance: HarmonicBalance, curve: ResponseCurve) -> np.ndarray:
     x = curve.coefficients.reshape(len(curve.frequency), -1) / float(balance.displacement_scale)
     omega = curve.frequency / float(balance.frequency_scale)
     return np.concatenate([x, omega[:, None]], axis=1)
-
-
-def _distance(point: np.ndarray, curve: np.ndarray) -> float:
-    """Distance of a point from the polyline through a curve's points."""
-    begin, step = curve[:-1], np.diff(curve, axis=0)
-    square = np.maximum(np.sum(step**2, axis=1), 1e-300)
-    share = np.clip(np.sum((point - begin) * step, axis=1) / square, 0.0, 1.0)
-    return float(np.min(np.linalg.norm(begin + share[:, None] * step - point, axis=1)))
-
-
-def _both_ways(
-    balances: HarmonicBalance,
-    point: np.ndarray,
-    ends: np.ndarray,
-    steps: StepControl,
-) -> TracedCurve:
-    """The curve through a point: once around, or from one end to the other."""
-    ways = []
-    for downward in (False, True):
-        way = trace_through(balances, ends, steps, downward=downward, starts=point[None])[0]
-        ways.append(way)
-        if way.status == CurveStatus.CLOSED:
-            return way
-    up, down = ways
-    back = down.reversed()
-    solves = up.n_solves + down.n_solves
-    if not len(up.points) or not len(back.points):
-        whole = up if len(up.points) else back
-        return whole._replace(n_solves=solves)
-    status = up.status if up.status != CurveStatus.UPPER_END else back.status
-    return TracedCurve(
-        np.concatenate([back.points[:-1], up.points]),
-        np.concatenate([back.tangents[:-1], up.tangents]),
-        status,
-        solves,
-    )
