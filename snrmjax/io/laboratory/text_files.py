@@ -50,19 +50,58 @@ def fields_of(line: str, separator: str) -> list[str]:
     return fields
 
 
-def number_in(field: str, decimal: str) -> float | None:
-    """The number in a field, or None: it is a text, or empty."""
-    plain = field.strip()
-    shape = _POINT if decimal == "point" else _COMMA
-    if not shape.fullmatch(plain):
+def number_in(field: str, decimal: str, *, thousands: bool = False) -> float | None:
+    """The number in a field, or None: it is a text, or empty.
+
+    Arguments: `thousands` also takes separators of thousands (the other mark, an apostrophe, a
+    blank or a thin one), as people's spreadsheets write them and instruments do not.
+
+    >>> number_in("1.729,21", "comma", thousands=True), number_in("1.729,21", "comma")
+    (1729.21, None)
+    """
+    match = _SHAPES[decimal, thousands].fullmatch(field.strip())
+    if match is None or match[0].lower() == "nan":
         return None
-    return float(re.sub("[dD]", "e", plain.replace(",", "."))) if plain.lower() != "nan" else None
-
-
-_POINT = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eEdD][+-]?[0-9]+)?|nan", re.I)
-_COMMA = re.compile(r"[+-]?(?:[0-9]+,?[0-9]*|,[0-9]+)(?:[eE][+-]?[0-9]+)?|nan", re.I)
+    plain = match[0].replace(match["mark"], "") if thousands and match["mark"] else match[0]
+    return float(re.sub("[dD]", "e", plain.replace(",", ".")))
 
 
 def is_number(field: str, decimal: str) -> bool:
-    """Whether a field is written as a number, "nan" included."""
-    return bool((_POINT if decimal == "point" else _COMMA).fullmatch(field.strip()))
+    """Whether a field is written as a number, "nan" and those with thousands included."""
+    return bool(_SHAPES[decimal, True].fullmatch(field.strip()))
+
+
+def has_thousands(field: str, decimal: str) -> bool:
+    """Whether a number has separators of thousands, by this decimal mark."""
+    match = _SHAPES[decimal, True].fullmatch(field.strip())
+    return match is not None and match["mark"] is not None
+
+
+def may_be_thousands(field: str, mark: str) -> bool:
+    """Whether a field is a number either way: with `mark` between thousands or as the decimal.
+
+    >>> [may_be_thousands(field, ".") for field in ("1.000", "-12.345", "0.500", "1.25", "998")]
+    [True, True, False, False, False]
+    """
+    return bool(_EITHER[mark].fullmatch(field.strip()))
+
+
+_MARKS = {"point": ".", "comma": ","}
+_GROUP = "'’ \u00a0\u2009\u202f"
+
+
+def _shape(decimal: str, *, thousands: bool) -> re.Pattern[str]:
+    mark = re.escape(_MARKS[decimal])
+    (other,) = (each for name, each in _MARKS.items() if name != decimal)
+    groups = rf"|[1-9][0-9]{{0,2}}(?P<mark>[{other}{_GROUP}])[0-9]{{3}}(?:(?P=mark)[0-9]{{3}})*"
+    whole = rf"(?:[0-9]+{groups if thousands else ''})"
+    number = rf"(?:{whole}(?:{mark}[0-9]*)?|{mark}[0-9]+)"
+    return re.compile(rf"[+-]?{number}(?:[eEdD][+-]?[0-9]+)?|nan", re.IGNORECASE)
+
+
+_SHAPES = {
+    (decimal, thousands): _shape(decimal, thousands=thousands)
+    for decimal in _MARKS
+    for thousands in (False, True)
+}
+_EITHER = {mark: re.compile(rf"[+-]?[1-9][0-9]{{0,2}}\{mark}[0-9]{{3}}") for mark in ".,"}

@@ -206,3 +206,59 @@ def test_a_number_of_very_many_digits_is_a_number(tmp_path):
     rows = "\n".join(f"{k},{10**25 + k}" for k in range(5))
     (table,) = read(tmp_path, f"f [Hz],v [m/s]\n{rows}\n", "a.csv").tables
     assert table.columns["v"].tolist() == [1e25] * 5
+
+
+@pytest.mark.parametrize(
+    ("separator", "mark", "decimal"),
+    [
+        *((";", ".", ","), (";", " ", ","), ("\t", " ", ","), ("\t", "\u2009", ".")),
+        *((";", "'", "."), (",", ".", ","), (",", ",", "."), ("\t", "\u202f", ",")),
+    ],
+)
+def test_separators_of_thousands(tmp_path, separator, mark, decimal):
+    def row(*fields):
+        words = [f"{one:,}".replace(",", "T").replace(".", decimal) for one in fields]
+        words = [word.replace("T", mark) for word in words]
+        quoted = [f'"{word}"' if separator in word else word for word in words]
+        return separator.join(quoted)
+
+    truth = [(998, 0.5, 1250.25, 12), (1000, 0.5, 1391, 1234567), (1001, 0.5, 1.25, -40)]
+    head = separator.join(["f [Hz]", "F [N]", "v [mm/s]", "n"])
+    held = read(tmp_path, "\n".join([head, *(row(*one) for one in truth)]), "a.csv")
+    np.testing.assert_array_equal(np.transpose(list(held.tables[0].columns.values())), truth)
+    assert sum(note.kind == "thousands" for note in held.notes) == 3
+
+
+@pytest.mark.parametrize(
+    ("rows", "complaint", "by_point", "by_comma"),
+    [
+        ("998;5\n1.000;5", r"is 1\.000 in row 3 of a\.csv 1 or 1000\?", [998, 1], [998, 1000]),
+        ("998;5\n1,001;5", r"1,001 in row 3 of a\.csv 1\.001 or 1001", [998, 1001], [998, 1.001]),
+        ("998;0.5\n1.000;0.5", "Column f has 998, too", [998, 1], [998, 1000]),
+        ("998;0,5\n1,000;0,5", "Column f has 998, too", [998, 1000], [998, 1]),
+    ],
+)
+def test_thousands_that_may_be_decimals_are_asked_about(
+    tmp_path, rows, complaint, by_point, by_comma
+):
+    text = f"f;F\n{rows}\n"
+    with pytest.raises(ValueError, match=f"{complaint}.*--decimal point or comma"):
+        read(tmp_path, text, "a.csv")
+    for decimal, wanted in (("point", by_point), ("comma", by_comma)):
+        told = {"separator": "semicolon", "decimal": decimal}
+        (table,) = read(tmp_path, text, "a.csv", **told).tables
+        assert table.columns["f"].tolist() == wanted
+
+
+def test_decimals_of_three_digits_and_columns_of_another_mark(tmp_path):
+    (table,) = read(tmp_path, "f v\n79.125 1.250\n80.000 1.391\n", "a.csv").tables
+    assert table.columns["v"].tolist() == [1.25, 1.391]
+    held = read(tmp_path, "f;F;v\n998;0,5;1.25\n1.000;0,5;1.391\n", "a.csv")
+    assert [one.tolist() for one in held.tables[0].columns.values()] == [
+        *([998, 1000], [0.5, 0.5], [1.25, 1.391])
+    ]
+    assert [note.kind for note in held.notes][:2] == ["thousands", "other_decimal"]
+    with pytest.raises(
+        ValueError, match=r"v of a\.csv has decimal commas and decimal points"
+    ):
+        read(tmp_path, "f;F;v\n998;0,5;1.25\n1.000;0,5;12,3911\n", "a.csv")
