@@ -258,7 +258,5 @@ def test_decimals_of_three_digits_and_columns_of_another_mark(tmp_path):
         *([998, 1000], [0.5, 0.5], [1.25, 1.391])
     ]
     assert [note.kind for note in held.notes][:2] == ["thousands", "other_decimal"]
-    with pytest.raises(
-        ValueError, match=r"v of a\.csv has decimal commas and decimal points"
-    ):
+    with pytest.raises(ValueError, match=r"v of a\.csv has decimal commas and decimal points"):
         read(tmp_path, "f;F;v\n998;0,5;1.25\n1.000;0,5;12,3911\n", "a.csv")
