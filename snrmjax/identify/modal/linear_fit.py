@@ -176,7 +176,7 @@ def _start(
         )
         raise ValueError(
             f"all modes {where} have negative damping ({listed}): the responses seem to be "
-            "conjugated (time dependence e^(-iΩt)); change the sign of their imaginary parts."
+            "conjugated (time dependence e^(-iΩt)): `modes --conjugated` takes their conjugates."
         )
     raise ValueError(
         f"no pole is stable over the model orders {where}: widen the band, raise the highest "
@@ -274,7 +274,7 @@ def _check_found(fit: SeparableFit, settings: BasisSettings) -> None:
         raise ValueError(
             f"all modes have negative damping ({100 * ratio[0]:.3g} % at "
             f"{natural[0] / HERTZ:.6g} Hz): the responses seem to be conjugated (time dependence "
-            "e^(-iΩt)); change the sign of their imaginary parts."
+            "e^(-iΩt)): `modes --conjugated` takes their conjugates."
         )
     if np.any(ratio <= 0) or np.any(ratio >= MOST_DAMPED):
         k = int(np.argmax((ratio <= 0) | (ratio >= MOST_DAMPED)))

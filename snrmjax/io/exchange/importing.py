@@ -75,7 +75,11 @@ def import_files(
     files = joined_files([read_laboratory_file(path, mapping.text_format) for path in paths])
     for held in files:
         datasets += _datasets(held, mapping, strict="dataset" in stated)
-        notes += [Fact("note_of_file", file=held.name, note=note) for note in held.notes]
+        notes += [
+            Fact("note_of_file", file=held.name, note=note)
+            for note in held.notes
+            if not (mapping.rate and note.kind == "rate_left_open")
+        ]
     if len({type(dataset.content) for dataset in datasets}) > 1:
         listed = ", ".join(f"{dataset.file}: {dataset.name}" for dataset in datasets)
         raise ValueError(f"files of one test must hold things of one kind, but have {listed}.")

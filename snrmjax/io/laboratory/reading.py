@@ -14,8 +14,8 @@ _READERS: dict[Kind, tuple[str, str]] = {
     "matlab": ("arrays.matlab_files", "read_matlab"),
     "hdf5": ("arrays.hdf5_tree", "read_hdf5"),
     "tdms": ("tdms_files", "read_tdms"),
-    "lvm": ("labview_text", "read_labview_text"),
-    "csv": ("separated_text", "read_separated_text"),
+    "lvm": ("text.labview_text", "read_labview_text"),
+    "csv": ("text.separated_text", "read_separated_text"),
 }
 _HEAD = 4096
 _MOST_REASONS = 6  # notes that say why nothing was read

@@ -6,6 +6,7 @@ from truths.import_runs import run_import
 
 from snrmjax.io.laboratory import read_laboratory_file
 from snrmjax.io.laboratory.contents import TextFormat
+from snrmjax.io.laboratory.record_tables import read_record_table
 
 RATE = 1000
 TIME = np.arange(80) / RATE
@@ -260,3 +261,47 @@ def test_decimals_of_three_digits_and_columns_of_another_mark(tmp_path):
     assert [note.kind for note in held.notes][:2] == ["thousands", "other_decimal"]
     with pytest.raises(ValueError, match=r"v of a\.csv has decimal commas and decimal points"):
         read(tmp_path, "f;F;v\n998;0,5;1.25\n1.000;0,5;12,3911\n", "a.csv")
+
+
+@pytest.mark.parametrize(
+    ("rate", "digits", "n", "start", "unit"),
+    [
+        *((5120, ".4g", 2000, 0.0, 1.0), (5120, ".5g", 2000, 12.5, 1.0)),
+        *((51200, ".5g", 8000, 0.0, 1e-3), (2048, ".4f", 900, -0.1, 1.0)),
+        *((1 / 0.00023, ".4g", 2000, 0.0, 1.0), (1024, ".3e", 700, 0.0, 1.0)),
+    ],
+)
+@pytest.mark.parametrize("cut", [False, True])
+def test_times_of_few_digits_are_even(tmp_path, rate, digits, n, start, unit, cut):
+    times = (start + np.arange(n) / rate) / unit
+    words = [f"{one:{digits}}" for one in times]
+    if cut:  # of the decimals of the first step, as some programs do not round
+        words = [repr(float(np.floor(one * 1e5 + 1e-6)) / 1e5) for one in times]
+    name = "t [ms]" if unit == 1e-3 else "t [s]"
+    rows = [f"{word},{0.1 * k!r}" for k, word in enumerate(words)]
+    held = read(tmp_path, "\n".join([f"{name},v [m/s]", *rows]), "a.csv")
+    (record,) = held.recordings
+    tolerance = 1e-4 if cut else 1e-12
+    assert record.sampling_rate == pytest.approx(rate, rel=tolerance)
+    assert record.start_time == pytest.approx(start, abs=1e-4 * unit)
+
+
+def test_uneven_times_of_few_digits_stay_a_column_and_an_open_rate_is_stated(tmp_path):
+    times = np.round(np.arange(300) / 5120, 3)
+    rows = [f"{one:.3f},{k / 8!r}" for k, one in enumerate(times)]
+    path = tmp_path / "a.csv"
+    path.write_text("\n".join(["t [s],v [m/s]", *rows]))
+    (note,) = (n for n in read_laboratory_file(path).notes if n.kind == "rate_left_open")
+    assert note["rate"] == 5120
+    words = (path, "--rate", 5120, "--record", "decay", "--response", "v", "--out", tmp_path / "o")
+    code, said = run_import(*words)
+    assert code == 0
+    assert "few digits" not in said
+    record = read_record_table(tmp_path / "o" / "record.csv")
+    assert record.sampling_rate == pytest.approx(5120, rel=1e-12)
+    # The same times in a table of our own, then with a gap of two samples.
+    path.write_text("\n".join(["time_s,velocity_m_s", *rows]))
+    assert read_record_table(path).sampling_rate == pytest.approx(5120, rel=1e-2)
+    gap = [f"{float(row.split(',')[0]) + 0.01 * (k > 150):.3f},1" for k, row in enumerate(rows)]
+    path.write_text("\n".join(["t [s],v [m/s]", *gap]))
+    assert "uneven_time" in [note.kind for note in read_laboratory_file(path).notes]

@@ -13,8 +13,8 @@ from snrmjax.io.laboratory.arrays.value_tree import Node, held
 from snrmjax.io.laboratory.contents import LaboratoryFile, TextFormat
 from snrmjax.io.laboratory.names import Label, label_of, role_of
 from snrmjax.io.laboratory.physical_units import unit_meaning
-from snrmjax.io.laboratory.text_columns import read_columns
-from snrmjax.io.laboratory.text_files import (
+from snrmjax.io.laboratory.text.columns import read_columns
+from snrmjax.io.laboratory.text.fields import (
     SEPARATORS,
     fields_of,
     has_thousands,

@@ -10,7 +10,7 @@ import pandas
 
 from snrmjax.io.files import shown
 from snrmjax.io.laboratory.contents import TextFormat
-from snrmjax.io.laboratory.text_files import (
+from snrmjax.io.laboratory.text.fields import (
     fields_of,
     has_thousands,
     is_number,
