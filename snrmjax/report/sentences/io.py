@@ -19,7 +19,6 @@ _NOT_READ = {
     "type": "is of a type that is not read",
     "times_of_day": "holds times of day",
     "sparse": "is a sparse matrix: save numbers, text, structs and cells",
-    "object": "is a function handle or an object: save numbers, text, structs and cells",
     "circle": "links in a circle or nests too deeply",
     "other_file": "is a link to another file",
     "elsewhere": "lies in other files",
@@ -70,6 +69,11 @@ SENTENCES: dict[str, Wording] = {
     ),
     # Notes on files of laboratories.
     "not_read": lambda name, why: f"{name} {_NOT_READ[why]}; not read.",
+    "object_not_read": lambda name, kind: (
+        f"{name} is a {'function handle' if kind == 'function_handle' else f'MATLAB {kind}'}; not "
+        "read: save numbers, text, structs and cells"
+        + (f" (table2struct({name}, 'ToScalar', true))." if kind == "table" else ".")
+    ),
     "nothing_measured": lambda names: (
         "it has only texts, single numbers and empty arrays"
         + (f" ({', '.join(names)})." if names else ".")

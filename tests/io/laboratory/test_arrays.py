@@ -1,6 +1,7 @@
 """MATLAB, HDF5 and netCDF files by scipy, h5py and xarray: what their structs hold."""
 
 import struct
+import zlib
 
 import h5py
 import numpy as np
@@ -199,8 +200,43 @@ def test_function_handles_and_objects_are_named(tmp_path):
 
     write_v73(path, fill)
     found = read_laboratory_file(path)
-    assert [note["why"] for note in found.notes] == ["object", "object"]
+    named = [(note["name"], note["kind"]) for note in found.notes]
+    assert named == [("f", "function_handle"), ("s", "string")]
     assert set(found.tables[0].columns) == {"x"}
+
+
+def object_of_matlab(name, kind):
+    """A variable of level 5 that is an object, as MATLAB writes tables, strings and datetimes."""
+
+    def element(number, data):
+        return struct.pack("<II", number, len(data)) + data + bytes(-len(data) % 8)
+
+    marks = np.array([3707764736, 2, 1, 1, 1, 1], dtype="<u4")
+    flags = element(6, struct.pack("<II", 13, 0))
+    inner = flags + element(5, struct.pack("<ii", 6, 1)) + element(1, b"")
+    inner = element(14, inner + element(6, marks.tobytes()))
+    texts = b"".join(element(1, word.encode()) for word in (name, "MCOS", kind))
+    return element(14, element(6, struct.pack("<II", 17, 0)) + texts + inner)
+
+
+@pytest.mark.parametrize("is_compressed", [False, True])
+@pytest.mark.parametrize("kinds", [("table",), ("string", "datetime", "containers.Map")])
+def test_objects_beside_plain_arrays_are_named(tmp_path, kinds, is_compressed):
+    path = tmp_path / "objects.mat"
+    scipy.io.savemat(path, {"frequency": HERTZ, "s": {"force": 1.0}}, do_compression=is_compressed)
+    for kind in kinds:
+        packed = object_of_matlab(f"a_{kind[:3]}", kind)
+        if is_compressed:
+            packed = zlib.compress(packed)
+            packed = struct.pack("<II", 15, len(packed)) + packed
+        path.write_bytes(path.read_bytes() + packed)
+    found = read_laboratory_file(path)
+    np.testing.assert_array_equal(found.tables[0].columns["frequency"], HERTZ)
+    named = [(note["name"], note["kind"]) for note in found.notes]
+    assert named == [(f"a_{kind[:3]}", kind) for kind in kinds]
+    path.write_bytes(path.read_bytes()[:128] + object_of_matlab("T", "timetable"))
+    with pytest.raises(ValueError, match=r"nothing that could be read: T is a MATLAB timetable"):
+        read_laboratory_file(path)
 
 
 def test_links_to_other_files_are_not_followed(tmp_path):

@@ -110,7 +110,8 @@ def _object(walk: _Walk, item: Any, name: str) -> Node | None:
     """A group or data set as a node, or None with a note."""
     kind = _attribute(item, "MATLAB_class")
     if "MATLAB_object_decode" in item.attrs or kind in ("function_handle", "opaque"):
-        return walk.leave_out(name, "object")
+        walk.notes.append(Fact("object_not_read", name=name, kind=kind or "object"))
+        return None
     if isinstance(item, walk.h5py.Group):
         return _structs(_group(walk, item)) if kind == "struct" else _group(walk, item)
     if not isinstance(item, walk.h5py.Dataset) or "MATLAB_empty" in item.attrs:

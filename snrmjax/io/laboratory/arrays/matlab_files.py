@@ -2,8 +2,10 @@
 
 import struct
 import warnings
+import zlib
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,6 +17,8 @@ from snrmjax.io.laboratory.libraries import damaged_if_it_fails
 from snrmjax.numerics.facts import Fact
 
 _MATRIX, _COMPRESSED = 14, 15  # types of elements
+_OPAQUE = 17  # class of an object's array
+_HEADER = 4096  # bytes in which a variable's header ends
 _LARGEST = 2**29  # bytes of a file before v7.3, which is read whole, and numbers of its variables
 
 
@@ -45,18 +49,74 @@ def _tree_of_old(path: Path) -> tuple[dict[str, Node], list[Fact]]:
     with damaged_if_it_fails(path.name, "a MATLAB file"), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of several objects, which all have no name
         # Headers first: a compressed variable may state more than any memory holds.
-        for name, sides, _ in scipy.io.whosmat(path):
-            if np.prod(sides, dtype=float) > _LARGEST:
-                raise ValueError(f"{name} states {' by '.join(map(str, sides))} numbers")
         content = path.read_bytes()
         if content.startswith(b"MATLAB 5"):
-            _check_elements(memoryview(content)[128:], "<" if content[126:128] == b"IM" else ">")
-        loaded: dict[str, Any] = scipy.io.loadmat(path, mat_dtype=False)
-    notes: list[Fact] = []
+            order = "<" if content[126:128] == b"IM" else ">"
+            _check_elements(memoryview(content)[128:], order)
+            variables = list(_headers(memoryview(content)[128:], order))
+        else:
+            variables = [_Header(name, sides) for name, sides, _ in scipy.io.whosmat(path)]
+        for name, sides, _ in variables:
+            if np.prod(sides, dtype=float) > _LARGEST:
+                raise ValueError(f"{name} states {' by '.join(map(str, sides))} numbers")
+        plain = [one.name for one in variables if not one.object_class]
+        loaded: dict[str, Any] = scipy.io.loadmat(path, mat_dtype=False, variable_names=plain)
+    notes = [
+        Fact("object_not_read", name=one.name, kind=one.object_class)
+        for one in variables
+        if one.object_class and one.name
+    ]
     nodes = {
         key: _node(variable, key, notes) for key, variable in loaded.items() if key[:2] != "__"
     }
     return {key: node for key, node in nodes.items() if node is not None}, notes
+
+
+class _Header(NamedTuple):
+    """Name and sides of a variable, or the class of an object (a table, a string, a datetime)."""
+
+    name: str
+    sides: tuple[int, ...] = ()
+    object_class: str = ""
+
+
+def _headers(content: memoryview, order: str) -> Iterator[_Header]:
+    """What stands before the numbers of every variable of a file of level 5.
+
+    An object has no sides: behind its name stand "MCOS" (or "java") and its class.
+    """
+    at = 0
+    while at + 8 <= len(content):
+        kind, size = struct.unpack_from(f"{order}II", content, at)
+        body = content[at + 8 : at + 8 + size]
+        if kind == _COMPRESSED:
+            body = memoryview(zlib.decompressobj().decompress(body, _HEADER))[8:]
+        parts = _parts(body, order)
+        flags = next(parts)
+        array_class = struct.unpack_from(f"{order}I", flags)[0] & 0xFF if len(flags) > 3 else 0
+        if array_class == _OPAQUE:
+            name, _, object_class = (bytes(next(parts)).decode("latin1") for _ in range(3))
+            yield _Header(name, (), object_class or "object")
+        elif array_class:
+            sides = next(parts)
+            numbers = struct.unpack(f"{order}{len(sides) // 4}i", sides[: len(sides) // 4 * 4])
+            yield _Header(bytes(next(parts)).decode("latin1"), numbers)
+        at += 8 + (size if kind == _COMPRESSED else -(-size // 8) * 8)
+
+
+def _parts(content: memoryview, order: str) -> Iterator[memoryview]:
+    """The contents of the elements that stand one behind another; empty ones at the end."""
+    at = 0
+    while at + 8 <= len(content):
+        kind, size = struct.unpack_from(f"{order}II", content, at)
+        if kind >> 16:
+            yield content[at + 4 : at + 4 + (kind >> 16)]
+            at += 8
+        else:
+            yield content[at + 8 : at + 8 + size]
+            at += 8 + -(-size // 8) * 8
+    while True:
+        yield memoryview(b"")
 
 
 def _check_elements(content: memoryview, order: str) -> None:
@@ -79,8 +139,13 @@ def _check_elements(content: memoryview, order: str) -> None:
 def _node(value: Any, name: str, notes: list[Fact]) -> Node | None:
     """A loaded value as a node, or None with a note unless it is empty."""
     if type(value) is not np.ndarray:
-        why = "sparse" if hasattr(value, "tocoo") else "object"
-        notes.append(Fact("not_read", name="a variable" if name == "None" else name, why=why))
+        if hasattr(value, "tocoo"):
+            notes.append(Fact("not_read", name=name, why="sparse"))
+            return None
+        names = value.dtype.names or ()
+        kind = value.reshape(-1)[0]["s2"].decode("latin1") if "s2" in names else ""
+        kind = kind or getattr(value, "classname", "") or "function_handle"
+        notes.append(Fact("object_not_read", name=name, kind=kind))
         return None
     if value.dtype.names:
         structs = []
