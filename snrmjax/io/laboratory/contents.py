@@ -11,7 +11,7 @@ from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.numerics.facts import Fact
 
-Kind = Literal["uff", "matlab", "hdf5", "netcdf", "tdms", "lvm", "csv"]
+Kind = Literal["uff", "matlab", "octave", "hdf5", "netcdf", "tdms", "lvm", "csv"]
 
 
 class NumberTable(NamedTuple):

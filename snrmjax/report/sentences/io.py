@@ -70,7 +70,7 @@ SENTENCES: dict[str, Wording] = {
     # Notes on files of laboratories.
     "not_read": lambda name, why: f"{name} {_NOT_READ[why]}; not read.",
     "object_not_read": lambda name, kind: (
-        f"{name} is a {'function handle' if kind == 'function_handle' else f'MATLAB {kind}'}; not "
+        f"{name} is a {kind.replace('_', ' ')}{' of MATLAB' * (kind != 'function_handle')}; not "
         "read: save numbers, text, structs and cells"
         + (f" (table2struct({name}, 'ToScalar', true))." if kind == "table" else ".")
     ),

@@ -235,7 +235,7 @@ def test_objects_beside_plain_arrays_are_named(tmp_path, kinds, is_compressed):
     named = [(note["name"], note["kind"]) for note in found.notes]
     assert named == [(f"a_{kind[:3]}", kind) for kind in kinds]
     path.write_bytes(path.read_bytes()[:128] + object_of_matlab("T", "timetable"))
-    with pytest.raises(ValueError, match=r"nothing that could be read: T is a MATLAB timetable"):
+    with pytest.raises(ValueError, match=r"nothing that could be read: T is a timetable of MATLAB"):
         read_laboratory_file(path)
 
 
@@ -336,4 +336,157 @@ def test_elements_of_no_type_are_refused(tmp_path):
     content[at : at + 8] = bytes(8)
     path.write_bytes(content)
     with pytest.raises(ValueError, match=r"zeros\.mat is damaged .*type 0"):
+        read_laboratory_file(path)
+
+
+OCTAVE = """# Created by Octave 6.4.0, Mon Jan 05 10:00:00 2026 UTC <user@host>
+# name: test
+# type: scalar struct
+# ndims: 2
+ 1 1
+# length: 7
+# name: frequency
+# type: range
+# base, limit, increment
+79 80 0.5
+
+
+# name: force
+# type: int32 matrix
+# ndims: 2
+ 3 1
+  1
+  2
+  4
+
+
+# name: velocity
+# type: float complex matrix
+# rows: 1
+# columns: 3
+ (1,0.5) (NaN,-2) (-3e-2,0)
+
+
+# name: ok
+# type: bool matrix
+# rows: 3
+# columns: 1
+ 1
+ 0
+ 1
+
+
+# name: title
+# type: string
+# elements: 1
+# length: 5
+a tip
+
+
+# name: f
+# type: function handle
+@<anonymous>
+@ (x) x .^ 2
+
+
+# name: gain
+# type: scalar
+2.5
+
+
+
+
+# name: levels
+# type: cell
+# rows: 1
+# columns: 2
+# name: <cell-element>
+# type: scalar struct
+# ndims: 2
+ 1 1
+# length: 2
+# name: frequency
+# type: matrix
+# rows: 2
+# columns: 1
+ 10
+ 11
+
+
+# name: force
+# type: scalar
+0.1
+
+
+
+
+# name: <cell-element>
+# type: scalar struct
+# ndims: 2
+ 1 1
+# length: 2
+# name: frequency
+# type: matrix
+# rows: 2
+# columns: 1
+ 10
+ 12
+
+
+# name: force
+# type: scalar
+0.2
+
+
+
+
+
+
+
+# name: S
+# type: sparse matrix
+# nnz: 1
+# rows: 2
+# columns: 2
+1 1 3
+
+
+"""
+
+
+def test_the_text_format_of_octave(tmp_path):
+    path = tmp_path / "a.mat"
+    path.write_text(OCTAVE)
+    found = read_laboratory_file(path)
+    assert found.kind == "octave"
+    named = {table.name: table for table in found.tables}
+    columns = named["test"].columns
+    np.testing.assert_array_equal(columns["frequency"], HERTZ)
+    np.testing.assert_array_equal(columns["force"], [1, 2, 4])
+    np.testing.assert_array_equal(columns["velocity"], [1 + 0.5j, np.nan - 2j, -0.03])
+    assert columns["ok"].dtype == bool
+    levels = named["levels"].columns
+    assert levels["force"].tolist() == [0.1, 0.1, 0.2, 0.2]
+    assert levels["frequency"].tolist() == [10, 11, 10, 12]
+    said = [(note.kind, note["name"]) for note in found.notes]
+    assert ("object_not_read", "test.f") in said
+    assert ("not_read", "S") in said
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "complaint"),
+    [
+        ("# columns: 3", "# columns: 4", "have 3 numbers, but 4 are stated"),
+        ("# rows: 2", "# rows: 200", "it ends within a variable"),
+        ("# rows: 2", "# rows: -2", "line 69 must be a number of rows, but is '-2'"),
+        ("79 80 0.5", "79 80 0", "must be base, limit and increment of test.frequency"),
+        ("79 80 0.5", "79 80 1e-12", "a range of less than"),
+        (" 10\n", " 1x\n", "must be numbers"),
+        ("# type: bool", "# kind: bool", "must be # type: …, but is '# kind: bool matrix'"),
+    ],
+)
+def test_damaged_text_of_octave_is_refused(tmp_path, old, new, complaint):
+    path = tmp_path / "a.mat"
+    path.write_text(OCTAVE.replace(old, new))
+    with pytest.raises(ValueError, match=rf"a\.mat is (cut|damaged): .*{complaint}"):
         read_laboratory_file(path)
