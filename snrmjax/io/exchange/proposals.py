@@ -15,7 +15,12 @@ from snrmjax.io.exchange.importing import import_files, joined_files
 from snrmjax.io.exchange.record_import import mapped_record
 from snrmjax.io.laboratory.contents import LaboratoryFile, NumberTable
 from snrmjax.io.laboratory.names import is_of_base, role_of
-from snrmjax.io.laboratory.physical_units import UnitMeaning, size_of, unit_meaning
+from snrmjax.io.laboratory.physical_units import (
+    UnitMeaning,
+    level_reference,
+    size_of,
+    unit_meaning,
+)
 from snrmjax.measure.recordings.channels import DERIVATIVE, Channel
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
 from snrmjax.measure.recordings.time_recording import TimeRecording
@@ -127,12 +132,13 @@ class _Motion(NamedTuple):
     quantity: str
     meaning: UnitMeaning | None
     is_stated: bool  # quantity and unit are the file's
+    unit_word: str = "UNIT"
 
     @property
     def base_word(self) -> str:
         """As `--base` wants it, with the quantity always."""
         known = self.quantity if self.quantity in DERIVATIVE else "QUANTITY"
-        return f"{self.name}:{known}" + ("" if self.is_stated else ":UNIT")
+        return f"{self.name}:{known}" + ("" if self.is_stated else f":{self.unit_word}")
 
     @property
     def word(self) -> str:
@@ -141,10 +147,13 @@ class _Motion(NamedTuple):
 
 
 def _motion_of(name: str, unit: str, role: str) -> _Motion:
+    reference = level_reference(unit)
     try:
-        meaning = unit_meaning(unit)
+        meaning = unit_meaning(unit if reference is None else reference)
     except ValueError:
         return _Motion(name, role, None, False)
+    if reference == "":
+        return _Motion(name, role, None, False, "dB re UNIT")
     is_motion = meaning.quantity in DERIVATIVE and not meaning.per_volt
     return _Motion(name, meaning.quantity if is_motion else role, meaning, is_motion)
 

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
+from snrmjax.io.exchange.decibels import with_stated_references
 from snrmjax.io.exchange.import_levels import MeasuredPart
 from snrmjax.io.exchange.import_map import BY_NAME, Assumptions, ImportMap, ResponseMap
 from snrmjax.io.exchange.import_units import (
@@ -20,6 +21,7 @@ from snrmjax.io.exchange.import_units import (
 )
 from snrmjax.io.laboratory.contents import NumberTable
 from snrmjax.io.laboratory.names import label_of, role_of
+from snrmjax.io.laboratory.physical_units import level_reference
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.velocity_states import velocity_factors
 from snrmjax.measure.states import UNNAMED_SENSOR
@@ -83,6 +85,7 @@ def import_table(
     Raises `ValueError` with a question that names the option for what cannot be told.
     """
     mapping = mapping.with_names({name: table.units.get(name, "") for name in table.columns})
+    table, mapping, notes = with_stated_references(table, mapping, file)
     source = _Source(table, mapping, file, assumed)
     mapping = mapping._replace(frequency=mapping.frequency or _frequency_column(source))
     source = source._replace(mapping=mapping)
@@ -131,7 +134,7 @@ def import_table(
         *(amplitude_std[good], phase_std[good]),
     )
     left_out = int(np.sum(~good))
-    notes = [Fact("rows_incomplete", n=left_out, of=len(good), file=file)] if left_out else []
+    notes += [Fact("rows_incomplete", n=left_out, of=len(good), file=file)] if left_out else []
     return part, mapping, force, notes
 
 
@@ -380,6 +383,11 @@ def _bare(name: str) -> str:
 
 def _deviations(source: _Source, name: str, option: str) -> Float[np.ndarray, " row"]:
     values = np.real(source.column(name, option)).astype(float)
+    if level_reference(source.unit(name)) is not None:
+        raise ValueError(
+            f"{name} of {source.file} must be standard deviations in the unit of their column, but "
+            f"is in {source.unit(name)}: {option} names another column."
+        )
     bad = np.flatnonzero(values < 0)
     if bad.size:
         raise ValueError(

@@ -6,7 +6,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Num
 
-from snrmjax.io.laboratory.names import label_of, role_of
+from snrmjax.io.laboratory.names import column_unit, role_of
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.numerics.facts import Fact
@@ -34,7 +34,7 @@ class NumberTable(NamedTuple):
 
     def with_named_units(self) -> "NumberTable":
         """With the units that names of columns have in them, where the file states none."""
-        said = {name: self.units.get(name) or label_of(name).unit for name in self.columns}
+        said = {name: column_unit(name, self.units.get(name, "")) for name in self.columns}
         return self._replace(units={name: unit for name, unit in said.items() if unit})
 
     @property

@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float
 
 from snrmjax.io.files import FilePath
-from snrmjax.io.laboratory.names import label_of
-from snrmjax.io.laboratory.physical_units import channel_meaning
+from snrmjax.io.laboratory.names import column_unit
+from snrmjax.io.laboratory.physical_units import channel_meaning, level_reference
 from snrmjax.io.laboratory.printed_times import rate_of_printed_times
 from snrmjax.io.rows import header_of, read_cells
 from snrmjax.measure.recordings.channels import Channel, Quantity
@@ -72,8 +72,10 @@ def with_named_channels(recording: TimeRecording) -> TimeRecording:
 
 
 def _named(channel: Channel) -> Channel:
-    unit = channel.unit or label_of(channel.name).unit
+    unit = column_unit(channel.name, channel.unit)
     quantity, calibration = channel_meaning(unit)
+    if level_reference(unit) is not None:
+        return channel._replace(quantity="unknown", unit=unit, calibration=1.0)
     if channel.quantity != "unknown" or quantity == "unknown":
         return channel
     ours = (re.fullmatch(rf"(.+)[._]{column}", channel.name) for column in _COLUMNS)

@@ -86,6 +86,7 @@ SENTENCES: dict[str, Wording] = {
     "responses_along_first_side": "responses along the first side that is not the frequency's.",
     "columns_numbered": "no row of names above the numbers: the columns are numbered.",
     "comments_not_read": "{n:#line} of comment among the numbers not read.",
+    "level_as_amplitude": "{name} is a level in {unit}: its amplitudes are taken.",
     "thousands": "column {name} has separators of thousands: {text} is {number:.10g}.",
     "other_decimal": "column {name} has a decimal {decimal}, unlike other columns.",
     "empty_fields": "column {name} has {n:#empty field}.",

@@ -7,7 +7,7 @@ import numpy as np
 
 from snrmjax.io.laboratory.arrays.value_tree import ChannelPlace, Numbers, PlacedSamples
 from snrmjax.io.laboratory.names import label_of, role_of
-from snrmjax.io.laboratory.physical_units import channel_meaning, unit_meaning
+from snrmjax.io.laboratory.physical_units import channel_meaning, level_reference, unit_meaning
 from snrmjax.io.laboratory.printed_times import rate_of_printed_times
 from snrmjax.io.units import HERTZ
 from snrmjax.measure.recordings.channels import Channel, Quantity
@@ -121,7 +121,7 @@ def _channel(name: str, said: Mapping[str, str]) -> Channel:
     """A channel with what the file says of it."""
     unit = said.get("unit", "")
     quantity, calibration = channel_meaning(unit)
-    if quantity == "unknown":
+    if quantity == "unknown" and level_reference(unit) is None:
         known: tuple[Quantity, ...] = get_args(Quantity)
         quantity = next((name for name in known if name == said.get("quantity")), "unknown")
     place = said.get("point", ""), said.get("direction", "")

@@ -12,7 +12,7 @@ from snrmjax.io.laboratory.arrays.structs import read_struct
 from snrmjax.io.laboratory.arrays.value_tree import Node, held
 from snrmjax.io.laboratory.contents import LaboratoryFile, TextFormat
 from snrmjax.io.laboratory.names import Label, label_of, role_of
-from snrmjax.io.laboratory.physical_units import unit_meaning
+from snrmjax.io.laboratory.physical_units import level_reference, unit_meaning
 from snrmjax.io.laboratory.text.columns import read_columns
 from snrmjax.io.laboratory.text.fields import (
     SEPARATORS,
@@ -313,6 +313,8 @@ def _repeated(names: Sequence[str], fewest: int) -> int:
 def _all_units(fields: list[str]) -> bool:
     """Whether a row is one of units: each is understood or empty, and one at least has letters."""
     for field in fields:
+        if level_reference(field.strip("()")) is not None:
+            continue
         try:
             unit_meaning(field.strip("()"))
         except ValueError:
