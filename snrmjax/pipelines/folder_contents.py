@@ -173,7 +173,7 @@ def read_test_files(
         elif suffix == ".csv" and is_own_file(path):
             states.append(NamedStates(path.name, read_steady_states(path), path))
         else:
-            raw.append(read_laboratory_file(path, told.text_format))
+            raw.append(read_laboratory_file(path, told.text_format, told.even_axis))
     assumed_of: dict[str, list[str]] = {}  # files by what was assumed of them
     for held in raw:
         ask_for_rate(held.notes, told.rate, held.name)
@@ -220,7 +220,7 @@ def read_test_files(
 def _measured_text(path: Path, told: ImportMap) -> LaboratoryFile | None:
     """A text that holds measurements: numbers with a frequency or a time; None of any other."""
     try:
-        held = read_laboratory_file(path, told.text_format)
+        held = read_laboratory_file(path, told.text_format, told.even_axis)
     except ValueError:
         return None  # what people wrote is shown as it is
     axes = {table.role(name) for table in held.tables for name in table.columns}

@@ -26,7 +26,10 @@ from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
 from snrmjax.measure.recordings.time_recording import TimeRecording
 
 _TO_FILL_IN = re.compile(r"\b(COLUMN|CHANNEL|QUANTITY|UNIT|NEWTONS|AMPLITUDE|SENSOR)\b")
-_OTHERS = ("frequency", "force", "drive", "phase", "imaginary", "level", "deviation", "time")
+_OTHERS = (
+    *("frequency", "force", "drive", "phase", "imaginary", "level", "deviation", "time", "mark"),
+    "coherence",
+)
 _TRIED = 2**21  # samples of a record that is read to see whether it is of steps or sweeps
 _RADIANS = 1.01 * np.pi  # which phases in radians do not exceed
 _A_TURN = 1.0  # rad that phases of a resonance cover at least
@@ -64,6 +67,9 @@ def proposed_commands(paths: Sequence[Path], files: Sequence[LaboratoryFile]) ->
     held = joined_files(files)[0]
     if held.tables and is_ours(held.tables[0].columns):
         return [f"it has our own columns: `snrmjax check`, `identify` and `test` take {held.name}."]
+    if any(note.kind == "responses_without_axis" for note in held.notes) and not held.responses:
+        words = f"snrmjax import {named} --frequency-start HZ --frequency-step HZ"
+        return ["state the frequencies of the responses (fill in HZ):", f"  {words}"]
     contents: list[_Content] = [*held.recordings, *held.tables, *held.responses]
     content = contents[0]
     found = _options_of(content)
@@ -167,7 +173,7 @@ def _of_table(table: NumberTable) -> _Options:
 
     if len(of("frequency")) != 1:
         found["frequency"] = next(iter(of("frequency")), "COLUMN")
-    numbers = [name for name in table.columns if roles[name] not in (*_OTHERS, "coherence")]
+    numbers = [name for name in table.columns if roles[name] not in _OTHERS]
     named = [_motion_of(name, table.units.get(name, ""), roles[name]) for name in numbers]
     loads = of("force") or of("drive")
     moved = [] if loads else [one for one in named if is_of_base(one.name)][:1]
@@ -297,7 +303,8 @@ def _modes(named: str, sets: object) -> list[str]:
         return []
     if any(one.quantity not in DERIVATIVE for one in sets.responses):
         return [
-            "`snrmjax modes` needs to know which motions these are, and the file states no unit."
+            "`snrmjax modes` needs to know which motions these are, and the file states no unit: "
+            "import them as above with the force 1, and give it measured.csv."
         ]
     reference = sets.references[0]
     of_base = reference.quantity in DERIVATIVE

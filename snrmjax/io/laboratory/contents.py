@@ -29,8 +29,9 @@ class NumberTable(NamedTuple):
     words: Mapping[str, tuple[str, ...]] = {}
 
     def role(self, name: str) -> str:
-        """What a column is, by its name and its unit; see `role_of`."""
-        return role_of(name, self.units.get(name, ""))
+        """What a column is, by its name and its unit; see `role_of`. Truth values are marks."""
+        is_mark = self.columns[name].dtype == bool
+        return "mark" if is_mark else role_of(name, self.units.get(name, ""))
 
     def with_named_units(self) -> "NumberTable":
         """With the units that names of columns have in them, where the file states none."""

@@ -29,6 +29,8 @@ _ROLES = {
     "drive": r"\w*(drive|volt\w*|source|generator|amplifier|signal|spannung)\w*|"
     r"v_?(in|out|exc)|u",
     "force": r"\w*(force|kraft|load_?cell|hammer|impedance_?head_?f)\w*|fexc|f_?amp\w*|lc\w*",
+    "mark": r"flags?|\w*_flags?|valid\w*|ok|is_\w+|overload\w*|ovld?|clipped|settled|converged|"
+    r"status|quality|mask|reject\w*|outlier\w*|n?_?(avg|averages)|error_?code\w*",
     "coherence": r"\w*coh\w*",
     "velocity": r"\w*(velo\w*|vibrometer|ldv|geschw\w*|vitesse)|v|vel\w*",
     "acceleration": r"\w*(acc\w*|beschl\w*)|a",

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import scipy.io
 import xarray
+from truths.import_runs import run_import
 
 from snrmjax.io.laboratory import read_laboratory_file
 
@@ -490,3 +491,62 @@ def test_damaged_text_of_octave_is_refused(tmp_path, old, new, complaint):
     path.write_text(OCTAVE.replace(old, new))
     with pytest.raises(ValueError, match=rf"a\.mat is (cut|damaged): .*{complaint}"):
         read_laboratory_file(path)
+
+
+@pytest.mark.parametrize("version", ["v5", "v7.3"])
+@pytest.mark.parametrize(
+    ("names", "unit", "is_vector"),
+    [(("fstart", "df"), 1.0, False), (("freq_start_kHz", "f_step_kHz"), 1e3, True)],
+)
+def test_a_start_and_a_step_are_the_axis_of_responses(tmp_path, version, names, unit, is_vector):
+    h = np.arange(1, 41).reshape(2, 20) * (1 + 2j)
+    single = {names[0]: 10.0 / unit, names[1]: 0.25 / unit}
+    arrays = {"H": h[0] if is_vector else h.T, "flags": (np.arange(20) % 2).astype(np.int16)}
+    path = tmp_path / "frf.mat"
+    if version == "v5":
+        scipy.io.savemat(path, {**single, **arrays})
+    else:
+
+        def fill(file):
+            for key, value in {**single, **arrays}.items():
+                put(file, key, np.atleast_2d(value))
+
+        write_v73(path, fill)
+    found = read_laboratory_file(path)
+    (one,) = found.responses
+    np.testing.assert_allclose(one.frequency, 2 * np.pi * (10 + 0.25 * np.arange(20)), rtol=1e-13)
+    np.testing.assert_array_equal(one.values[:, 0], h[:1] if is_vector else h)
+    assert not found.tables
+    assert [note.kind for note in found.notes if note.kind != "responses_along_first_side"] == [
+        *("even_axis", "not_read")
+    ]
+    assert any(note.get("why") == "marks" for note in found.notes)
+
+
+def test_an_axis_that_is_stated_and_marks_beside_responses(tmp_path):
+    path, out = tmp_path / "frf.mat", tmp_path / "out"
+    h, valid = np.arange(1, 41).reshape(2, 20) * (1 + 2j), np.arange(20) > 3
+    scipy.io.savemat(path, {"H": h, "valid": valid})
+    code, said = run_import(path)
+    assert code == 0
+    assert "snrmjax import" in said
+    assert "--frequency-start HZ --frequency-step HZ" in said
+    words = ("--response", "H.2:velocity:m/s", "--force-amplitude", 2, "--out", out)
+    axis = ("--frequency-start", 10, "--frequency-step", 0.25)
+    code, said = run_import(path, *axis, *words)
+    assert code == 0, said
+    table = np.genfromtxt(out / "measured.csv", delimiter=",", names=True)
+    np.testing.assert_allclose(table["frequency_hz"], 10 + 0.25 * np.arange(20), rtol=1e-13)
+    np.testing.assert_allclose(table["velocity_im_m_s"], 2 * h[1].imag, rtol=1e-13)
+    # The map of that import reads the next file alike.
+    code, said = run_import(path, "--map", out / "map.toml", "--out", tmp_path / "again")
+    assert (tmp_path / "again" / "measured.csv").read_text() == (out / "measured.csv").read_text()
+    assert "needs --frequency-step" in run_import(path, *axis[:2], *words)[1]
+    scipy.io.savemat(path, {"H": h, "f": 10 + np.arange(20), "valid": valid})
+    assert "--frequency-step has no effect" in run_import(path, *axis, *words)[1]
+    found = read_laboratory_file(path)
+    assert not found.tables
+    assert len(found.responses) == 1
+    # A truth value is never proposed as the response of a table.
+    scipy.io.savemat(path, {"f": 10 + np.arange(20), "good": valid, "v": h[0].real})
+    assert "--response v:" in run_import(path)[1]

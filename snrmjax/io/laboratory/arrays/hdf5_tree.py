@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from snrmjax.io.laboratory.arrays.even_axis import EvenAxis
 from snrmjax.io.laboratory.arrays.structs import file_of_tree
 from snrmjax.io.laboratory.arrays.value_tree import Node, Numbers, Selection, held
 from snrmjax.io.laboratory.contents import LaboratoryFile
@@ -62,10 +63,10 @@ def open_tree(path: Path) -> tuple[dict[str, Node], list[Fact]]:
         return _group(walk, file), notes
 
 
-def read_hdf5(path: Path) -> LaboratoryFile:
+def read_hdf5(path: Path, axis: EvenAxis | None = None) -> LaboratoryFile:
     """An HDF5 or netCDF 4 file. Raises `ValueError` as `read_laboratory_file` does."""
     netcdf = path.suffix.lower() in _NETCDF
-    return file_of_tree(path.name, "netcdf" if netcdf else "hdf5", *open_tree(path))
+    return file_of_tree(path.name, "netcdf" if netcdf else "hdf5", *open_tree(path), axis)
 
 
 def _group(walk: _Walk, group: Any) -> dict[str, Node]:

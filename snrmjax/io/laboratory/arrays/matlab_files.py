@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from snrmjax.io.laboratory.arrays.even_axis import EvenAxis
 from snrmjax.io.laboratory.arrays.hdf5_tree import open_tree
 from snrmjax.io.laboratory.arrays.structs import file_of_tree
 from snrmjax.io.laboratory.arrays.value_tree import Node, held
@@ -28,11 +29,12 @@ def is_old_matlab(head: bytes, suffix: str) -> bool:
     return head.startswith(b"MATLAB 5") or (suffix.lower() == ".mat" and min(first) < 5000)
 
 
-def read_matlab(path: Path) -> LaboratoryFile:
+def read_matlab(path: Path, axis: EvenAxis | None = None) -> LaboratoryFile:
     """A MATLAB file. Raises `ValueError` as `read_laboratory_file` does."""
     with open(path, "rb") as file:
         is_old = is_old_matlab(file.read(8), path.suffix)
-    return file_of_tree(path.name, "matlab", *(_tree_of_old(path) if is_old else open_tree(path)))
+    tree, notes = _tree_of_old(path) if is_old else open_tree(path)
+    return file_of_tree(path.name, "matlab", tree, notes, axis)
 
 
 def _tree_of_old(path: Path) -> tuple[dict[str, Node], list[Fact]]:

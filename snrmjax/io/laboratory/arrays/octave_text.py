@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from snrmjax.io.files import shown
+from snrmjax.io.laboratory.arrays.even_axis import EvenAxis
 from snrmjax.io.laboratory.arrays.structs import file_of_tree
 from snrmjax.io.laboratory.arrays.value_tree import Node, held
 from snrmjax.io.laboratory.contents import LaboratoryFile
@@ -32,7 +33,7 @@ def is_octave_text(head: bytes) -> bool:
     )
 
 
-def read_octave(path: Path) -> LaboratoryFile:
+def read_octave(path: Path, axis: EvenAxis | None = None) -> LaboratoryFile:
     """A file of Octave's text format. Raises `ValueError` as `read_laboratory_file` does."""
     lines = _Lines(text_of(path).splitlines(), path.name)
     tree: dict[str, Node] = {}
@@ -41,7 +42,7 @@ def read_octave(path: Path) -> LaboratoryFile:
         node = _value(lines, name, 0)
         if node is not None:
             tree[name] = node
-    return file_of_tree(path.name, "octave", tree, lines.notes)
+    return file_of_tree(path.name, "octave", tree, lines.notes, axis)
 
 
 class _Lines:
