@@ -66,7 +66,7 @@ def with_stated_references(
     mapping = mapping._replace(
         responses=tuple(responses),
         base=base,
-        force_unit=level_reference(mapping.force_unit) or mapping.force_unit,
+        force_unit=(mapping.force and level_reference(mapping.force_unit)) or mapping.force_unit,
     )
     return table._replace(columns=columns, units=units), mapping, notes
 
