@@ -550,3 +550,15 @@ def test_an_axis_that_is_stated_and_marks_beside_responses(tmp_path):
     # A truth value is never proposed as the response of a table.
     scipy.io.savemat(path, {"f": 10 + np.arange(20), "good": valid, "v": h[0].real})
     assert "--response v:" in run_import(path)[1]
+
+
+def test_an_array_without_its_imaginary_part_is_refused(tmp_path):
+    """A damaged flag says that a field is complex: within scipy it ends the process."""
+    path = tmp_path / "flag.mat"
+    scipy.io.savemat(path, {"s": {"frequency": HERTZ, "v": HERTZ**2}})
+    content = bytearray(path.read_bytes())
+    at = content.index(struct.pack("<III", 6, 8, 6), 300) + 9
+    content[at] |= 8
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"flag\.mat is damaged .*without its numbers"):
+        read_laboratory_file(path)

@@ -19,6 +19,8 @@ from snrmjax.numerics.facts import Fact
 
 _MATRIX, _COMPRESSED = 14, 15  # types of elements
 _OPAQUE = 17  # class of an object's array
+_NUMBERS_OF = dict.fromkeys(range(6, 16), 1) | {4: 1, 5: 3}  # elements of numbers by class
+_COMPLEX = 0x800  # flag of an array
 _HEADER = 4096  # bytes in which a variable's header ends
 _LARGEST = 2**29  # bytes of a file before v7.3, which is read whole, and numbers of its variables
 
@@ -121,11 +123,13 @@ def _parts(content: memoryview, order: str) -> Iterator[memoryview]:
         yield memoryview(b"")
 
 
-def _check_elements(content: memoryview, order: str) -> None:
-    """Raises `ValueError` for an element of no known type, which ends the process within scipy.
+def _check_elements(content: memoryview, order: str) -> list[int]:
+    """Raises `ValueError` for elements that end the process within scipy; returns their types.
 
-    What is compressed has a checksum of its own.
+    They are of no known type, or stand where an array lacks its numbers (its imaginary part, where
+    a damaged flag says that there is one). What is compressed has a checksum of its own.
     """
+    kinds: list[int] = []
     at = 0
     while at + 8 <= len(content):
         kind, size = struct.unpack_from(f"{order}II", content, at)
@@ -133,9 +137,18 @@ def _check_elements(content: memoryview, order: str) -> None:
             kind, size = kind & 0xFFFF, 0
         if not 1 <= kind <= 18:
             raise ValueError(f"it has an element of the type {kind}")
-        if kind == _MATRIX:
-            _check_elements(content[at + 8 : at + 8 + size], order)
+        if kind == _MATRIX and size:
+            body = content[at + 8 : at + 8 + size]
+            within = _check_elements(body, order)
+            flags = struct.unpack_from(f"{order}I", body, 8)[0] if len(body) >= 12 else 0
+            count = _NUMBERS_OF.get(flags & 0xFF, 0)
+            count += int(count > 0 and bool(flags & _COMPLEX))
+            parts = within[3 : 3 + count]
+            if len(parts) < count or _MATRIX in parts:
+                raise ValueError("it has an array without its numbers")
+        kinds.append(kind)
         at += 8 + (size if kind == _COMPRESSED else -(-size // 8) * 8)
+    return kinds
 
 
 def _node(value: Any, name: str, notes: list[Fact]) -> Node | None:
