@@ -562,3 +562,22 @@ def test_an_array_without_its_imaginary_part_is_refused(tmp_path):
     path.write_bytes(content)
     with pytest.raises(ValueError, match=r"flag\.mat is damaged .*without its numbers"):
         read_laboratory_file(path)
+
+
+def test_a_heap_of_texts_without_an_end_is_refused(tmp_path):
+    """Zeros over the size of its free space: within HDF5 reading a text never ends."""
+    path = tmp_path / "heap.h5"
+    with h5py.File(path, "w") as file:
+        file["x"] = HERTZ
+        file["x"].attrs["unit"] = "mm/s"
+        file["names"] = ["one", "two"]
+    assert read_laboratory_file(path).tables[0].units == {"x": "mm/s"}
+    content = bytearray(path.read_bytes())
+    start = content.index(b"GCOL")
+    at = start + 16
+    while int.from_bytes(content[at : at + 2], "little"):
+        at += 16 + -(-int.from_bytes(content[at + 8 : at + 16], "little") // 8) * 8
+    content[at : at + 16] = bytes(16)
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"heap\.h5 is damaged .*heap of texts without an end"):
+        read_laboratory_file(path)
