@@ -28,6 +28,7 @@ from snrmjax.measure.states import UNNAMED_SENSOR
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.names import near_miss
 
+_DECIBELS = re.compile(r"(?<![^\W\d_])d[Bb](?![^\W\d_])")
 _DEVIATION = re.compile(r"stdev|stddev|std|sigma|deviation|dev")
 
 
@@ -38,6 +39,7 @@ class _Source(NamedTuple):
     mapping: ImportMap
     file: str
     assumed: Assumptions
+    levels: frozenset[str] = frozenset()  # columns that the file has in dB
 
     def unit(self, name: str) -> str:
         """The file's word for a column's unit."""
@@ -86,7 +88,8 @@ def import_table(
     """
     mapping = mapping.with_names({name: table.units.get(name, "") for name in table.columns})
     table, mapping, notes = with_stated_references(table, mapping, file)
-    source = _Source(table, mapping, file, assumed)
+    levels = frozenset(note["name"] for note in notes)
+    source = _Source(table, mapping, file, assumed, levels)
     mapping = mapping._replace(frequency=mapping.frequency or _frequency_column(source))
     source = source._replace(mapping=mapping)
     omega = frequency_in_rad(
@@ -356,6 +359,15 @@ def _errors(
     the unit of the phases.
     """
     turn = 1.0 if _in_radians(source, response) else np.pi / 180
+    of_level, name = response.channel in source.levels, response.amplitude_std
+    is_level = bool(_DECIBELS.search(name)) or level_reference(source.unit(name)) is not None
+    if name and of_level != is_level and (is_level or source.unit(name)):
+        raise ValueError(
+            f"{name} of {source.file} must be standard deviations in the unit of "
+            f"{response.channel}, but one of both is in dB: --amplitude-std names another column."
+        )
+    if of_level:  # errors in dB, too
+        scale = scale * np.log(10) / 20 * np.abs(source.column(response.channel, "--response"))
     stated = (
         (response.amplitude_std, "--amplitude-std", scale),
         (response.phase_std, "--phase-std", np.asarray(turn)),
@@ -383,11 +395,6 @@ def _bare(name: str) -> str:
 
 def _deviations(source: _Source, name: str, option: str) -> Float[np.ndarray, " row"]:
     values = np.real(source.column(name, option)).astype(float)
-    if level_reference(source.unit(name)) is not None:
-        raise ValueError(
-            f"{name} of {source.file} must be standard deviations in the unit of their column, but "
-            f"is in {source.unit(name)}: {option} names another column."
-        )
     bad = np.flatnonzero(values < 0)
     if bad.size:
         raise ValueError(

@@ -145,7 +145,8 @@ def _level_of(name: str) -> Label | None:
         unit = unit.rpartition(")" if word.endswith("(") else "]")[0] or unit
     if level_reference(unit) is None:
         return None
-    return Label(word.rstrip(" /,_-.(["), unit.strip(), is_bracketed)
+    word = word[:-1].rstrip(" /,_-") if is_bracketed else word.rstrip(" /,_-.")
+    return Label(word, unit.strip(), is_bracketed)
 
 
 def _is_unit_of(word: str, unit: str) -> bool:

@@ -71,9 +71,8 @@ SENTENCES: dict[str, Wording] = {
     # Notes on files of laboratories.
     "not_read": lambda name, why: f"{name} {_NOT_READ[why]}; not read.",
     "object_not_read": lambda name, kind: (
-        f"{name} is a {kind.replace('_', ' ')}{' of MATLAB' * (kind != 'function_handle')}; not "
-        "read: save numbers, text, structs and cells"
-        + (f" (table2struct({name}, 'ToScalar', true))." if kind == "table" else ".")
+        f"{name} is of the class {kind.replace('_', ' ')}; not read: save numbers, text, structs "
+        "and cells" + (f" (table2struct({name}, 'ToScalar', true))." if kind == "table" else ".")
     ),
     "nothing_measured": lambda names: (
         "it has only texts, single numbers and empty arrays"

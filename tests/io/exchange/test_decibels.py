@@ -81,6 +81,22 @@ def test_levels_are_never_taken_for_amplitudes(tmp_path, name, unit_row, word, c
     assert complaint in said
 
 
+@pytest.mark.parametrize("name", ["v_std", "v_dB_std", "v_std [dB]"])
+def test_errors_of_levels_are_in_db(tmp_path, name):
+    head = f"f [Hz],F [N],v [dB re 1 m/s],{name},phase [deg]"
+    path = write(tmp_path / "a.csv", head, HERTZ, FORCE, level(SPEED), FORCE, PHASE)
+    words = ("--force", "F", "--response", "v", "--amplitude-std", name, "--out", tmp_path / "o")
+    code, said = run_import(path, *words)
+    assert code == 0, said
+    table = np.genfromtxt(tmp_path / "o" / "measured.csv", delimiter=",", names=True)
+    step = 1e-5  # of dB, a difference
+    wanted = 0.5 * (SPEED * 10 ** (step / 20) - SPEED * 10 ** (-step / 20)) / (2 * step)
+    np.testing.assert_allclose(table["velocity_std_m_s"], wanted, rtol=1e-9)
+    path.write_text(path.read_text().replace("v [dB re 1 m/s]", "v [m/s]").replace("-", ""))
+    if name != "v_std":
+        assert "one of both is in dB" in run_import(path, *words)[1]
+
+
 def test_levels_of_structs_records_and_universal_files(tmp_path):
     units = np.array(["Hz", "N", "dB re 1 m/s", "deg"], dtype=object)
     test = {"f": HERTZ, "F": FORCE, "v": level(SPEED), "phase": PHASE, "units": units}

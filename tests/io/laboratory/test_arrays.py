@@ -236,7 +236,7 @@ def test_objects_beside_plain_arrays_are_named(tmp_path, kinds, is_compressed):
     named = [(note["name"], note["kind"]) for note in found.notes]
     assert named == [(f"a_{kind[:3]}", kind) for kind in kinds]
     path.write_bytes(path.read_bytes()[:128] + object_of_matlab("T", "timetable"))
-    with pytest.raises(ValueError, match=r"nothing that could be read: T is a timetable of MATLAB"):
+    with pytest.raises(ValueError, match=r"could be read: T is of the class timetable"):
         read_laboratory_file(path)
 
 

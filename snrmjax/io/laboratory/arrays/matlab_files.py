@@ -154,8 +154,9 @@ def _check_elements(content: memoryview, order: str) -> list[int]:
 def _node(value: Any, name: str, notes: list[Fact]) -> Node | None:
     """A loaded value as a node, or None with a note unless it is empty."""
     if type(value) is not np.ndarray:
-        if hasattr(value, "tocoo"):
-            notes.append(Fact("not_read", name=name, why="sparse"))
+        if value is None or hasattr(value, "tocoo"):
+            why = "empty" if value is None else "sparse"
+            notes.append(Fact("not_read", name=name, why=why))
             return None
         names = value.dtype.names or ()
         kind = value.reshape(-1)[0]["s2"].decode("latin1") if "s2" in names else ""

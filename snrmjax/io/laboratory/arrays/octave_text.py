@@ -151,7 +151,7 @@ def _value(lines: _Lines, name: str, depth: int) -> Node | None:
     lines.notes.append(
         Fact("not_read", name=name, why="sparse")
         if is_sparse
-        else Fact("object_not_read", name=name, kind=kind.replace(" ", "_"))
+        else Fact("object_not_read", name=name, kind=kind)
     )
     lines.find_name()
     return None
