@@ -172,7 +172,8 @@ def test_shape_times_participation_is_the_residue_without_a_scale(base, tmp_path
 
 BAD = [
     (("elsewhere.uff",), "no sensor is known to be where"),
-    (("conjugated.uff",), "`modes --conjugated` takes their conjugates"),
+    (("conjugated.uff",), "seem to be conjugated, of e^(-iΩt): state `--conjugated`"),
+    (("frf.uff", "--conjugated"), "seem to be conjugated, of e^(-iΩt): leave `--conjugated` out"),
     (("decay.uff", "--conjugated"), "no effect on modes from records"),
     (("decay.uff", "--rate", "600"), "--rate says 600 Hz, but decay.uff 512 Hz"),
     (("frf.uff", "--rate", "512"), "no effect on modes from frequency responses"),

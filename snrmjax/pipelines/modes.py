@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 from snrmjax.identify.modal.free_decay import DecayModes
+from snrmjax.identify.modal.linear_fit import GrowingModes
 from snrmjax.identify.modal.modal_fit import LinearModalFit
 from snrmjax.identify.modal.modes_of_tests import find_modes
 from snrmjax.identify.modal.response_data import joined_responses
@@ -84,7 +85,11 @@ def find_linear_modes(
         "to_frequency": None if high is None else high * HERTZ,
         "poles": _poles(options.poles),
     }
-    fitted, notes = find_modes(sources, **fit)
+    try:
+        fitted, notes = find_modes(sources, **fit)
+    except GrowingModes as error:
+        way = "leave `--conjugated` out" if options.conjugated else "state `--conjugated`"
+        raise ValueError(f"{str(error).rstrip('.')}: {way}.") from error
     second = None if with_mass is None else find_modes(_as_stated(with_mass, options), **fit)[0]
     scaled = scale_modes(
         fitted,
