@@ -67,10 +67,12 @@ def proposed_commands(paths: Sequence[Path], files: Sequence[LaboratoryFile]) ->
     held = joined_files(files)[0]
     if held.tables and is_ours(held.tables[0].columns):
         return [f"it has our own columns: `snrmjax check`, `identify` and `test` take {held.name}."]
-    if any(note.kind == "responses_without_axis" for note in held.notes) and not held.responses:
+    is_lost = any(note.kind == "responses_without_axis" for note in held.notes)
+    with_axis = [one for one in held.tables if _may_have_axis(one)]
+    if is_lost and not (with_axis or held.responses or held.recordings):
         words = f"snrmjax import {named} --frequency-start HZ --frequency-step HZ"
         return ["state the frequencies of the responses (fill in HZ):", f"  {words}"]
-    contents: list[_Content] = [*held.recordings, *held.tables, *held.responses]
+    contents: list[_Content] = [*held.recordings, *with_axis, *held.responses, *held.tables]
     content = contents[0]
     found = _options_of(content)
     _take_amplitudes_of_names(found, files)
@@ -93,6 +95,14 @@ def proposed_commands(paths: Sequence[Path], files: Sequence[LaboratoryFile]) ->
     ]
     lines += [f"  it will ask: {question}"] if question else []
     return [*lines, *(_modes(named, content) if held.responses else ())]
+
+
+def _may_have_axis(table: NumberTable) -> bool:
+    """Whether a column of a table may be its frequencies."""
+    return any(
+        not np.iscomplexobj(column) and table.role(name) not in ("mark", "coherence")
+        for name, column in table.columns.items()
+    )
 
 
 def _take_amplitudes_of_names(found: _Options, files: Sequence[LaboratoryFile]) -> None:

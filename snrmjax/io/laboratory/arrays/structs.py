@@ -325,7 +325,7 @@ def _responses(
         elif lines is not None and even is not None:
             hertz = even.hertz(lines)
         else:
-            if lines is not None and len(sides) > 1:
+            if lines is not None and (len(sides) > 1 or not axes):
                 contents.notes.append(Fact("responses_without_axis", name=key, n=lines))
             continue
         if not (np.isfinite(hertz).all() and hertz[0] >= 0 and np.all(np.diff(hertz) > 0)):
