@@ -129,6 +129,8 @@ def _refuse_either(rows: list[tuple[int, str]], separator: str, file: str) -> No
     have, they are decimals of three digits, as are points where commas separate columns.
     """
     marks = "," if separator == "," else ".,"
+    if not any(mark in line for _, line in rows for mark in marks):
+        return
     first: tuple[int, str] | None = None
     has_whole = False
     for k, line in rows:
