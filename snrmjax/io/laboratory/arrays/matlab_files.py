@@ -21,6 +21,7 @@ _MATRIX, _COMPRESSED = 14, 15  # types of elements
 _OPAQUE = 17  # class of an object's array
 _NUMBERS_OF = dict.fromkeys(range(6, 16), 1) | {4: 1, 5: 3}  # elements of numbers by class
 _COMPLEX = 0x800  # flag of an array
+_OF_NUMBERS = frozenset((*range(1, 8), 9, 12, 13, 16, 17, 18))  # types of elements
 _HEADER = 4096  # bytes in which a variable's header ends
 _LARGEST = 2**29  # bytes of a file before v7.3, which is read whole, and numbers of its variables
 
@@ -144,7 +145,7 @@ def _check_elements(content: memoryview, order: str) -> list[int]:
             count = _NUMBERS_OF.get(flags & 0xFF, 0)
             count += int(count > 0 and bool(flags & _COMPLEX))
             parts = within[3 : 3 + count]
-            if len(parts) < count or _MATRIX in parts:
+            if len(parts) < count or not _OF_NUMBERS.issuperset(parts):
                 raise ValueError("it has an array without its numbers")
         kinds.append(kind)
         at += 8 + (size if kind == _COMPRESSED else -(-size // 8) * 8)
