@@ -3,7 +3,8 @@
 Run: python benchmarks/hostile_files.py [--runs 20000] [--seed 0] [--only KIND]
 
 Valid files of every format (UFF 58, 58b and 55, MATLAB v4, v5 and v7.3, HDF5, netCDF, TDMS, CSV in
-two dialects, a LabVIEW measurement file, runs side by side, a vibrometer's export) are mutated:
+two dialects, a LabVIEW measurement file, runs side by side, a vibrometer's export, thousands, times
+of few digits, levels in dB, objects of MATLAB, Octave's text, a start and a step) are mutated:
 cut, bits flipped, counts made huge, runs overwritten, NaN put in, parts doubled, text for binary,
 two formats spliced, gzip and zip around them, one in another. Each is
 listed, and what it holds is read and imported, in a child process whose address space may grow by
@@ -24,6 +25,7 @@ import os
 import re
 import resource
 import signal
+import struct
 import tempfile
 import time
 import zipfile
@@ -108,6 +110,7 @@ def valid_files(folder):
     dialect = [line.replace(",", ";").replace(".", ",") for line in lines]
     (folder / "b.txt").write_text("\n".join(["Titel", "f;F;v;phase", "Hz;N;g;°", *dialect]))
     write_texts(folder, rng, hertz)
+    write_other_customs(folder, rng, hertz)
     return {one.name: one.read_bytes() for one in sorted(folder.iterdir())}
 
 
@@ -142,6 +145,50 @@ def write_texts(folder, rng, hertz):
             writer.write_segment([ChannelObject("g", f"CH{k}", rng.normal(size=300), wave)])
 
 
+def write_other_customs(folder, rng, hertz):
+    """Thousands, few digits, levels in dB, objects of MATLAB, Octave's text, a start and a step."""
+    import scipy.io
+
+    def german(number):
+        return f"{number:,}".replace(",", "T").replace(".", ",").replace("T", ".")
+
+    rows = [(int(990 + k), 0.5, int(1000 + 9 * k), k - 20.5) for k in range(40)]
+    lines = [";".join(map(german, row)) for row in rows]
+    (folder / "g.csv").write_text("\n".join(["f [Hz];F [N];v [mm/s];phase [deg]", *lines]))
+    rows = [f"{k / 5120:.4g},{v!r}" for k, v in enumerate(rng.normal(size=300).tolist())]
+    (folder / "h.csv").write_text("\n".join(["Time [s],v [m/s]", *rows]))
+    rows = [f"{f!r},0.1,{-20 - f / 9!r},{f!r}" for f in hertz.tolist()]
+    (folder / "i.csv").write_text("\n".join(["f [Hz],F [N],v [dB re 1 m/s],phase [deg]", *rows]))
+    response = rng.normal(size=(40, 3)) + 1j
+    single = {"f_start": 10.0, "df": 0.5, "flags": np.arange(40) % 2 == 0}
+    scipy.io.savemat(folder / "j.mat", {"H": response, **single})
+    scipy.io.savemat(folder / "k.mat", {"freq": hertz, "force": hertz / 800, "v": hertz**2})
+    with open(folder / "k.mat", "ab") as file:
+        file.write(object_of_matlab())
+    text = ["# Created by Octave 6.4.0", "# name: test", "# type: scalar struct", "# ndims: 2"]
+    text += [" 1 1", "# length: 3"]
+    for name, values in (("freq", hertz), ("force", hertz / 800)):
+        text += [f"# name: {name}", "# type: matrix", "# rows: 40", "# columns: 1"]
+        text += [*(f" {value!r}" for value in values.tolist()), "", ""]
+    text += ["# name: v", "# type: complex matrix", "# rows: 40", "# columns: 1"]
+    text += [*(f" ({value!r},1)" for value in hertz.tolist()), "", "", "", ""]
+    text += ["# name: c", "# type: cell", "# rows: 1", "# columns: 1", "# name: <cell-element>"]
+    text += ["# type: string", "# elements: 1", "# length: 3", "tip", "", "", ""]
+    (folder / "l.mat").write_text("\n".join(text))
+
+
+def object_of_matlab():
+    """A variable that is a table, as MATLAB writes one."""
+
+    def element(number, data):
+        return struct.pack("<II", number, len(data)) + data + bytes(-len(data) % 8)
+
+    flags = element(6, struct.pack("<II", 13, 0)) + element(5, struct.pack("<ii", 6, 1))
+    inner = flags + element(1, b"") + element(6, struct.pack("<6I", 3707764736, 2, 1, 1, 1, 1))
+    texts = element(1, b"log") + element(1, b"MCOS") + element(1, b"table")
+    return element(14, element(6, struct.pack("<II", 17, 0)) + texts + element(14, inner))
+
+
 def invented(path, held):
     """A number that a text does not have, or nothing: each that was read must stand there."""
     if path.suffix not in (".lvm", ".txt", ".csv"):
@@ -150,7 +197,8 @@ def invented(path, held):
     fields = re.split(r"[\t;\s\"]+", text) + re.split(r"[\t;,\s\"]+", text)
     there = {0.0}
     for field in fields:
-        for word in (field, field.replace(",", ".")):
+        whole = field.replace(".", "").replace(",", ".")  # with separators of thousands
+        for word in (field, field.replace(",", "."), whole, field.replace(",", "")):
             with contextlib.suppress(ValueError):
                 there.add(float(word.lower().replace("d", "e")))
     columns = {

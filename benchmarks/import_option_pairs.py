@@ -2,9 +2,10 @@
 
 Run: python benchmarks/import_option_pairs.py [--runs 1200] [--seed 0]
 
-Five files (a table of amplitudes and phases, one of complex parts, frequency responses, a record of
-steps, our own table) are imported with a command that is right, to which one or two options are
-added: units, signs, columns, levels, wrong words, options of other files. An import that ends with
+Seven files (a table of amplitudes and phases, one of levels in dB, one of complex parts, frequency
+responses, a matrix of them without frequencies, a record of steps, our own table) are imported with
+a command that is right, to which one or two options are added: units, signs, columns, levels, wrong
+words, options of other files. An import that ends with
 exit 2 must say one sentence. One that ends with 0 must have written what a calculation of its own
 (NumPy, a few lines, nothing of the package) makes of the same options; where that calculation knows
 no meaning for an option, the import must not accept it.
@@ -39,15 +40,18 @@ COLUMNS = {
     "s": 1e-3 * (1 + np.arange(N)),
     "im": 0.02 * np.arange(N) - 0.1,
 }
-UNITS = {"N": 1.0, "lbf": POUND, "kN": 1e3, "V": 1.0}
+UNITS = {"N": 1.0, "lbf": POUND, "kN": 1e3, "V": 1.0, "dB re 1 N": 1.0}
 MOTION = {"mm/s": (1, 1e-3), "g": (2, GRAVITY), "m/s": (1, 1.0), "mm": (0, 1e-3)}
 CHOICES = {
     "frequency": ["f2", "nothing"],
     "frequency_unit": ["rad/s", "banana", "m"],
     "force": ["G", "nothing"],
-    "force_unit": ["lbf", "kN", "V", "g", "banana"],
+    "frequency_start": [5, -1],
+    "frequency_step": [0.5, -1],
+    "rate": [999, 500, -3],
+    "force_unit": ["lbf", "kN", "V", "g", "banana", "dB re 1 N", "dB"],
     "base": ["G:acceleration:g", "0.5:acceleration:g", "G:acceleration", "G", "G:velocity:m/s"],
-    "unit": ["mm/s", "g", "banana"],
+    "unit": ["mm/s", "g", "banana", "dB re 1 m/s", "dB"],
     "force_phase": ["fp", "nothing"],
     "force_amplitude": ["0.4", "z", "name", "-1"],
     "over_force": [True],
@@ -70,11 +74,10 @@ CHOICES = {
 SIZES = {"peak": 1.0, "rms": np.sqrt(2), "peak_to_peak": 0.5}
 
 
-def expected(given):
+def expected(given, v=COLUMNS["v"], hz=None):
     """Frequency (Hz), load, velocity phasor of a table; None: nothing that can be meant."""
-    hz = COLUMNS[given.get("frequency", "f")] / (
-        HERTZ if given.get("frequency_unit") == "rad/s" else 1
-    )
+    hz = COLUMNS[given.get("frequency", "f")] if hz is None else hz
+    hz = hz / (HERTZ if given.get("frequency_unit") == "rad/s" else 1)
     omega, size = HERTZ * hz, SIZES[given.get("amplitude", "peak")]
     over, factor_of_load = given.get("over_force"), UNITS.get(given.get("force_unit", "N"))
     base = given.get("base", "").split(":")
@@ -90,8 +93,12 @@ def expected(given):
     elif given.get("force"):
         if given.get("force_amplitude"):
             return None
-        load = COLUMNS[given["force"]] * UNITS[given.get("force_unit", "N")] * size
+        column = COLUMNS[given["force"]]
+        column = 10 ** (column / 20) if given.get("force_unit", "").startswith("dB") else column
+        load = column * UNITS[given.get("force_unit", "N")] * size
     else:
+        if given.get("force_unit", "").startswith("dB"):
+            return None
         load = float(given["force_amplitude"]) * UNITS[given.get("force_unit", "N")] * np.ones(N)
         load = load * (size if "amplitude" in given else 1.0)
     phase = np.zeros(N)
@@ -101,9 +108,9 @@ def expected(given):
         phase = sign * unit * COLUMNS[given["force_phase"]]
     order, factor = MOTION[given.get("unit", "m/s")]
     if given.get("imaginary"):
-        response = COLUMNS["v"] + 1j * sign * COLUMNS[given["imaginary"]]
+        response = v + 1j * sign * COLUMNS[given["imaginary"]]
     else:
-        response = COLUMNS["v"] * np.exp(1j * sign * unit * COLUMNS[given.get("phase", "ph")])
+        response = v * np.exp(1j * sign * unit * COLUMNS[given.get("phase", "ph")])
     velocity = response * factor * (1j * omega) ** (1 - order)
     # Responses over the force are over its numbers, whatever their unit.
     velocity = velocity * (load / factor_of_load if over else size * np.exp(-1j * phase))
@@ -119,6 +126,7 @@ def write_files(folder):
     rows = np.column_stack([COLUMNS[name] for name in names]).tolist()
     lines = [",".join(names), *(",".join(map(repr, row)) for row in rows)]
     (folder / "t.csv").write_text("\n".join(lines))
+    (folder / "d.csv").write_text("\n".join(lines))
     columns = {name: COLUMNS[name] for name in names if name != "ph"}
     scipy.io.savemat(folder / "c.mat", {**columns, "v": COLUMNS["v"] + 1j * COLUMNS["im"]})
     place = {"rsp_node": 1, "rsp_dir": 3, "ref_node": 2, "ref_dir": 3}
@@ -127,6 +135,8 @@ def write_files(folder):
     data = COLUMNS["v"] * np.exp(1j * np.radians(COLUMNS["ph"]))
     curve = pyuff.prepare_58(x=F, data=data, binary=1, z_axis_value=0.3, **place, **kind)
     pyuff.UFF(str(folder / "r.uff")).write_sets([curve], "add")
+    marks = np.arange(N) % 2 == 0
+    scipy.io.savemat(folder / "m.mat", {"H": np.stack([data, 2 * data]), "valid": marks})
     rate, seconds = 1000.0, 4.0
     time = np.arange(int(rate * seconds)) / rate
     steps = {"f": [], "a": []}
@@ -146,6 +156,10 @@ def write_files(folder):
 BASE = {
     "t.csv": {"frequency": "f", "force": "F", "force_unit": "N", "response": "v:velocity:m/s"}
     | {"phase": "ph", "phase_unit": "deg"},
+    "d.csv": {"frequency": "f", "force": "F", "force_unit": "N", "phase": "ph"}
+    | {"phase_unit": "deg", "response": "v:velocity:dB re 1 m/s"},
+    "m.mat": {"frequency_start": 50, "frequency_step": 0.25, "force_amplitude": "0.4"}
+    | {"response": "H.1:velocity:m/s"},
     "c.mat": {"frequency": "f", "force": "F", "force_unit": "N", "response": "v:velocity:m/s"},
     "r.uff": {"force_amplitude": "0.4", "response": "1+z:velocity:m/s"},
     "s.mat": {"force": "F", "force_unit": "N", "response": "v:velocity:m/s", "record": "steps"},
@@ -169,6 +183,13 @@ def oracle(file, added):
         if "imaginary" in told and "phase" not in told:
             given.pop("phase", None)
         return expected(given)
+    if file == "d.csv":
+        if "imaginary" in told:
+            return None
+        return expected(given, 10 ** (COLUMNS["v"] / 20))
+    if file == "m.mat":
+        lines = given.pop("frequency_start") + given.pop("frequency_step") * np.arange(N)
+        return expected(given | {"phase": "ph", "over_force": True}, hz=lines)
     if file == "c.mat":
         return expected(given | {"imaginary": "im"})
     if file == "r.uff":
@@ -177,7 +198,7 @@ def oracle(file, added):
             given["force_amplitude"] = 0.3
         return expected(given)
     if file == "s.mat":
-        hz = np.array([50.0, 55.0, 60.0])
+        hz = np.array([50.0, 55.0, 60.0]) * given.get("rate", 1000) / 1000
         if given.get("base"):
             return None  # there is no channel G
         size = UNITS[given.get("force_unit", "N")]

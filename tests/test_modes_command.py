@@ -69,6 +69,8 @@ def folder(tmp_path_factory):
     write_uff(path / "short.uff", responses=[short])
     start = np.concatenate([np.zeros(3), np.linalg.inv(STRUCTURE.mass)[0]])
     velocity = integrated(STRUCTURE, np.zeros((1024, 3)), 512.0, start=start)[1].T
+    rows = [f"{k / 5120:.3f},{v!r}" for k, v in enumerate(velocity[0, :300].tolist())]
+    (path / "open_rate.csv").write_text("\n".join(["time [s],v [m/s]", *rows]))
     channels = [Channel(f"V{k}", "velocity", "m/s", point=str(k), direction="+z") for k in "123"]
     write_uff(path / "decay.uff", recordings=[time_recording(velocity, channels, 512.0)])
     pushed = [Channel("F", "force", "N", point="1", direction="+z"), *channels[1:]]
@@ -94,6 +96,17 @@ def test_responses_become_a_model_and_a_report(folder, tmp_path):
     table = (out.parent / "modes.csv").read_text(encoding="utf-8").splitlines()
     assert table[0].startswith("mode,sensor,frequency_hz,frequency_std_hz")
     assert len(table) == 1 + 3 * 3
+
+
+def test_conjugated_responses_give_the_modes_of_the_others(folder, tmp_path):
+    found = []
+    for words in (("frf.uff",), ("conjugated.uff", "--conjugated")):
+        out = tmp_path / f"{len(found)}.toml"
+        assert run(folder / words[0], *words[1:], "--out", out)[0] == 0
+        found.append(sj.read_model(out).modes)
+    for name in ("natural_frequency", "damping_ratio", "mode_shape", "participation"):
+        one, other = (np.asarray(getattr(modes, name)) for modes in found)
+        assert np.allclose(one, other, rtol=1e-6)  # of what UFF's digits leave
 
 
 @pytest.mark.long
@@ -159,7 +172,12 @@ def test_shape_times_participation_is_the_residue_without_a_scale(base, tmp_path
 
 BAD = [
     (("elsewhere.uff",), "no sensor is known to be where"),
-    (("conjugated.uff",), "negative damping"),
+    (("conjugated.uff",), "seem to be conjugated, of e^(-iΩt): state `--conjugated`"),
+    (("frf.uff", "--conjugated"), "seem to be conjugated, of e^(-iΩt): leave `--conjugated` out"),
+    (("decay.uff", "--conjugated"), "no effect on modes from records"),
+    (("decay.uff", "--rate", "600"), "--rate says 600 Hz, but decay.uff 512 Hz"),
+    (("frf.uff", "--rate", "512"), "no effect on modes from frequency responses"),
+    (("open_rate.csv",), "`--rate 5120`, if that is it"),
     (("two.uff",), "over one reference, but there are 2"),
     (("line.uff",), "modes need 6 lines"),
     (("frf.uff", "frf.uff"), "comes 2 times"),

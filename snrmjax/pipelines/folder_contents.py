@@ -18,7 +18,11 @@ from snrmjax.io.exchange.import_options import STAYS_RECORD
 from snrmjax.io.exchange.importing import Imported, import_files, joined_files
 from snrmjax.io.exchange.own_tables import is_own_file
 from snrmjax.io.exchange.proposals import proposed_commands
-from snrmjax.io.exchange.record_import import at_stated_rate, mapped_record
+from snrmjax.io.exchange.record_import import (
+    ask_for_rate,
+    at_stated_rate,
+    mapped_record,
+)
 from snrmjax.io.files import read_text
 from snrmjax.io.laboratory.contents import LaboratoryFile
 from snrmjax.io.laboratory.reading import read_laboratory_file
@@ -169,9 +173,10 @@ def read_test_files(
         elif suffix == ".csv" and is_own_file(path):
             states.append(NamedStates(path.name, read_steady_states(path), path))
         else:
-            raw.append(read_laboratory_file(path, told.text_format))
+            raw.append(read_laboratory_file(path, told.text_format, told.even_axis))
     assumed_of: dict[str, list[str]] = {}  # files by what was assumed of them
-    _ask_for_rate(raw, told)
+    for held in raw:
+        ask_for_rate(held.notes, told.rate, held.name)
     for held, names in _joined(raw):
         paths, file, assumed = [folder / name for name in names], held.name, Assumptions()
         stepped = held.recordings and told.base and told.record not in STAYS_RECORD
@@ -215,26 +220,12 @@ def read_test_files(
 def _measured_text(path: Path, told: ImportMap) -> LaboratoryFile | None:
     """A text that holds measurements: numbers with a frequency or a time; None of any other."""
     try:
-        held = read_laboratory_file(path, told.text_format)
+        held = read_laboratory_file(path, told.text_format, told.even_axis)
     except ValueError:
         return None  # what people wrote is shown as it is
     axes = {table.role(name) for table in held.tables for name in table.columns}
     named = told.frequency in {name for table in held.tables for name in table.columns}
     return held if held.recordings or held.responses or named or axes & {*_AXES} else None
-
-
-def _ask_for_rate(raw: Sequence[LaboratoryFile], told: ImportMap) -> None:
-    """Raise `ValueError` where records state their rate with few digits, and nobody else does."""
-    if told.rate:
-        return
-    for held in raw:
-        for note in held.notes:
-            if note.kind == "rate_left_open":
-                raise ValueError(
-                    f"which sampling rate has {held.name}? Its step of {note['step']} s has few "
-                    f"digits, so that frequencies may be off by {note['off']:.1g} %. Say so by "
-                    f"`--rate {note['rate']:g}`, if that is it."
-                )
 
 
 def _joined(raw: Sequence[LaboratoryFile]) -> list[tuple[LaboratoryFile, list[str]]]:

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from snrmjax.io.exchange.import_map import map_of_options
+from snrmjax.io.exchange.import_options import refuse_unused_axis
 from snrmjax.io.exchange.importing import Imported, import_files
 from snrmjax.io.exchange.listing import listed_contents
 from snrmjax.io.exchange.proposals import proposed_commands
@@ -28,8 +29,9 @@ def import_test(
 
 def list_contents(files: Sequence[FilePath], **options: Any) -> list[str]:
     """What files hold, in lines, and the command that would import them as one test."""
-    text_format = map_of_options(None, options).text_format
+    stated = map_of_options(None, options)
     paths = [Path(file) for file in files]
-    held = [read_laboratory_file(path, text_format) for path in paths]
+    held = [read_laboratory_file(path, stated.text_format, stated.even_axis) for path in paths]
+    refuse_unused_axis([key for key, value in options.items() if value], held)
     lines = [line for one in held for line in listed_contents(one)]
     return [*lines, *proposed_commands(paths, held)]

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 from snrmjax.identify.modal.free_decay import DecayModes
+from snrmjax.identify.modal.linear_fit import GrowingModes
 from snrmjax.identify.modal.modal_fit import LinearModalFit
 from snrmjax.identify.modal.modes_of_tests import find_modes
 from snrmjax.identify.modal.response_data import joined_responses
@@ -21,6 +22,7 @@ from snrmjax.identify.scaling.scale import (
 )
 from snrmjax.identify.scaling.scaled_modes import ScaledModes
 from snrmjax.io.exchange.own_tables import is_own_file
+from snrmjax.io.exchange.record_import import ask_for_rate, at_stated_rate
 from snrmjax.io.files import FilePath, file_name
 from snrmjax.io.laboratory.reading import read_laboratory_file
 from snrmjax.io.tables import read_steady_states
@@ -69,6 +71,7 @@ def find_linear_modes(
     """
     options = checked(dataclasses.replace(options or ModesOptions(), **settings))
     _refuse_unused(options, sources)
+    sources = _as_stated(sources, options)
     low, high = options.from_hz, options.to_hz
     fit: dict[str, Any] = {
         name: getattr(options, name)
@@ -82,8 +85,12 @@ def find_linear_modes(
         "to_frequency": None if high is None else high * HERTZ,
         "poles": _poles(options.poles),
     }
-    fitted, notes = find_modes(sources, **fit)
-    second = None if with_mass is None else find_modes(with_mass, **fit)[0]
+    try:
+        fitted, notes = find_modes(sources, **fit)
+    except GrowingModes as error:
+        way = "leave `--conjugated` out" if options.conjugated else "state `--conjugated`"
+        raise ValueError(f"{str(error).rstrip('.')}: {way}.") from error
+    second = None if with_mass is None else find_modes(_as_stated(with_mass, options), **fit)[0]
     scaled = scale_modes(
         fitted,
         _asked_scale(options, second),
@@ -97,6 +104,23 @@ def find_linear_modes(
         base = base_motion(cast(SensorMotion, options.base))
     scaled = dataclasses.replace(scaled, base=base)
     return LinearModesFound(name, fitted, scaled, interest, (*notes, *scaled.notes))
+
+
+def _as_stated(sources: ModalSources, options: ModesOptions) -> ModalSources:
+    """What options say of phasors and of sampling rates, done.
+
+    Raises `ValueError` for records whose few digits leave their rate open.
+    """
+    if isinstance(sources, FrequencyResponses):
+        values = sources.values.conj() if options.conjugated else sources.values
+        return dataclasses.replace(sources, values=values)
+    if isinstance(sources, SteadyStates):
+        velocity = sources.velocity.conj() if options.conjugated else sources.velocity
+        return dataclasses.replace(sources, velocity=velocity)
+    rate = options.rate or 0.0
+    for record in sources:
+        ask_for_rate(record.notes, rate, record.name)
+    return tuple(at_stated_rate(record, rate, record.name) for record in sources)
 
 
 def _refuse_unused(options: ModesOptions, sources: ModalSources) -> None:
@@ -135,11 +159,11 @@ def read_modal_sources(
 
 
 _UNUSED: dict[type, tuple[str, ...]] = {
-    FrequencyResponses: ("level",),
-    SteadyStates: ("window",),
+    FrequencyResponses: ("level", "rate"),
+    SteadyStates: ("window", "rate"),
     tuple: (
         *("level", "reference", "order", "from_hz", "residual_terms", "window"),
-        *("instrument_phase", "base"),
+        *("instrument_phase", "base", "conjugated"),
     ),
 }
 _WORDS = {
@@ -167,7 +191,11 @@ def _read(path: Path) -> FrequencyResponses | SteadyStates | tuple[TimeRecording
                 f"{file_name(path)} holds time records with a force ({forces[0]}): modes need "
                 "frequency responses of them, or records of a decay without a force."
             )
-        return held.recordings
+        open_rates = [note for note in held.notes if note.kind == "rate_left_open"]
+        return tuple(
+            dataclasses.replace(record, name=path.name, notes=(*record.notes, *open_rates))
+            for record in held.recordings
+        )
     raise ValueError(
         f"{file_name(path)} holds neither frequency responses nor records nor our table of steady "
         "states: `snrmjax import` says what it holds, and a map what its columns are."

@@ -343,6 +343,12 @@ class ModesOptions:
     to_hz: float | None = option(
         None, "Upper end of the band in Hz; decays are thinned to it.", "HZ"
     )
+    conjugated: bool = option(
+        False, "Responses are those of e^(-iΩt): take their conjugates.", panel="Fit"
+    )
+    rate: float | None = option(
+        *(None, "Sampling rate in Hz of records whose file has few digits.", "HZ"), panel="Fit"
+    )
     poles: str | None = option(
         None, "Natural frequencies in Hz by hand, as 79.0,427.5.", "HZ,…", panel="Fit"
     )

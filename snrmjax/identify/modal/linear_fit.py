@@ -35,6 +35,13 @@ _CURVED = 12.0  # a sensor, in units of the noise, that a further residual term 
 _EVEN = 1e-3  # of the line spacing
 
 
+class GrowingModes(ValueError):
+    """All modes that responses show have negative damping, as those of e^(-iΩt) have."""
+
+    def __init__(self, found: str) -> None:
+        super().__init__(f"{found}: the responses seem to be conjugated, of e^(-iΩt).")
+
+
 def fit_linear_modes(
     responses: FrequencyResponses,
     *,
@@ -174,10 +181,7 @@ def _start(
         listed = ", ".join(
             f"{100 * -p.real / abs(p):.3g} % at {abs(p) / HERTZ:.6g} Hz" for p in growing[:3]
         )
-        raise ValueError(
-            f"all modes {where} have negative damping ({listed}): the responses seem to be "
-            "conjugated (time dependence e^(-iΩt)); change the sign of their imaginary parts."
-        )
+        raise GrowingModes(f"all modes {where} have negative damping ({listed})")
     raise ValueError(
         f"no pole is stable over the model orders {where}: widen the band, raise the highest "
         "order, or give the natural frequencies by hand."
@@ -271,10 +275,9 @@ def _least_certain(fit: SeparableFit, settings: BasisSettings, data: ResponseDat
 def _check_found(fit: SeparableFit, settings: BasisSettings) -> None:
     natural, ratio, _ = unpacked(fit.unknowns, settings)
     if np.all(ratio < 0):
-        raise ValueError(
+        raise GrowingModes(
             f"all modes have negative damping ({100 * ratio[0]:.3g} % at "
-            f"{natural[0] / HERTZ:.6g} Hz): the responses seem to be conjugated (time dependence "
-            "e^(-iΩt)); change the sign of their imaginary parts."
+            f"{natural[0] / HERTZ:.6g} Hz)"
         )
     if np.any(ratio <= 0) or np.any(ratio >= MOST_DAMPED):
         k = int(np.argmax((ratio <= 0) | (ratio >= MOST_DAMPED)))

@@ -16,6 +16,7 @@ from snrmjax.numerics.names import suggestion
 from snrmjax.numerics.rules import NOT_NEGATIVE
 
 if TYPE_CHECKING:
+    from snrmjax.io.laboratory.arrays.even_axis import EvenAxis
     from snrmjax.io.laboratory.contents import TextFormat
 
 _MOTIONS = ("displacement", "velocity", "acceleration")
@@ -49,6 +50,10 @@ KEYS = {
     ),
     "frequency": MapKey("column of the forcing frequency"),
     "frequency_unit": MapKey("unit of the frequency: Hz or rad/s", "UNIT", _NUMBERS),
+    "frequency_start": MapKey(
+        "first frequency in Hz of responses without frequencies", "HZ", _NUMBERS
+    ),
+    "frequency_step": MapKey("step of their frequencies in Hz; 0: the file's", "HZ", _NUMBERS),
     "force": MapKey(
         "channel or column of the force (or of the voltage that drives it)", group=None
     ),
@@ -145,6 +150,8 @@ class ImportMap(NamedTuple):
     rate: float = 0.0
     frequency: str = ""
     frequency_unit: str = ""
+    frequency_start: float = 0.0
+    frequency_step: float = 0.0
     force: str = ""
     force_unit: str = ""
     base: str = ""
@@ -165,7 +172,7 @@ class ImportMap(NamedTuple):
     def is_empty(self) -> bool:
         """Whether nothing is said of channels."""
         plain = self._replace(separator="", decimal="", header_row=0, dataset="", rate=0.0)
-        return plain == ImportMap()
+        return plain._replace(frequency_start=0.0, frequency_step=0.0) == ImportMap()
 
     @property
     def base_motion(self) -> ResponseMap:
@@ -213,6 +220,13 @@ class ImportMap(NamedTuple):
         named: dict[str, Any] = {key: listed_name(getattr(self, key), units) for key in _COLUMNS}
         base = listed_name(self.base_channel, units) + self.base[len(self.base_channel) :]
         return self._replace(responses=tuple(responses), base=base, **named)
+
+    @property
+    def even_axis(self) -> "EvenAxis | None":
+        """The frequencies of responses without any, if they are stated."""
+        from snrmjax.io.laboratory.arrays.even_axis import axis_of_options
+
+        return axis_of_options(self.frequency_start, self.frequency_step)
 
     @property
     def text_format(self) -> "TextFormat":
@@ -357,7 +371,7 @@ def _value(table: TomlTable, key: str) -> Any:
         return value
     if key == "header_row":
         return table.whole(key, 0)
-    if key == "rate":
+    if key in ("rate", "frequency_start", "frequency_step"):
         return table.number(key, NOT_NEGATIVE)
     if key == "force_amplitude":
         return (

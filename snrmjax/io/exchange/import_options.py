@@ -1,9 +1,10 @@
 """Options of an import that nothing would obey: refused, so that no number is silently another."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import Literal
 
 from snrmjax.io.exchange.import_map import ImportMap
+from snrmjax.io.laboratory.contents import LaboratoryFile
 
 Content = Literal["own table", "table", "responses", "records"]
 
@@ -12,7 +13,7 @@ _ANY = {"dataset", "response", "unit", "force_unit", *_TEXT}
 _PHASORS = {*_ANY, "force", "base", "force_amplitude", "phase_sign", "amplitude", "level", "sensor"}
 _OBEYED: dict[Content, set[str]] = {
     "own table": {"dataset", "unit", "force_unit", "amplitude", "phase_sign", *_TEXT},
-    "responses": _PHASORS,
+    "responses": {*_PHASORS, "frequency_start", "frequency_step"},
     "table": {
         *_PHASORS,
         *("frequency", "frequency_unit", "force_phase", "over_force", "phase_unit"),
@@ -66,6 +67,17 @@ def refuse_unused(
         for key in ("level", "drive"):
             if key in stated:
                 refuse(key, f"on records that stay records (--record {mapping.record})")
+
+
+def refuse_unused_axis(stated: Collection[str], files: Sequence[LaboratoryFile]) -> None:
+    """Raise `ValueError` where frequencies are stated of responses that have their own, or none."""
+    for held in files:
+        is_used = any(note.kind == "even_axis" for note in held.notes)
+        if "frequency_step" in stated and not is_used:
+            raise ValueError(
+                f"--frequency-step has no effect on {held.name}, which holds no responses without "
+                "frequencies: leave it out."
+            )
 
 
 def refuse_unused_phase_unit(stated: Collection[str], used: ImportMap) -> None:

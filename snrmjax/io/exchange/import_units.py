@@ -8,7 +8,12 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from snrmjax.io.exchange.import_map import Assumptions, ImportMap
-from snrmjax.io.laboratory.physical_units import UnitMeaning, size_of, unit_meaning
+from snrmjax.io.laboratory.physical_units import (
+    UnitMeaning,
+    level_reference,
+    size_of,
+    unit_meaning,
+)
 from snrmjax.measure.recordings.channels import DERIVATIVE, SI_UNIT, Quantity
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.names import near_miss
@@ -72,6 +77,8 @@ def amplitude_of_name(file: str) -> tuple[float, str] | None:
 
 def force_meaning(mapping: ImportMap, file_unit: str, what: str) -> Force:
     """The unit of the force. Raises `ValueError` with a question where nobody states it."""
+    if mapping.force_unit and level_reference(file_unit) is not None:
+        raise ValueError(f"{what} is a level in {file_unit}, not in {mapping.force_unit}.")
     unit = mapping.force_unit or file_unit
     if not unit:
         raise ValueError(
@@ -116,6 +123,10 @@ def motion_meaning(
     numbers as they stand, where the unit does not say "m/s/N" or "g/g".
     Raises `ValueError` with a question where they are not stated or contradict one another.
     """
+    if unit and level_reference(file_unit) is not None:
+        raise ValueError(
+            f"{channel} is a level in {file_unit}, not in {unit}: give the response itself."
+        )
     stated = unit or file_unit
     if not stated:
         of: Quantity = next((known for known in SI_UNIT if known == quantity), "velocity")

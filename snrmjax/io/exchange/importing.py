@@ -14,6 +14,7 @@ from snrmjax.io.exchange.import_map import Assumptions, ImportMap
 from snrmjax.io.exchange.import_options import (
     Content,
     refuse_unused,
+    refuse_unused_axis,
     refuse_unused_phase_unit,
 )
 from snrmjax.io.exchange.import_units import Force
@@ -72,10 +73,17 @@ def import_files(
     """
     assumed, notes = Assumptions(), list[Fact]()
     datasets: list[_Dataset] = []
-    files = joined_files([read_laboratory_file(path, mapping.text_format) for path in paths])
+    how = mapping.text_format, mapping.even_axis
+    files = [read_laboratory_file(path, *how) for path in paths]
+    refuse_unused_axis(stated, files)
+    files = joined_files(files)
     for held in files:
         datasets += _datasets(held, mapping, strict="dataset" in stated)
-        notes += [Fact("note_of_file", file=held.name, note=note) for note in held.notes]
+        notes += [
+            Fact("note_of_file", file=held.name, note=note)
+            for note in held.notes
+            if not (mapping.rate and note.kind == "rate_left_open")
+        ]
     if len({type(dataset.content) for dataset in datasets}) > 1:
         listed = ", ".join(f"{dataset.file}: {dataset.name}" for dataset in datasets)
         raise ValueError(f"files of one test must hold things of one kind, but have {listed}.")

@@ -15,13 +15,21 @@ from snrmjax.io.exchange.importing import import_files, joined_files
 from snrmjax.io.exchange.record_import import mapped_record
 from snrmjax.io.laboratory.contents import LaboratoryFile, NumberTable
 from snrmjax.io.laboratory.names import is_of_base, role_of
-from snrmjax.io.laboratory.physical_units import UnitMeaning, size_of, unit_meaning
+from snrmjax.io.laboratory.physical_units import (
+    UnitMeaning,
+    level_reference,
+    size_of,
+    unit_meaning,
+)
 from snrmjax.measure.recordings.channels import DERIVATIVE, Channel
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
 from snrmjax.measure.recordings.time_recording import TimeRecording
 
 _TO_FILL_IN = re.compile(r"\b(COLUMN|CHANNEL|QUANTITY|UNIT|NEWTONS|AMPLITUDE|SENSOR)\b")
-_OTHERS = ("frequency", "force", "drive", "phase", "imaginary", "level", "deviation", "time")
+_OTHERS = (
+    *("frequency", "force", "drive", "phase", "imaginary", "level", "deviation", "time", "mark"),
+    "coherence",
+)
 _TRIED = 2**21  # samples of a record that is read to see whether it is of steps or sweeps
 _RADIANS = 1.01 * np.pi  # which phases in radians do not exceed
 _A_TURN = 1.0  # rad that phases of a resonance cover at least
@@ -59,7 +67,12 @@ def proposed_commands(paths: Sequence[Path], files: Sequence[LaboratoryFile]) ->
     held = joined_files(files)[0]
     if held.tables and is_ours(held.tables[0].columns):
         return [f"it has our own columns: `snrmjax check`, `identify` and `test` take {held.name}."]
-    contents: list[_Content] = [*held.recordings, *held.tables, *held.responses]
+    is_lost = any(note.kind == "responses_without_axis" for note in held.notes)
+    with_axis = [one for one in held.tables if _may_have_axis(one)]
+    if is_lost and not (with_axis or held.responses or held.recordings):
+        words = f"snrmjax import {named} --frequency-start HZ --frequency-step HZ"
+        return ["state the frequencies of the responses (fill in HZ):", f"  {words}"]
+    contents: list[_Content] = [*held.recordings, *with_axis, *held.responses, *held.tables]
     content = contents[0]
     found = _options_of(content)
     _take_amplitudes_of_names(found, files)
@@ -82,6 +95,14 @@ def proposed_commands(paths: Sequence[Path], files: Sequence[LaboratoryFile]) ->
     ]
     lines += [f"  it will ask: {question}"] if question else []
     return [*lines, *(_modes(named, content) if held.responses else ())]
+
+
+def _may_have_axis(table: NumberTable) -> bool:
+    """Whether a column of a table may be its frequencies."""
+    return any(
+        not np.iscomplexobj(column) and table.role(name) not in ("mark", "coherence")
+        for name, column in table.columns.items()
+    )
 
 
 def _take_amplitudes_of_names(found: _Options, files: Sequence[LaboratoryFile]) -> None:
@@ -127,12 +148,13 @@ class _Motion(NamedTuple):
     quantity: str
     meaning: UnitMeaning | None
     is_stated: bool  # quantity and unit are the file's
+    unit_word: str = "UNIT"
 
     @property
     def base_word(self) -> str:
         """As `--base` wants it, with the quantity always."""
         known = self.quantity if self.quantity in DERIVATIVE else "QUANTITY"
-        return f"{self.name}:{known}" + ("" if self.is_stated else ":UNIT")
+        return f"{self.name}:{known}" + ("" if self.is_stated else f":{self.unit_word}")
 
     @property
     def word(self) -> str:
@@ -141,10 +163,13 @@ class _Motion(NamedTuple):
 
 
 def _motion_of(name: str, unit: str, role: str) -> _Motion:
+    reference = level_reference(unit)
     try:
-        meaning = unit_meaning(unit)
+        meaning = unit_meaning(unit if reference is None else reference)
     except ValueError:
         return _Motion(name, role, None, False)
+    if reference == "":
+        return _Motion(name, role, None, False, "dB re UNIT")
     is_motion = meaning.quantity in DERIVATIVE and not meaning.per_volt
     return _Motion(name, meaning.quantity if is_motion else role, meaning, is_motion)
 
@@ -158,7 +183,7 @@ def _of_table(table: NumberTable) -> _Options:
 
     if len(of("frequency")) != 1:
         found["frequency"] = next(iter(of("frequency")), "COLUMN")
-    numbers = [name for name in table.columns if roles[name] not in (*_OTHERS, "coherence")]
+    numbers = [name for name in table.columns if roles[name] not in _OTHERS]
     named = [_motion_of(name, table.units.get(name, ""), roles[name]) for name in numbers]
     loads = of("force") or of("drive")
     moved = [] if loads else [one for one in named if is_of_base(one.name)][:1]
@@ -288,7 +313,8 @@ def _modes(named: str, sets: object) -> list[str]:
         return []
     if any(one.quantity not in DERIVATIVE for one in sets.responses):
         return [
-            "`snrmjax modes` needs to know which motions these are, and the file states no unit."
+            "`snrmjax modes` needs to know which motions these are, and the file states no unit: "
+            "import them as above with the force 1, and give it measured.csv."
         ]
     reference = sets.references[0]
     of_base = reference.quantity in DERIVATIVE

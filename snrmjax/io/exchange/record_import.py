@@ -1,6 +1,7 @@
 """Steady states, or records of a decay, of a laboratory's time records."""
 
 import dataclasses
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,20 @@ ENDINGS = {"velocity": "m_s", "acceleration": "m_s2", "displacement": "m"}
 
 _FEW_DIGITS = 0.02  # relative: two digits of a step
 _DIRECT: dict[str, Levels] = {"force": "force", "drive": "drive", "runs": "runs"}
+
+
+def ask_for_rate(notes: Iterable[Fact | str], rate: float, file: str) -> None:
+    """Raise `ValueError` where a file's few digits leave its sampling rate open.
+
+    Arguments: `rate` (Hz) is what is stated instead, or 0.
+    """
+    for note in notes:
+        if not rate and isinstance(note, Fact) and note.kind == "rate_left_open":
+            raise ValueError(
+                f"which sampling rate has {file}? Its step of {note['step']} s has few digits, so "
+                f"that frequencies may be off by {note['off']:.1g} %. Say so by "
+                f"`--rate {note['rate']:g}`, if that is it."
+            )
 
 
 def at_stated_rate(record: TimeRecording, rate: float, file: str) -> TimeRecording:

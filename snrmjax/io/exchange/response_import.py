@@ -16,6 +16,7 @@ from snrmjax.io.exchange.import_units import (
 )
 from snrmjax.io.exchange.table_import import import_table
 from snrmjax.io.laboratory.contents import NumberTable
+from snrmjax.io.laboratory.physical_units import level_reference
 from snrmjax.measure.recordings.channels import SI_UNIT, Channel
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
 from snrmjax.numerics.facts import Fact
@@ -203,8 +204,9 @@ def import_responses(
     for response in mapping.responses:
         name = response.channel
         columns[name], channel = source.column(name, response.unit, "--response")
-        if channel.quantity not in ("unknown", "voltage"):
-            units[name] = channel.unit if response.unit else channel.si_unit
+        is_level = level_reference(channel.unit) is not None
+        if is_level or channel.quantity not in ("unknown", "voltage"):
+            units[name] = channel.unit if is_level or response.unit else channel.si_unit
     table = NumberTable(file, columns, {name: unit for name, unit in units.items() if unit})
     part, used, force, notes = import_table(table, as_table, file, assumed)
     del assumed["frequency_unit"]

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
+from snrmjax.io.exchange.decibels import with_stated_references
 from snrmjax.io.exchange.import_levels import MeasuredPart
 from snrmjax.io.exchange.import_map import BY_NAME, Assumptions, ImportMap, ResponseMap
 from snrmjax.io.exchange.import_units import (
@@ -20,12 +21,14 @@ from snrmjax.io.exchange.import_units import (
 )
 from snrmjax.io.laboratory.contents import NumberTable
 from snrmjax.io.laboratory.names import label_of, role_of
+from snrmjax.io.laboratory.physical_units import level_reference
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.velocity_states import velocity_factors
 from snrmjax.measure.states import UNNAMED_SENSOR
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.names import near_miss
 
+_DECIBELS = re.compile(r"(?<![^\W\d_])d[Bb](?![^\W\d_])")
 _DEVIATION = re.compile(r"stdev|stddev|std|sigma|deviation|dev")
 
 
@@ -36,6 +39,7 @@ class _Source(NamedTuple):
     mapping: ImportMap
     file: str
     assumed: Assumptions
+    levels: frozenset[str] = frozenset()  # columns that the file has in dB
 
     def unit(self, name: str) -> str:
         """The file's word for a column's unit."""
@@ -83,7 +87,9 @@ def import_table(
     Raises `ValueError` with a question that names the option for what cannot be told.
     """
     mapping = mapping.with_names({name: table.units.get(name, "") for name in table.columns})
-    source = _Source(table, mapping, file, assumed)
+    table, mapping, notes = with_stated_references(table, mapping, file)
+    levels = frozenset(note["name"] for note in notes)
+    source = _Source(table, mapping, file, assumed, levels)
     mapping = mapping._replace(frequency=mapping.frequency or _frequency_column(source))
     source = source._replace(mapping=mapping)
     omega = frequency_in_rad(
@@ -131,7 +137,7 @@ def import_table(
         *(amplitude_std[good], phase_std[good]),
     )
     left_out = int(np.sum(~good))
-    notes = [Fact("rows_incomplete", n=left_out, of=len(good), file=file)] if left_out else []
+    notes += [Fact("rows_incomplete", n=left_out, of=len(good), file=file)] if left_out else []
     return part, mapping, force, notes
 
 
@@ -353,6 +359,15 @@ def _errors(
     the unit of the phases.
     """
     turn = 1.0 if _in_radians(source, response) else np.pi / 180
+    of_level, name = response.channel in source.levels, response.amplitude_std
+    is_level = bool(_DECIBELS.search(name)) or level_reference(source.unit(name)) is not None
+    if name and of_level != is_level and (is_level or source.unit(name)):
+        raise ValueError(
+            f"{name} of {source.file} must be standard deviations in the unit of "
+            f"{response.channel}, but one of both is in dB: --amplitude-std names another column."
+        )
+    if of_level:  # errors in dB, too
+        scale = scale * np.log(10) / 20 * np.abs(source.column(response.channel, "--response"))
     stated = (
         (response.amplitude_std, "--amplitude-std", scale),
         (response.phase_std, "--phase-std", np.asarray(turn)),

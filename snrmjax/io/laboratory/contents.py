@@ -6,12 +6,12 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Num
 
-from snrmjax.io.laboratory.names import label_of, role_of
+from snrmjax.io.laboratory.names import column_unit, role_of
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.numerics.facts import Fact
 
-Kind = Literal["uff", "matlab", "hdf5", "netcdf", "tdms", "lvm", "csv"]
+Kind = Literal["uff", "matlab", "octave", "hdf5", "netcdf", "tdms", "lvm", "csv"]
 
 
 class NumberTable(NamedTuple):
@@ -29,12 +29,13 @@ class NumberTable(NamedTuple):
     words: Mapping[str, tuple[str, ...]] = {}
 
     def role(self, name: str) -> str:
-        """What a column is, by its name and its unit; see `role_of`."""
-        return role_of(name, self.units.get(name, ""))
+        """What a column is, by its name and its unit; see `role_of`. Truth values are marks."""
+        is_mark = self.columns[name].dtype == bool
+        return "mark" if is_mark else role_of(name, self.units.get(name, ""))
 
     def with_named_units(self) -> "NumberTable":
         """With the units that names of columns have in them, where the file states none."""
-        said = {name: self.units.get(name) or label_of(name).unit for name in self.columns}
+        said = {name: column_unit(name, self.units.get(name, "")) for name in self.columns}
         return self._replace(units={name: unit for name, unit in said.items() if unit})
 
     @property

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from snrmjax.io.laboratory.physical_units import (
+    level_reference,
     size_words_removed,
     unit_in_table,
     unit_meaning,
@@ -28,6 +29,8 @@ _ROLES = {
     "drive": r"\w*(drive|volt\w*|source|generator|amplifier|signal|spannung)\w*|"
     r"v_?(in|out|exc)|u",
     "force": r"\w*(force|kraft|load_?cell|hammer|impedance_?head_?f)\w*|fexc|f_?amp\w*|lc\w*",
+    "mark": r"flags?|\w*_flags?|valid\w*|ok|is_\w+|overload\w*|ovld?|clipped|settled|converged|"
+    r"status|quality|mask|reject\w*|outlier\w*|n?_?(avg|averages)|error_?code\w*",
     "coherence": r"\w*coh\w*",
     "velocity": r"\w*(velo\w*|vibrometer|ldv|geschw\w*|vitesse)|v|vel\w*",
     "acceleration": r"\w*(acc\w*|beschl\w*)|a",
@@ -55,6 +58,10 @@ _BOUNDARY = re.compile(
 )
 _IN_BRACKETS = re.compile(r"^(.*?)\s*(?:\[([^\[\]]*)\]|\(((?:[^()]|\([^()]*\))*)\))$")
 _DATE = re.compile(r"[0-9]+[-/.:][0-9]+[-/.:]|[0-9]:[0-9]")  # and times of day: no units
+
+# Levels: "vel_dB", "Mag [dB re 1 m/s]", "20*log10(|v|)".
+_LEVEL = re.compile(r"(?<![^\W\d_])(?:d[Bb]|DB|[Dd]ecibels?)(?:V|u|[mµu]V)?(?!\w).*$|(?<=[a-z])dB$")
+_LOGARITHM = re.compile(r"20\s*[*·x]?\s*log", re.IGNORECASE)
 
 _BASE = re.compile(
     r"(.*[^a-z])?(base|table|shaker|control|ctrl|foot|fixture|slip|basis|tisch|fu[sß]s?punkt|pot)"
@@ -93,6 +100,8 @@ def label_of(name: str) -> Label:
     (('', 'mm/s'), ('g', ''), ('acc_mm_s', ''))
     """
     plain, size = without_size(name.strip())
+    if (level := _level_of(name.strip())) is not None:
+        return level
     match = _IN_BRACKETS.match(plain)
     if match and _DATE.search(match[2] or match[3] or ""):
         return Label(name.strip())
@@ -112,6 +121,32 @@ def label_of(name: str) -> Label:
         if word or not _called(_BOUNDARY.split(plain)[0]):
             break
     return Label(name.strip())
+
+
+def column_unit(name: str, stated: str) -> str:
+    """The unit of a column: stated, or in its name. A name that says dB is believed before others.
+
+    >>> column_unit("vel_mm_s", ""), column_unit("vel", "mm/s"), column_unit("vel_dB", "mm/s")
+    ('mm/s', 'mm/s', 'dB')
+    """
+    named = label_of(name).unit
+    is_level = level_reference(named) is not None and level_reference(stated) is None
+    return named if is_level or not stated else stated
+
+
+def _level_of(name: str) -> Label | None:
+    """A name of a level in two, as "vel" and "dB re 1 m/s", or None: of no level."""
+    found = _LEVEL.search(name)
+    if found is None:
+        return Label(name, "dB") if _LOGARITHM.search(name) else None
+    word, unit = name[: found.start()].rstrip(), found[0]
+    is_bracketed = word.endswith(("(", "["))
+    if is_bracketed:
+        unit = unit.rpartition(")" if word.endswith("(") else "]")[0] or unit
+    if level_reference(unit) is None:
+        return None
+    word = word[:-1].rstrip(" /,_-") if is_bracketed else word.rstrip(" /,_-.")
+    return Label(word, unit.strip(), is_bracketed)
 
 
 def _is_unit_of(word: str, unit: str) -> bool:
@@ -146,7 +181,8 @@ def role_of(name: str, unit: str = "") -> str:
     label = label_of(name)
     by_name = _called(label.word)
     try:
-        meaning = unit_meaning(unit or label.unit)
+        stated = unit or label.unit
+        meaning = unit_meaning(level_reference(stated) or stated)
     except ValueError:
         return by_name
     by_unit = _BY_UNIT.get(meaning.dimension, "")

@@ -33,6 +33,15 @@ _SIZED = re.compile(
     rf"[\s_,]*(?:(?P<round>\()|(?P<square>\[))?{_SIZE}(?(round)\)|(?(square)\]))$", re.IGNORECASE
 )
 
+_LEVEL = re.compile(
+    r"(?:d[Bb]|DB|[Dd]ecibels?)(?:\s*(?P<volt>[mµu]?V|u)\b|\s*\(?(?P<size>rms|pk|peak)\b\)?)?"
+    r"(?:\s*\(?\s*(?:(?:re|ref|rel|reference|bezogen auf|bez)\b\.?(?:\s*to\b)?|//|:)\s*[:=]?\s*"
+    r"(?P<reference>[^()]*(?:\([^()]*\)[^()]*)*?)\)?|\s*\((?P<inner>[^()]*/[^()]*|g|N)\)"
+    r"|\s*\([A-Z]\)|\s*FS)?"
+)
+_VOLT_LEVELS = {"V": "1 V rms", "mV": "1 mV rms", "uV": "1 uV rms", "µV": "1 uV rms"}
+_VOLT_LEVELS["u"] = "0.7746 V rms"
+
 _Powers = tuple[int, int, int, int, int]  # of metre, kilogram, second, ampere and radian
 _VOLT: _Powers = (2, 1, -3, -1, 0)
 _DIMENSIONS: dict[str, _Powers] = {
@@ -124,6 +133,8 @@ def unit_meaning(text: str) -> UnitMeaning:
     (9.80665, 'velocity')
     """
     plain = text.strip().strip("[]").strip()
+    if level_reference(plain) is not None:
+        raise _not_understood(text, ", but is a level")
     if plain.lower() in _NOTHING:
         return UnitMeaning("unknown", 1.0)
     if len(plain) > _LONGEST or not _ALLOWED.fullmatch(plain):
@@ -154,6 +165,26 @@ def unit_meaning(text: str) -> UnitMeaning:
     if dimension == "angle" and not powers[4]:
         dimension = "other"
     return UnitMeaning(dimension, value * factor, size)
+
+
+def level_reference(text: str) -> str | None:
+    """The reference of a level in dB as a unit, "" where none is understood, None for no level.
+
+    >>> [level_reference(unit) for unit in ("dB re 1e-9 m/s", "dB (ref. g/N)", "dBV", "dB", "m/s")]
+    ['1e-9 m/s', 'g/N', '1 V rms', '', None]
+    """
+    plain = text.strip().strip("[]").strip()
+    match = _LEVEL.fullmatch(plain)
+    if match is None:
+        return "" if re.match(r"d[Bb](?!ar)|DB|[Dd]ecibel", plain) else None
+    if match["volt"]:
+        return _VOLT_LEVELS[match["volt"]]
+    reference = (match["reference"] or match["inner"] or "").strip()
+    power = re.match(r"10\s*(?:\^\s*\(?|\*\*)?\s*([-−⁻][0-9¹²³⁴⁵⁶⁷⁸⁹]{1,2})\)?\s*", reference)
+    if power:
+        digits = power[1].translate(str.maketrans("−⁻¹²³⁴⁵⁶⁷⁸⁹", "--123456789"))
+        reference = f"1e{digits} {reference[power.end() :]}"
+    return f"{reference} {match['size'] or ''}".strip()
 
 
 def size_of(text: str) -> str:

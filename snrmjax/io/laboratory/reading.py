@@ -4,7 +4,9 @@ import importlib
 from pathlib import Path
 
 from snrmjax.io.files import FilePath, file_name, read_bytes
+from snrmjax.io.laboratory.arrays.even_axis import EvenAxis
 from snrmjax.io.laboratory.arrays.matlab_files import is_old_matlab
+from snrmjax.io.laboratory.arrays.octave_text import is_octave_text
 from snrmjax.io.laboratory.contents import Kind, LaboratoryFile, TextFormat
 from snrmjax.io.laboratory.record_tables import with_named_channels
 
@@ -12,23 +14,28 @@ _ROOM = "snrmjax.io.laboratory"
 _READERS: dict[Kind, tuple[str, str]] = {
     "uff": ("uff.functions", "read_uff"),
     "matlab": ("arrays.matlab_files", "read_matlab"),
+    "octave": ("arrays.octave_text", "read_octave"),
     "hdf5": ("arrays.hdf5_tree", "read_hdf5"),
     "tdms": ("tdms_files", "read_tdms"),
-    "lvm": ("labview_text", "read_labview_text"),
-    "csv": ("separated_text", "read_separated_text"),
+    "lvm": ("text.labview_text", "read_labview_text"),
+    "csv": ("text.separated_text", "read_separated_text"),
 }
+_OF_ARRAYS = ("matlab", "octave", "hdf5")
 _HEAD = 4096
 _MOST_REASONS = 6  # notes that say why nothing was read
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 
 
-def read_laboratory_file(path: FilePath, text_format: TextFormat | None = None) -> LaboratoryFile:
+def read_laboratory_file(
+    path: FilePath, text_format: TextFormat | None = None, axis: EvenAxis | None = None
+) -> LaboratoryFile:
     """All recordings, frequency responses and tables of a file.
 
-    Formats: UFF/UNV (58, 58b), MATLAB v4 to v7.3, HDF5, netCDF 4, TDMS, LabVIEW measurement files,
-    and CSV or other separated text. Long records are not read before they are asked for (HDF5,
-    netCDF, MATLAB v7.3, TDMS).
-    Arguments: `text_format` says how a CSV is written where that is not found out by itself.
+    Formats: UFF/UNV (58, 58b), MATLAB v4 to v7.3, Octave's text, HDF5, netCDF 4, TDMS, LabVIEW
+    measurement files, and CSV or other separated text. Long records are not read before they are
+    asked for (HDF5, netCDF, MATLAB v7.3, TDMS).
+    Arguments: `text_format` says how a CSV is written where that is not found out by itself; `axis`
+    is that of matrices of responses (MATLAB, Octave, HDF5) without a vector of frequencies.
     Returns `LaboratoryFile`. Raises `ValueError`, in one sentence that names the file, for a file
     that is missing, empty, of another format, damaged, or that states more than it can hold; and
     where the reader needs a package that is not installed.
@@ -36,7 +43,7 @@ def read_laboratory_file(path: FilePath, text_format: TextFormat | None = None) 
     kind = _kind(path)
     module, function = _READERS[kind]
     read = getattr(importlib.import_module(f"{_ROOM}.{module}"), function)
-    options = (text_format,) if kind == "csv" else ()
+    options = (text_format,) if kind == "csv" else (axis,) if kind in _OF_ARRAYS else ()
     held: LaboratoryFile = read(Path(path), *options)
     if held.is_empty:
         why = f": {' '.join(map(str, held.notes[:_MOST_REASONS]))}" if held.notes else "."
@@ -59,6 +66,8 @@ def _kind(path: FilePath) -> Kind:
         return "tdms"
     if is_old_matlab(head, Path(path).suffix):
         return "matlab"
+    if is_octave_text(head):
+        return "octave"
     if head.lstrip(b"\xef\xbb\xbf\r\n ").startswith(b"LabVIEW Measurement"):
         return "lvm"
     first = head.lstrip(b"\r\n").split(b"\n", 1)[0].rstrip()

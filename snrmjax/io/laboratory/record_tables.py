@@ -7,8 +7,9 @@ import numpy as np
 from jaxtyping import Float
 
 from snrmjax.io.files import FilePath
-from snrmjax.io.laboratory.names import label_of
-from snrmjax.io.laboratory.physical_units import channel_meaning
+from snrmjax.io.laboratory.names import column_unit
+from snrmjax.io.laboratory.physical_units import channel_meaning, level_reference
+from snrmjax.io.laboratory.printed_times import rate_of_printed_times
 from snrmjax.io.rows import header_of, read_cells
 from snrmjax.measure.recordings.channels import Channel, Quantity
 from snrmjax.measure.recordings.time_recording import TimeRecording, time_recording
@@ -55,7 +56,8 @@ def read_record_table(path: FilePath) -> TimeRecording:
             f"a time record needs {_FEWEST} samples at least, but {file} has {len(time)}."
         )
     start = float(time[0])
-    rate = _sampling_rate(time, file)
+    rate, further = _sampling_rate(time, file)
+    notes += further
     return time_recording(values, channels, rate, start_time=start, name=file, notes=notes)
 
 
@@ -70,8 +72,10 @@ def with_named_channels(recording: TimeRecording) -> TimeRecording:
 
 
 def _named(channel: Channel) -> Channel:
-    unit = channel.unit or label_of(channel.name).unit
+    unit = column_unit(channel.name, channel.unit)
     quantity, calibration = channel_meaning(unit)
+    if level_reference(unit) is not None:
+        return channel._replace(quantity="unknown", unit=unit, calibration=1.0)
     if channel.quantity != "unknown" or quantity == "unknown":
         return channel
     ours = (re.fullmatch(rf"(.+)[._]{column}", channel.name) for column in _COLUMNS)
@@ -110,28 +114,29 @@ def _channels(names: list[str], file: str) -> tuple[list[Channel], list[Fact]]:
     return channels, [Fact("column_not_used", name=name, file=file, near="") for name in others]
 
 
-def _sampling_rate(time: Float[np.ndarray, " row"], file: str) -> float:
-    """Samples a second of times that rise evenly, as far as their digits say."""
+def _sampling_rate(time: Float[np.ndarray, " row"], file: str) -> tuple[float, list[Fact]]:
+    """Samples a second of times that rise evenly, as far as their digits say, and notes."""
     steps = np.diff(time)
+    step = float(time[-1] - time[0]) / len(steps)
+    away = np.abs(time - time[0] - step * np.arange(len(time)))
+    typical = float(np.median(steps))
+    allowed = max(_EVEN * typical, 1.01 * _rounding(time, typical))
+    worst = int(np.argmax(away))
+    if away[worst] <= allowed and step > 0:
+        return 1 / step, []
+    if (printed := rate_of_printed_times(time)) is not None:
+        return printed.rate, [] if printed.note is None else [printed.note]
     falls = np.flatnonzero(steps <= 0)
     if falls.size:
         raise ValueError(
             f"`time_s` must rise, but row {falls[0] + 3} of {file} has {time[falls[0] + 1]:.9g} "
             f"after {time[falls[0]]:.9g}."
         )
-    step = float(time[-1] - time[0]) / len(steps)
-    away = np.abs(time - time[0] - step * np.arange(len(time)))
-    worst = int(np.argmax(away))
-    # A gap somewhere moves the mean step too: the median is that of the other samples.
-    typical = float(np.median(steps))
-    allowed = max(_EVEN * typical, 1.01 * _rounding(time, typical))
-    if away[worst] > allowed:
-        gap = int(np.argmax(np.abs(steps - typical)))
-        raise ValueError(
-            f"`time_s` must be evenly spaced, but in row {gap + 3} of {file} it steps by "
-            f"{steps[gap]:.6g} s, elsewhere by {typical:.6g} s: resample the record."
-        )
-    return 1 / step
+    gap = int(np.argmax(np.abs(steps - typical)))
+    raise ValueError(
+        f"`time_s` must be evenly spaced, but in row {gap + 3} of {file} it steps by "
+        f"{steps[gap]:.6g} s, elsewhere by {typical:.6g} s: resample the record."
+    )
 
 
 def _rounding(time: Float[np.ndarray, " row"], step: float) -> float:

@@ -17,9 +17,9 @@ def _our_own_table(unit: str, force_unit: str, amplitude: str, conjugated: bool)
 _NOT_READ = {
     "empty": "is empty",
     "type": "is of a type that is not read",
+    "marks": "marks the lines of responses",
     "times_of_day": "holds times of day",
     "sparse": "is a sparse matrix: save numbers, text, structs and cells",
-    "object": "is a function handle or an object: save numbers, text, structs and cells",
     "circle": "links in a circle or nests too deeply",
     "other_file": "is a link to another file",
     "elsewhere": "lies in other files",
@@ -70,6 +70,10 @@ SENTENCES: dict[str, Wording] = {
     ),
     # Notes on files of laboratories.
     "not_read": lambda name, why: f"{name} {_NOT_READ[why]}; not read.",
+    "object_not_read": lambda name, kind: (
+        f"{name} is of the class {kind.replace('_', ' ')}; not read: save numbers, text, structs "
+        "and cells" + (f" (table2struct({name}, 'ToScalar', true))." if kind == "table" else ".")
+    ),
     "nothing_measured": lambda names: (
         "it has only texts, single numbers and empty arrays"
         + (f" ({', '.join(names)})." if names else ".")
@@ -82,6 +86,17 @@ SENTENCES: dict[str, Wording] = {
     "responses_along_first_side": "responses along the first side that is not the frequency's.",
     "columns_numbered": "no row of names above the numbers: the columns are numbered.",
     "comments_not_read": "{n:#line} of comment among the numbers not read.",
+    "even_axis": (
+        "the frequencies of {name} are from {start:g} to {stop:g} Hz in steps of {step:g} Hz, as "
+        "stated."
+    ),
+    "responses_without_axis": (
+        "{name} has {n} lines without frequencies: --frequency-step states their step in Hz, and "
+        "--frequency-start where they start (0 by default)."
+    ),
+    "level_as_amplitude": "{name} is a level in {unit}: its amplitudes are taken.",
+    "thousands": "column {name} has separators of thousands: {text} is {number:.10g}.",
+    "other_decimal": "column {name} has a decimal {decimal}, unlike other columns.",
     "empty_fields": "column {name} has {n:#empty field}.",
     "text_says": lambda separator, decimal, n: (
         f"separator {separator}, decimal {decimal}, {number_of(n, 'segment')}, as its header says."

@@ -1,12 +1,14 @@
 """MATLAB, HDF5 and netCDF files by scipy, h5py and xarray: what their structs hold."""
 
 import struct
+import zlib
 
 import h5py
 import numpy as np
 import pytest
 import scipy.io
 import xarray
+from truths.import_runs import run_import
 
 from snrmjax.io.laboratory import read_laboratory_file
 
@@ -199,8 +201,43 @@ def test_function_handles_and_objects_are_named(tmp_path):
 
     write_v73(path, fill)
     found = read_laboratory_file(path)
-    assert [note["why"] for note in found.notes] == ["object", "object"]
+    named = [(note["name"], note["kind"]) for note in found.notes]
+    assert named == [("f", "function_handle"), ("s", "string")]
     assert set(found.tables[0].columns) == {"x"}
+
+
+def object_of_matlab(name, kind):
+    """A variable of level 5 that is an object, as MATLAB writes tables, strings and datetimes."""
+
+    def element(number, data):
+        return struct.pack("<II", number, len(data)) + data + bytes(-len(data) % 8)
+
+    marks = np.array([3707764736, 2, 1, 1, 1, 1], dtype="<u4")
+    flags = element(6, struct.pack("<II", 13, 0))
+    inner = flags + element(5, struct.pack("<ii", 6, 1)) + element(1, b"")
+    inner = element(14, inner + element(6, marks.tobytes()))
+    texts = b"".join(element(1, word.encode()) for word in (name, "MCOS", kind))
+    return element(14, element(6, struct.pack("<II", 17, 0)) + texts + inner)
+
+
+@pytest.mark.parametrize("is_compressed", [False, True])
+@pytest.mark.parametrize("kinds", [("table",), ("string", "datetime", "containers.Map")])
+def test_objects_beside_plain_arrays_are_named(tmp_path, kinds, is_compressed):
+    path = tmp_path / "objects.mat"
+    scipy.io.savemat(path, {"frequency": HERTZ, "s": {"force": 1.0}}, do_compression=is_compressed)
+    for kind in kinds:
+        packed = object_of_matlab(f"a_{kind[:3]}", kind)
+        if is_compressed:
+            packed = zlib.compress(packed)
+            packed = struct.pack("<II", 15, len(packed)) + packed
+        path.write_bytes(path.read_bytes() + packed)
+    found = read_laboratory_file(path)
+    np.testing.assert_array_equal(found.tables[0].columns["frequency"], HERTZ)
+    named = [(note["name"], note["kind"]) for note in found.notes]
+    assert named == [(f"a_{kind[:3]}", kind) for kind in kinds]
+    path.write_bytes(path.read_bytes()[:128] + object_of_matlab("T", "timetable"))
+    with pytest.raises(ValueError, match=r"could be read: T is of the class timetable"):
+        read_laboratory_file(path)
 
 
 def test_links_to_other_files_are_not_followed(tmp_path):
@@ -300,4 +337,247 @@ def test_elements_of_no_type_are_refused(tmp_path):
     content[at : at + 8] = bytes(8)
     path.write_bytes(content)
     with pytest.raises(ValueError, match=r"zeros\.mat is damaged .*type 0"):
+        read_laboratory_file(path)
+
+
+OCTAVE = """# Created by Octave 6.4.0, Mon Jan 05 10:00:00 2026 UTC <user@host>
+# name: test
+# type: scalar struct
+# ndims: 2
+ 1 1
+# length: 7
+# name: frequency
+# type: range
+# base, limit, increment
+79 80 0.5
+
+
+# name: force
+# type: int32 matrix
+# ndims: 2
+ 3 1
+  1
+  2
+  4
+
+
+# name: velocity
+# type: float complex matrix
+# rows: 1
+# columns: 3
+ (1,0.5) (NaN,-2) (-3e-2,0)
+
+
+# name: ok
+# type: bool matrix
+# rows: 3
+# columns: 1
+ 1
+ 0
+ 1
+
+
+# name: title
+# type: string
+# elements: 1
+# length: 5
+a tip
+
+
+# name: f
+# type: function handle
+@<anonymous>
+@ (x) x .^ 2
+
+
+# name: gain
+# type: scalar
+2.5
+
+
+
+
+# name: levels
+# type: cell
+# rows: 1
+# columns: 2
+# name: <cell-element>
+# type: scalar struct
+# ndims: 2
+ 1 1
+# length: 2
+# name: frequency
+# type: matrix
+# rows: 2
+# columns: 1
+ 10
+ 11
+
+
+# name: force
+# type: scalar
+0.1
+
+
+
+
+# name: <cell-element>
+# type: scalar struct
+# ndims: 2
+ 1 1
+# length: 2
+# name: frequency
+# type: matrix
+# rows: 2
+# columns: 1
+ 10
+ 12
+
+
+# name: force
+# type: scalar
+0.2
+
+
+
+
+
+
+
+# name: S
+# type: sparse matrix
+# nnz: 1
+# rows: 2
+# columns: 2
+1 1 3
+
+
+"""
+
+
+def test_the_text_format_of_octave(tmp_path):
+    path = tmp_path / "a.mat"
+    path.write_text(OCTAVE)
+    found = read_laboratory_file(path)
+    assert found.kind == "octave"
+    named = {table.name: table for table in found.tables}
+    columns = named["test"].columns
+    np.testing.assert_array_equal(columns["frequency"], HERTZ)
+    np.testing.assert_array_equal(columns["force"], [1, 2, 4])
+    np.testing.assert_array_equal(columns["velocity"], [1 + 0.5j, np.nan - 2j, -0.03])
+    assert columns["ok"].dtype == bool
+    levels = named["levels"].columns
+    assert levels["force"].tolist() == [0.1, 0.1, 0.2, 0.2]
+    assert levels["frequency"].tolist() == [10, 11, 10, 12]
+    said = [(note.kind, note["name"]) for note in found.notes]
+    assert ("object_not_read", "test.f") in said
+    assert ("not_read", "S") in said
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "complaint"),
+    [
+        ("# columns: 3", "# columns: 4", "have 3 numbers, but 4 are stated"),
+        ("# rows: 2", "# rows: 200", "it ends within a variable"),
+        ("# rows: 2", "# rows: -2", "line 69 must be a number of rows, but is '-2'"),
+        ("79 80 0.5", "79 80 0", "must be base, limit and increment of test.frequency"),
+        ("79 80 0.5", "79 80 1e-12", "a range of less than"),
+        (" 10\n", " 1x\n", "must be numbers"),
+        ("# type: bool", "# kind: bool", "must be # type: …, but is '# kind: bool matrix'"),
+    ],
+)
+def test_damaged_text_of_octave_is_refused(tmp_path, old, new, complaint):
+    path = tmp_path / "a.mat"
+    path.write_text(OCTAVE.replace(old, new))
+    with pytest.raises(ValueError, match=rf"a\.mat is (cut|damaged): .*{complaint}"):
+        read_laboratory_file(path)
+
+
+@pytest.mark.parametrize("version", ["v5", "v7.3"])
+@pytest.mark.parametrize(
+    ("names", "unit", "is_vector"),
+    [(("fstart", "df"), 1.0, False), (("freq_start_kHz", "f_step_kHz"), 1e3, True)],
+)
+def test_a_start_and_a_step_are_the_axis_of_responses(tmp_path, version, names, unit, is_vector):
+    h = np.arange(1, 41).reshape(2, 20) * (1 + 2j)
+    single = {names[0]: 10.0 / unit, names[1]: 0.25 / unit}
+    arrays = {"H": h[0] if is_vector else h.T, "flags": (np.arange(20) % 2).astype(np.int16)}
+    path = tmp_path / "frf.mat"
+    if version == "v5":
+        scipy.io.savemat(path, {**single, **arrays})
+    else:
+
+        def fill(file):
+            for key, value in {**single, **arrays}.items():
+                put(file, key, np.atleast_2d(value))
+
+        write_v73(path, fill)
+    found = read_laboratory_file(path)
+    (one,) = found.responses
+    np.testing.assert_allclose(one.frequency, 2 * np.pi * (10 + 0.25 * np.arange(20)), rtol=1e-13)
+    np.testing.assert_array_equal(one.values[:, 0], h[:1] if is_vector else h)
+    assert not found.tables
+    assert [note.kind for note in found.notes if note.kind != "responses_along_first_side"] == [
+        *("even_axis", "not_read")
+    ]
+    assert any(note.get("why") == "marks" for note in found.notes)
+
+
+def test_an_axis_that_is_stated_and_marks_beside_responses(tmp_path):
+    path, out = tmp_path / "frf.mat", tmp_path / "out"
+    h, valid = np.arange(1, 41).reshape(2, 20) * (1 + 2j), np.arange(20) > 3
+    scipy.io.savemat(path, {"H": h, "valid": valid})
+    code, said = run_import(path)
+    assert code == 0
+    assert "snrmjax import" in said
+    assert "--frequency-start HZ --frequency-step HZ" in said
+    words = ("--response", "H.2:velocity:m/s", "--force-amplitude", 2, "--out", out)
+    axis = ("--frequency-start", 10, "--frequency-step", 0.25)
+    code, said = run_import(path, *axis, *words)
+    assert code == 0, said
+    table = np.genfromtxt(out / "measured.csv", delimiter=",", names=True)
+    np.testing.assert_allclose(table["frequency_hz"], 10 + 0.25 * np.arange(20), rtol=1e-13)
+    np.testing.assert_allclose(table["velocity_im_m_s"], 2 * h[1].imag, rtol=1e-13)
+    # The map of that import reads the next file alike.
+    code, said = run_import(path, "--map", out / "map.toml", "--out", tmp_path / "again")
+    assert (tmp_path / "again" / "measured.csv").read_text() == (out / "measured.csv").read_text()
+    assert "needs --frequency-step" in run_import(path, *axis[:2], *words)[1]
+    scipy.io.savemat(path, {"H": h, "f": 10 + np.arange(20), "valid": valid})
+    assert "--frequency-step has no effect" in run_import(path, *axis, *words)[1]
+    found = read_laboratory_file(path)
+    assert not found.tables
+    assert len(found.responses) == 1
+    # A truth value is never proposed as the response of a table.
+    scipy.io.savemat(path, {"f": 10 + np.arange(20), "good": valid, "v": h[0].real})
+    assert "--response v:" in run_import(path)[1]
+
+
+def test_an_array_without_its_imaginary_part_is_refused(tmp_path):
+    """A damaged flag says that a field is complex: within scipy it ends the process."""
+    path = tmp_path / "flag.mat"
+    scipy.io.savemat(path, {"s": {"frequency": HERTZ, "v": HERTZ**2}})
+    content = bytearray(path.read_bytes())
+    at = content.index(struct.pack("<III", 6, 8, 6), 300) + 9
+    content[at] |= 8
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"flag\.mat is damaged .*without its numbers"):
+        read_laboratory_file(path)
+
+
+def test_a_heap_of_texts_without_an_end_is_refused(tmp_path):
+    """Zeros over the size of its free space: within HDF5 reading a text never ends."""
+    path = tmp_path / "heap.h5"
+    with h5py.File(path, "w") as file:
+        file["x"] = HERTZ
+        file["x"].attrs["unit"] = "mm/s"
+        file["names"] = ["one", "two"]
+    assert read_laboratory_file(path).tables[0].units == {"x": "mm/s"}
+    content = bytearray(path.read_bytes())
+    start = content.index(b"GCOL")
+    at = start + 16
+    while int.from_bytes(content[at : at + 2], "little"):
+        at += 16 + -(-int.from_bytes(content[at + 8 : at + 16], "little") // 8) * 8
+    content[at : at + 16] = bytes(16)
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"heap\.h5 is damaged .*heap of texts without an end"):
         read_laboratory_file(path)

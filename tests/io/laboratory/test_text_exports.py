@@ -6,6 +6,7 @@ from truths.import_runs import run_import
 
 from snrmjax.io.laboratory import read_laboratory_file
 from snrmjax.io.laboratory.contents import TextFormat
+from snrmjax.io.laboratory.record_tables import read_record_table
 
 RATE = 1000
 TIME = np.arange(80) / RATE
@@ -206,3 +207,101 @@ def test_a_number_of_very_many_digits_is_a_number(tmp_path):
     rows = "\n".join(f"{k},{10**25 + k}" for k in range(5))
     (table,) = read(tmp_path, f"f [Hz],v [m/s]\n{rows}\n", "a.csv").tables
     assert table.columns["v"].tolist() == [1e25] * 5
+
+
+@pytest.mark.parametrize(
+    ("separator", "mark", "decimal"),
+    [
+        *((";", ".", ","), (";", " ", ","), ("\t", " ", ","), ("\t", "\u2009", ".")),
+        *((";", "'", "."), (",", ".", ","), (",", ",", "."), ("\t", "\u202f", ",")),
+    ],
+)
+def test_separators_of_thousands(tmp_path, separator, mark, decimal):
+    def row(*fields):
+        words = [f"{one:,}".replace(",", "T").replace(".", decimal) for one in fields]
+        words = [word.replace("T", mark) for word in words]
+        quoted = [f'"{word}"' if separator in word else word for word in words]
+        return separator.join(quoted)
+
+    truth = [(998, 0.5, 1250.25, 12), (1000, 0.5, 1391, 1234567), (1001, 0.5, 1.25, -40)]
+    head = separator.join(["f [Hz]", "F [N]", "v [mm/s]", "n"])
+    held = read(tmp_path, "\n".join([head, *(row(*one) for one in truth)]), "a.csv")
+    np.testing.assert_array_equal(np.transpose(list(held.tables[0].columns.values())), truth)
+    assert sum(note.kind == "thousands" for note in held.notes) == 3
+
+
+@pytest.mark.parametrize(
+    ("rows", "complaint", "by_point", "by_comma"),
+    [
+        ("998;5\n1.000;5", r"is 1\.000 in row 3 of a\.csv 1 or 1000\?", [998, 1], [998, 1000]),
+        ("998;5\n1,001;5", r"1,001 in row 3 of a\.csv 1\.001 or 1001", [998, 1001], [998, 1.001]),
+        ("998;0.5\n1.000;0.5", "Column f has 998, too", [998, 1], [998, 1000]),
+        ("998;0,5\n1,000;0,5", "Column f has 998, too", [998, 1000], [998, 1]),
+    ],
+)
+def test_thousands_that_may_be_decimals_are_asked_about(
+    tmp_path, rows, complaint, by_point, by_comma
+):
+    text = f"f;F\n{rows}\n"
+    with pytest.raises(ValueError, match=f"{complaint}.*--decimal point or comma"):
+        read(tmp_path, text, "a.csv")
+    for decimal, wanted in (("point", by_point), ("comma", by_comma)):
+        told = {"separator": "semicolon", "decimal": decimal}
+        (table,) = read(tmp_path, text, "a.csv", **told).tables
+        assert table.columns["f"].tolist() == wanted
+
+
+def test_decimals_of_three_digits_and_columns_of_another_mark(tmp_path):
+    (table,) = read(tmp_path, "f v\n79.125 1.250\n80.000 1.391\n", "a.csv").tables
+    assert table.columns["v"].tolist() == [1.25, 1.391]
+    held = read(tmp_path, "f;F;v\n998;0,5;1.25\n1.000;0,5;1.391\n", "a.csv")
+    assert [one.tolist() for one in held.tables[0].columns.values()] == [
+        *([998, 1000], [0.5, 0.5], [1.25, 1.391])
+    ]
+    assert [note.kind for note in held.notes][:2] == ["thousands", "other_decimal"]
+    with pytest.raises(ValueError, match=r"v of a\.csv has decimal commas and decimal points"):
+        read(tmp_path, "f;F;v\n998;0,5;1.25\n1.000;0,5;12,3911\n", "a.csv")
+
+
+@pytest.mark.parametrize(
+    ("rate", "digits", "n", "start", "unit"),
+    [
+        *((5120, ".4g", 2000, 0.0, 1.0), (5120, ".5g", 2000, 12.5, 1.0)),
+        *((51200, ".5g", 8000, 0.0, 1e-3), (2048, ".4f", 900, -0.1, 1.0)),
+        *((1 / 0.00023, ".4g", 2000, 0.0, 1.0), (1024, ".3e", 700, 0.0, 1.0)),
+    ],
+)
+@pytest.mark.parametrize("cut", [False, True])
+def test_times_of_few_digits_are_even(tmp_path, rate, digits, n, start, unit, cut):
+    times = (start + np.arange(n) / rate) / unit
+    words = [f"{one:{digits}}" for one in times]
+    if cut:  # of the decimals of the first step, as some programs do not round
+        words = [repr(float(np.floor(one * 1e5 + 1e-6)) / 1e5) for one in times]
+    name = "t [ms]" if unit == 1e-3 else "t [s]"
+    rows = [f"{word},{0.1 * k!r}" for k, word in enumerate(words)]
+    held = read(tmp_path, "\n".join([f"{name},v [m/s]", *rows]), "a.csv")
+    (record,) = held.recordings
+    tolerance = 1e-4 if cut else 1e-12
+    assert record.sampling_rate == pytest.approx(rate, rel=tolerance)
+    assert record.start_time == pytest.approx(start, abs=1e-4 * unit)
+
+
+def test_uneven_times_of_few_digits_stay_a_column_and_an_open_rate_is_stated(tmp_path):
+    times = np.round(np.arange(300) / 5120, 3)
+    rows = [f"{one:.3f},{k / 8!r}" for k, one in enumerate(times)]
+    path = tmp_path / "a.csv"
+    path.write_text("\n".join(["t [s],v [m/s]", *rows]))
+    (note,) = (n for n in read_laboratory_file(path).notes if n.kind == "rate_left_open")
+    assert note["rate"] == 5120
+    words = (path, "--rate", 5120, "--record", "decay", "--response", "v", "--out", tmp_path / "o")
+    code, said = run_import(*words)
+    assert code == 0
+    assert "few digits" not in said
+    record = read_record_table(tmp_path / "o" / "record.csv")
+    assert record.sampling_rate == pytest.approx(5120, rel=1e-12)
+    # The same times in a table of our own, then with a gap of two samples.
+    path.write_text("\n".join(["time_s,velocity_m_s", *rows]))
+    assert read_record_table(path).sampling_rate == pytest.approx(5120, rel=1e-2)
+    gap = [f"{float(row.split(',')[0]) + 0.01 * (k > 150):.3f},1" for k, row in enumerate(rows)]
+    path.write_text("\n".join(["t [s],v [m/s]", *gap]))
+    assert "uneven_time" in [note.kind for note in read_laboratory_file(path).notes]

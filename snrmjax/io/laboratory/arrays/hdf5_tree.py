@@ -5,6 +5,7 @@ may lead in circles or to other files. So sizes are compared with what the file 
 anything is read, and only its own content is followed.
 """
 
+import mmap
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from snrmjax.io.laboratory.arrays.even_axis import EvenAxis
 from snrmjax.io.laboratory.arrays.structs import file_of_tree
 from snrmjax.io.laboratory.arrays.value_tree import Node, Numbers, Selection, held
 from snrmjax.io.laboratory.contents import LaboratoryFile
@@ -25,6 +27,9 @@ _DEEPEST = 24
 _LONGEST_TEXT = 2**17  # letters, or texts of a list
 _INFLATES = 1100  # deflate cannot shrink by more
 _LARGEST_CHUNK = 2**26  # bytes
+_HEAP = b"GCOL\x01\0\0\0"  # signature and version of a heap of texts
+_HEAP_HEADER = 16  # bytes, of a heap and of each object in it
+_LARGEST_SEARCHED = 2**28  # bytes of a file that is searched for damaged heaps
 _HIDDEN = ("#refs#", "#subsystem#")
 _UNITS = ("units", "unit", "Unit", "Units", "unit_string", "UNIT")
 _WORDS = ("quantity", "point", "direction")
@@ -58,14 +63,40 @@ def open_tree(path: Path) -> tuple[dict[str, Node], list[Fact]]:
     h5py = library("h5py", "reading HDF5, netCDF and MATLAB v7.3")
     notes: list[Fact] = []
     walk = _Walk(h5py, path, os.path.getsize(path), notes, [], [0])
-    with damaged_if_it_fails(path.name, "an HDF5 file"), h5py.File(path, "r") as file:
-        return _group(walk, file), notes
+    with damaged_if_it_fails(path.name, "an HDF5 file"):
+        if walk.size < _LARGEST_SEARCHED:
+            with (
+                open(path, "rb") as raw,
+                mmap.mmap(raw.fileno(), 0, access=mmap.ACCESS_READ) as content,
+            ):
+                _check_heaps(content)
+        with h5py.File(path, "r") as file:
+            return _group(walk, file), notes
 
 
-def read_hdf5(path: Path) -> LaboratoryFile:
+def _check_heaps(content: mmap.mmap) -> None:
+    """Raises `ValueError` for a heap of texts whose free space has no size.
+
+    The library of HDF5 looks for its end forever.
+    """
+    start = content.find(_HEAP)
+    while start >= 0:
+        end = min(start + int.from_bytes(content[start + 8 : start + 16], "little"), len(content))
+        at = start + _HEAP_HEADER
+        while at + _HEAP_HEADER <= end:
+            size = int.from_bytes(content[at + 8 : at + 16], "little")
+            if not int.from_bytes(content[at : at + 2], "little"):
+                if size < _HEAP_HEADER:
+                    raise ValueError("it has a heap of texts without an end")
+                break
+            at += _HEAP_HEADER + -(-size // 8) * 8
+        start = content.find(_HEAP, start + 1)
+
+
+def read_hdf5(path: Path, axis: EvenAxis | None = None) -> LaboratoryFile:
     """An HDF5 or netCDF 4 file. Raises `ValueError` as `read_laboratory_file` does."""
     netcdf = path.suffix.lower() in _NETCDF
-    return file_of_tree(path.name, "netcdf" if netcdf else "hdf5", *open_tree(path))
+    return file_of_tree(path.name, "netcdf" if netcdf else "hdf5", *open_tree(path), axis)
 
 
 def _group(walk: _Walk, group: Any) -> dict[str, Node]:
@@ -110,7 +141,8 @@ def _object(walk: _Walk, item: Any, name: str) -> Node | None:
     """A group or data set as a node, or None with a note."""
     kind = _attribute(item, "MATLAB_class")
     if "MATLAB_object_decode" in item.attrs or kind in ("function_handle", "opaque"):
-        return walk.leave_out(name, "object")
+        walk.notes.append(Fact("object_not_read", name=name, kind=kind or "object"))
+        return None
     if isinstance(item, walk.h5py.Group):
         return _structs(_group(walk, item)) if kind == "struct" else _group(walk, item)
     if not isinstance(item, walk.h5py.Dataset) or "MATLAB_empty" in item.attrs:

@@ -7,7 +7,8 @@ import numpy as np
 
 from snrmjax.io.laboratory.arrays.value_tree import ChannelPlace, Numbers, PlacedSamples
 from snrmjax.io.laboratory.names import label_of, role_of
-from snrmjax.io.laboratory.physical_units import channel_meaning, unit_meaning
+from snrmjax.io.laboratory.physical_units import channel_meaning, level_reference, unit_meaning
+from snrmjax.io.laboratory.printed_times import rate_of_printed_times
 from snrmjax.io.units import HERTZ
 from snrmjax.measure.recordings.channels import Channel, Quantity
 from snrmjax.measure.recordings.time_recording import TimeRecording, time_recording
@@ -91,7 +92,8 @@ def recording_of(
         name=name,
         notes=axis.notes,
     )
-    return FoundRecord(record, frozenset((*alike, *axis.used)))
+    told = tuple(note for note in axis.notes if note.kind != "time_seen_in_places")
+    return FoundRecord(record, frozenset((*alike, *axis.used)), told)
 
 
 def _labels(words: Mapping[str, Sequence[str]], count: int) -> Sequence[str] | None:
@@ -119,7 +121,7 @@ def _channel(name: str, said: Mapping[str, str]) -> Channel:
     """A channel with what the file says of it."""
     unit = said.get("unit", "")
     quantity, calibration = channel_meaning(unit)
-    if quantity == "unknown":
+    if quantity == "unknown" and level_reference(unit) is None:
         known: tuple[Quantity, ...] = get_args(Quantity)
         quantity = next((name for name in known if name == said.get("quantity")), "unknown")
     place = said.get("point", ""), said.get("direction", "")
@@ -170,20 +172,27 @@ def _even_axis(key: str, array: Numbers) -> _Axis | Fact:
     uneven = Fact("uneven_time", name=key)
     if not (np.isfinite(step) and step > 0 and np.isfinite(1 / step)):
         return uneven
-    for start in sorted({0, max(0, n // 2 - _LOOK // 2), max(0, n - _LOOK)}):
-        stop = min(start + _LOOK, n)
-        expected = first + step * np.arange(start, stop)
-        # Times of many seconds in few digits: rounding by the resolution of what is written.
-        slack = _EVEN * step + 4e-16 * abs(last) + _single(array) * abs(last)
-        if not np.all(np.abs(array.stretch(start, stop) - expected) <= slack):
+    starts = sorted({0, max(0, n // 2 - _LOOK // 2), max(0, n - _LOOK)})
+    parts = [np.arange(start, min(start + _LOOK, n)) for start in starts]
+    at, where = np.unique(np.concatenate(parts), return_index=True)
+    read = [array.stretch(int(part[0]), int(part[-1]) + 1) for part in parts]
+    time = np.concatenate(read).astype(float)[where]
+    unit = _size_of_unit(key, array, "time")
+    notes = [Fact("time_seen_in_places", name=key)] if n > 3 * _LOOK else []
+    # Times of many seconds in few digits: rounding by the resolution of what is stored.
+    slack = _EVEN * step + 4e-16 * abs(last) + _single(array) * abs(last)
+    if np.all(np.abs(time - (first + step * at)) <= slack):
+        rate = 1 / (step * unit)
+        whole = round(rate)
+        if whole and abs(rate - whole) < 1e-6 * rate * min(1.0, 1e3 / n):
+            rate = float(whole)
+    else:
+        printed = rate_of_printed_times(time, at, unit) if np.isfinite(time).all() else None
+        if printed is None:
             return uneven
-    rate = 1 / step
-    whole = round(rate)
-    if whole and abs(rate - whole) < 1e-6 * rate * min(1.0, 1e3 / n):
-        rate = float(whole)
-    second = 1 / _size_of_unit(key, array, "time")
-    notes = (Fact("time_seen_in_places", name=key),) if n > 3 * _LOOK else ()
-    return _Axis(n, rate * second, first / second, (key,), notes)
+        rate = printed.rate
+        notes += [] if printed.note is None else [printed.note]
+    return _Axis(n, rate, first * unit, (key,), tuple(notes))
 
 
 def _size_of_unit(key: str, array: Numbers, dimension: str) -> float:

@@ -6,6 +6,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from snrmjax.io.laboratory.arrays.even_axis import (
+    EvenAxis,
+    axis_keys,
+    in_hertz,
+    is_mark,
+    side_of_lines,
+    stated_axis,
+)
 from snrmjax.io.laboratory.arrays.records import recording_of
 from snrmjax.io.laboratory.arrays.value_tree import Node, Numbers, held
 from snrmjax.io.laboratory.contents import Kind, LaboratoryFile, NumberTable
@@ -46,10 +54,18 @@ class Struct(NamedTuple):
 
 
 def file_of_tree(
-    name: str, kind: Kind, tree: Mapping[str, Node], notes: Sequence[Fact]
+    name: str,
+    kind: Kind,
+    tree: Mapping[str, Node],
+    notes: Sequence[Fact],
+    axis: EvenAxis | None = None,
 ) -> LaboratoryFile:
-    """All that is found in a tree; `notes` say what of the file is not in it."""
-    contents = read_struct("", tree)
+    """All that is found in a tree.
+
+    Arguments: `notes` say what of the file is not in it; `axis` is that of responses without a
+    vector of frequencies.
+    """
+    contents = read_struct("", tree, axis=axis)
     known = [*notes, *contents.notes]
     if not (known or contents.recordings or contents.responses or contents.tables):
         known = [Fact("nothing_measured", names=tuple(tree)[:_MOST_NAMED])]
@@ -62,40 +78,48 @@ def file_of_tree(
     )
 
 
-def read_struct(name: str, fields: Mapping[str, Node], *, entry: bool = False) -> Struct:
+def read_struct(
+    name: str,
+    fields: Mapping[str, Node],
+    *,
+    entry: bool = False,
+    axis: EvenAxis | None = None,
+) -> Struct:
     """Everything in a struct and below it.
 
     Arguments: `name` as results are called; `entry` says that the struct is one of a list, whose
-    single numbers hold for each of its rows.
+    single numbers hold for each of its rows; `axis` is that of responses without a vector of
+    frequencies, unless the struct states one.
     """
     contents = Struct([], [], {}, [])
     numbers = {key: node for key, node in fields.items() if isinstance(node, Numbers)}
+    axis = axis or stated_axis(numbers)
     words: dict[str, list[str]] = {}
     for key, node in fields.items():
         several = node if isinstance(node, list) else [node]
         texts = [text for text in several if isinstance(text, str)]
         if 0 < len(texts) == len(several):
             words[key] = texts
-    _read_numbers(name, numbers, words, contents, entry=entry)
+    _read_numbers(name, numbers, words, contents, entry=entry, axis=axis)
     cells: dict[int, dict[str, list[Node]]] = {}
     for key, node in fields.items():
         path = f"{name}.{key}" if name else key
         if isinstance(node, dict):
-            contents.add(key, read_struct(path, node, entry=entry))
+            contents.add(key, read_struct(path, node, entry=entry, axis=axis))
         elif isinstance(node, list) and node and key not in words:
             structs = [item for item in node if isinstance(item, dict)]
             rows = [item for item in node if isinstance(item, list)]
             if len(structs) == len(node):
-                contents.add(key, _entries(path, structs))
+                contents.add(key, _entries(path, structs, axis))
             elif len(rows) == len(node):
                 named = [{str(k + 1): cell for k, cell in enumerate(row)} for row in rows]
-                contents.add(key, _entries(path, named))
+                contents.add(key, _entries(path, named, axis))
             elif any(isinstance(item, Numbers | dict) for item in node):
                 cells.setdefault(len(node), {})[key] = node
     for count, group in cells.items():
         each = [{key: nodes[k] for key, nodes in group.items()} for k in range(count)]
         key = next(iter(group)) if len(group) == 1 else "entries"
-        contents.add(key, _entries(f"{name}.{key}" if name else key, each))
+        contents.add(key, _entries(f"{name}.{key}" if name else key, each, axis))
     return contents
 
 
@@ -116,7 +140,9 @@ def _joined_siblings(tables: Mapping[str, NumberTable]) -> dict[str, NumberTable
     return joined
 
 
-def _entries(name: str, structs: Sequence[Mapping[str, Node]]) -> Struct:
+def _entries(
+    name: str, structs: Sequence[Mapping[str, Node]], axis: EvenAxis | None = None
+) -> Struct:
     """A list with one struct a level: its tables under one another, with the entry's number."""
     if len(structs) > _MOST_ENTRIES:
         raise ValueError(f"{name} is a list of {len(structs)} entries, more than {_MOST_ENTRIES}.")
@@ -124,7 +150,8 @@ def _entries(name: str, structs: Sequence[Mapping[str, Node]]) -> Struct:
     contents = Struct([], [], {}, [])
     parts: dict[str, list[tuple[int, NumberTable]]] = {}
     for k, fields in enumerate(structs, 1):
-        below = read_struct(f"{name}({k})" if several else name, fields, entry=several)
+        path = f"{name}({k})" if several else name
+        below = read_struct(path, fields, entry=several, axis=axis)
         contents.add("", below._replace(tables={}))
         for place, table in below.tables.items():
             parts.setdefault(place, []).append((k, table))
@@ -161,13 +188,14 @@ def _read_numbers(
     contents: Struct,
     *,
     entry: bool,
+    axis: EvenAxis | None,
 ) -> None:
     """The arrays of one struct: first time records, then responses, then tables."""
     record, used, notes = recording_of(name, numbers, words)
     contents.recordings.extend([] if record is None else [record])
     contents.notes.extend(notes)
     rest = {key: array for key, array in numbers.items() if key not in used}
-    rest = _responses(name, rest, contents)
+    rest = _responses(name, rest, contents, axis)
     levels = _by_level(rest)
     if levels is not None:
         contents.add("", _entries(name, levels))
@@ -270,29 +298,48 @@ def _by_level(numbers: Mapping[str, Numbers]) -> list[Mapping[str, Node]] | None
     return structs
 
 
-def _responses(name: str, numbers: Mapping[str, Numbers], contents: Struct) -> dict[str, Numbers]:
-    """Complex matrices along a frequency axis as frequency responses; returns what is left."""
+def _responses(
+    name: str, numbers: Mapping[str, Numbers], contents: Struct, even: EvenAxis | None
+) -> dict[str, Numbers]:
+    """Complex matrices along a frequency axis as frequency responses; returns what is left.
+
+    Without a vector of frequencies `even` is the axis, of a complex vector, too.
+    """
     left = dict(numbers)
-    axes = [key for key, array in numbers.items() if role_of(key) == "frequency" and array.length]
+    axes = [
+        key
+        for key, array in numbers.items()
+        if role_of(key) == "frequency" and array.length and array.length > 1
+    ]
+    taken: set[int] = set()
+    single = axis_keys(numbers)
     for key, array in numbers.items():
         sides = array.sides
-        axis = next((other for other in axes if numbers[other].length in sides), None)
-        if not array.is_complex or len(sides) not in (2, 3) or axis is None:
+        if not array.is_complex or len(sides) not in (1, 2, 3):
             continue
-        hertz = numbers[axis].vector(axis).astype(float)
+        axis = next((other for other in axes if numbers[other].length in sides), None)
+        lines = side_of_lines(sides) if axis is None else None
+        if axis is not None and len(sides) > 1:
+            unit = numbers[axis].unit or label_of(axis).unit
+            hertz = numbers[axis].vector(axis).astype(float) * in_hertz(unit)
+        elif lines is not None and even is not None:
+            hertz = even.hertz(lines)
+        else:
+            if lines is not None and (len(sides) > 1 or not axes):
+                contents.notes.append(Fact("responses_without_axis", name=key, n=lines))
+            continue
         if not (np.isfinite(hertz).all() and hertz[0] >= 0 and np.all(np.diff(hertz) > 0)):
             continue
         values = np.moveaxis(array.all(key).reshape(sides), sides.index(hertz.size), -1)
-        values = values.reshape(values.shape[0], -1, hertz.size)
+        values = values.reshape(values.shape[0] if values.ndim > 1 else 1, -1, hertz.size)
         if not np.isfinite(values).any() or np.isinf(values).any():
             continue
         quantity, calibration = channel_meaning(array.unit)
-        unit = numbers[axis].unit or label_of(axis).unit
         above = Channel("", quantity, array.unit, calibration)
         below = Channel("", "force", "N") if is_per_force(array.unit) else Channel("")
         contents.responses.append(
             frequency_responses(
-                hertz * (1.0 if unit.lower().startswith("rad") else _HERTZ),
+                hertz * _HERTZ,
                 values,
                 [above._replace(name=f"{key}.{k + 1}") for k in range(values.shape[0])],
                 [below._replace(name=f"reference {k + 1}") for k in range(values.shape[1])],
@@ -300,5 +347,16 @@ def _responses(name: str, numbers: Mapping[str, Numbers], contents: Struct) -> d
                 notes=[Fact("responses_along_first_side")],
             )
         )
+        if axis is None and even is not None:
+            said = {"start": even.start, "step": even.step, "stop": float(hertz[-1])}
+            contents.notes.append(Fact("even_axis", name=key, **said))
+            left = {other: array for other, array in left.items() if other not in single}
         left.pop(key)
+        taken.add(hertz.size)
+    # What marks the lines of responses is no response; nor are their frequencies alone.
+    marks = {key: array for key, array in left.items() if array.length in taken}
+    if all(key in axes or is_mark(key, array) for key, array in marks.items()):
+        others = [key for key in marks if key not in axes]
+        contents.notes.extend(Fact("not_read", name=key, why="marks") for key in others)
+        left = {key: array for key, array in left.items() if key not in marks}
     return left

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from snrmjax.io.laboratory.physical_units import is_per_force, unit_meaning
+from snrmjax.io.laboratory.physical_units import is_per_force, level_reference, unit_meaning
 from snrmjax.io.laboratory.uff.data_sets import stated
 from snrmjax.measure.recordings.channels import SI_UNIT, Quantity
 from snrmjax.numerics.facts import Fact
@@ -68,6 +68,8 @@ def axis_unit(function: Mapping[str, Any], axis: str, units: UnitSystem) -> Axis
         return AxisUnit(
             quantity, SI_UNIT[quantity] if factor == 1 else "", factor if known else 1.0
         )
+    if level_reference(label) is not None:
+        return AxisUnit("unknown", label, 1.0)
     try:
         meaning = unit_meaning(label)
     except ValueError:

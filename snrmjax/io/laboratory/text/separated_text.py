@@ -1,23 +1,23 @@
 """Separated text (CSV and its relatives): separator, decimal mark and header found or told."""
 
-import io
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import pandas
 
 from snrmjax.io.files import shown
 from snrmjax.io.laboratory.arrays.structs import read_struct
 from snrmjax.io.laboratory.arrays.value_tree import Node, held
 from snrmjax.io.laboratory.contents import LaboratoryFile, TextFormat
 from snrmjax.io.laboratory.names import Label, label_of, role_of
-from snrmjax.io.laboratory.physical_units import unit_meaning
-from snrmjax.io.laboratory.text_files import (
+from snrmjax.io.laboratory.physical_units import level_reference, unit_meaning
+from snrmjax.io.laboratory.text.columns import read_columns
+from snrmjax.io.laboratory.text.fields import (
     SEPARATORS,
     fields_of,
+    has_thousands,
     is_number,
     number_in,
     text_of,
@@ -42,7 +42,7 @@ def read_separated_text(path: Path, text_format: TextFormat | None = None) -> La
     rows = [(k, line) for k, line in below if not line.lstrip().startswith(_COMMENTS)]
     if len(below) > len(rows):
         notes.append(Fact("comments_not_read", n=len(below) - len(rows)))
-    columns = _columns(rows, separator, decimal, width, header.names, file)
+    columns = read_columns(rows, separator, stated, decimal, width, header.names, file, notes)
     runs = _runs_side_by_side(header, columns)
     if runs is not None:
         columns, units, labels = runs
@@ -106,7 +106,7 @@ def _said_above(lines: Sequence[str], separator: str, decimal: str) -> _Said:
         if role not in ("rate", "step") or said.rate:
             continue
         number, _, unit = value.partition(" ")
-        size = number_in(number, decimal)
+        size = number_in(number, decimal, thousands=True)
         size = number_in(number, "point") if size is None else size
         unit = unit.strip() or label_of(key).unit or ("Hz" if role == "rate" else "s")
         try:
@@ -126,11 +126,12 @@ def _marks(lines: list[str], stated: TextFormat, file: str) -> tuple[str, str]:
     separators = [SEPARATORS[stated.separator]] if stated.separator else SEPARATORS.values()
     decimals = [stated.decimal] if stated.decimal else ["point", "comma"]
     looked = [line for line in lines[:_LOOKED_AT] if line.strip()]
+    is_quoted = any('"' in line for line in looked)
     scores = {
         (separator, decimal): score
         for separator in separators
         for decimal in decimals
-        if (separator, decimal) != (",", "comma")
+        if ((separator, decimal) != (",", "comma") or is_quoted)
         and (score := _score(looked, separator, decimal)) is not None
     }
     if not scores:
@@ -139,10 +140,12 @@ def _marks(lines: list[str], stated: TextFormat, file: str) -> tuple[str, str]:
     return max(scores, key=lambda marks: scores[marks])
 
 
-def _score(lines: list[str], separator: str, decimal: str) -> int | None:
+def _score(lines: list[str], separator: str, decimal: str) -> tuple[int, int] | None:
     """How many numbers these marks give in rows of the widest kind, or None: no row at all.
 
     A field that is no number counts against them twice: "79,5" cut at its comma gives numbers too.
+    Of two that give as many the one with fewer separators of thousands is better, and blanks
+    separate no columns where tabs do.
     """
     split = [fields_of(line, separator) for line in lines]
     rows = [fields for fields in split if _is_row(fields, decimal)]
@@ -151,7 +154,19 @@ def _score(lines: list[str], separator: str, decimal: str) -> int | None:
     widest = max(map(len, rows))
     fields = [field for row in rows if len(row) == widest for field in row if field]
     good = _count_numbers(fields, decimal)
-    return good - 2 * (len(fields) - good)
+    grouped = sum(has_thousands(field, decimal) for field in fields)
+    if separator == " " and any(map(_has_blank_thousands, lines)):
+        return None
+    return good - 2 * (len(fields) - good), -grouped
+
+
+def _has_blank_thousands(line: str) -> bool:
+    """Whether tabs separate columns, and blanks stand between thousands: "1 000<tab>0,5"."""
+    fields = [field for field in fields_of(line, "\t") if field]
+    is_blank = len(fields) > 1 and any(" " in field for field in fields)
+    return is_blank and any(
+        _count_numbers(fields, decimal) == len(fields) for decimal in ("point", "comma")
+    )
 
 
 def _count_numbers(fields: list[str], decimal: str) -> int:
@@ -298,69 +313,10 @@ def _repeated(names: Sequence[str], fewest: int) -> int:
 def _all_units(fields: list[str]) -> bool:
     """Whether a row is one of units: each is understood or empty, and one at least has letters."""
     for field in fields:
+        if level_reference(field.strip("()")) is not None:
+            continue
         try:
             unit_meaning(field.strip("()"))
         except ValueError:
             return False
     return any(re.search("[A-Za-z]", field) for field in fields)
-
-
-def _columns(
-    rows: list[tuple[int, str]],
-    separator: str,
-    decimal: str,
-    width: int,
-    names: Sequence[str],
-    file: str,
-) -> dict[str, np.ndarray | list[str]]:
-    """Columns of numbers or of text by name."""
-    for k, line in rows:
-        bare = line.rstrip(separator + " ") if separator != "\t" else line.rstrip()
-        least = len(line.split()) if separator == " " else bare.count(separator) + 1
-        most = least if separator == " " else line.count(separator) + 1
-        if (least > width or most < width) and '"' not in line:
-            raise ValueError(
-                f"row {k} of {file} has {least} fields, but the first row of numbers has {width}."
-            )
-    bare_rows = [_cut(line, separator, width) for _, line in rows]
-    # From 3.1 on pandas reads numbers to the last bit by itself, and says so of the option.
-    exact = tuple(map(int, pandas.__version__.split(".")[:2])) >= (3, 1)
-    precision: dict[str, Any] = {} if exact else {"float_precision": "round_trip"}
-    try:
-        table = pandas.read_csv(
-            io.StringIO("\n".join(bare_rows)),
-            sep=r"\s+" if separator == " " else separator,
-            decimal="." if decimal == "point" else ",",
-            header=None,
-            names=list(names),
-            index_col=False,
-            skipinitialspace=True,
-            **precision,
-        )
-    except (ValueError, OverflowError) as error:  # pandas' own errors are among them
-        said = " ".join(str(error).split())[:160]
-        raise ValueError(f"{file} is damaged or no table of text ({said}).") from error
-    columns: dict[str, np.ndarray | list[str]] = {}
-    for name, column in table.items():
-        if column.dtype.kind in "biuf":
-            columns[name] = column.to_numpy(dtype=float, na_value=np.nan)
-            continue
-        values = pandas.to_numeric(column, errors="coerce").to_numpy(dtype=float)
-        words = np.flatnonzero(np.isnan(values) & column.notna().to_numpy())
-        if not words.size:  # integers that are too long for pandas
-            columns[name] = values
-            continue
-        if 2 * words.size < values.size:
-            row, word = rows[int(words[0])][0], str(column.iloc[int(words[0])])
-            raise ValueError(
-                f"column {name} must be numbers, but row {row} of {file} has {shown(word)}."
-            )
-        columns[name] = ["" if pandas.isna(word) else str(word) for word in column]
-    return columns
-
-
-def _cut(line: str, separator: str, width: int) -> str:
-    """A row without what separators at its end add to its columns."""
-    if separator == " " or line.count(separator) < width or '"' in line:
-        return line
-    return separator.join(line.split(separator)[:width])

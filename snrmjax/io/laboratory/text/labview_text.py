@@ -3,7 +3,6 @@
 Source: NI, "LabVIEW Measurement File format specification" (tutorial 4139).
 """
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -14,8 +13,9 @@ from snrmjax.io.laboratory.arrays.structs import read_struct
 from snrmjax.io.laboratory.arrays.value_tree import Node, Numbers, held
 from snrmjax.io.laboratory.contents import LaboratoryFile, NumberTable
 from snrmjax.io.laboratory.physical_units import channel_meaning
+from snrmjax.io.laboratory.printed_times import rate_between
 from snrmjax.io.laboratory.shared_clock import SharedAxis, TimeAxis, note_on_shift, shared_axes
-from snrmjax.io.laboratory.text_files import SEPARATORS, fields_of, number_in, text_of
+from snrmjax.io.laboratory.text.fields import SEPARATORS, fields_of, number_in, text_of
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.time_recording import HeldSamples, TimeRecording, time_recording
 from snrmjax.numerics.facts import Fact
@@ -23,7 +23,6 @@ from snrmjax.numerics.facts import Fact
 _END = "***End_of_Header***"
 _X = "X_Value"
 _EVEN = 1e-3  # of a step: what rounding leaves of an even abscissa
-_ROUNDED = 1e-5  # relative, of a step, which its digits may leave open without a word
 
 
 class _Style(NamedTuple):
@@ -301,15 +300,11 @@ def _exact_step(word: str, step: float, notes: list[Fact]) -> float:
     rate = 1 / step
     if step <= half or abs(rate / max(1, round(rate)) - 1) < 1e-9:
         return step
-    least, most = math.ceil(1 / (step + half)), math.floor(1 / (step - half))
-    if least == most:
-        notes.append(Fact("whole_rate_of_digits", step=word, rate=least))
-        return 1 / least
-    if half / step > _ROUNDED:
-        # The roundest of the rates that it can mean: most often a power of two.
-        likely = max(range(least, most + 1), key=lambda n: n & -n) if least <= most else rate
-        notes.append(Fact("rate_left_open", step=word, rate=likely, off=100 * half / step))
-    return step
+    printed = rate_between(1 / (step + half), 1 / (step - half), word)
+    if printed.note is None:
+        return step
+    notes.append(printed.note)
+    return step if printed.note.kind == "rate_left_open" else 1 / printed.rate
 
 
 def _unique(names: Sequence[str]) -> list[str]:

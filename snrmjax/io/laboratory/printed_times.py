@@ -1,0 +1,131 @@
+"""The sampling rate of times or of a step that were printed with few digits."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from snrmjax.numerics.facts import Fact
+
+_MOST_DIGITS = 12  # more are those of a computation, not of a print
+_ROUND_STEP = 3  # digits of a step that somebody may have chosen
+_ROUNDED = 1e-5  # relative, of a rate, which digits may leave open without a word
+_FEW_DIGITS = 0.02  # likewise, which is too much to be an even time
+_HALVINGS = 60
+
+
+class PrintedRate(NamedTuple):
+    """A sampling rate (Hz) and a note where that is not simply the one that is printed."""
+
+    rate: float
+    note: Fact | None = None
+
+
+def rate_between(lowest: float, highest: float, word: str, step: float = 0.0) -> PrintedRate:
+    """The sampling rate (Hz) of which digits say only that it lies between two.
+
+    It is the only whole rate there, or that of the round `step` (s) where one is stated that lies
+    there, too, and no whole rate does. Else it stays the middle, with a note that says what is left
+    open and which rate is the roundest.
+    Arguments: `word` is the step as it is printed.
+    """
+    least, most = math.ceil(lowest * (1 - 1e-12)), math.floor(highest * (1 + 1e-12))
+    middle = 2 / (1 / lowest + 1 / highest)
+    is_round = step > 0 and lowest <= 1 / step <= highest and not (1 / step).is_integer()
+    if least == most and not is_round:
+        return PrintedRate(float(least), Fact("whole_rate_of_digits", step=word, rate=least))
+    half = 0.5 * (highest - lowest) / middle
+    if least > most and is_round:
+        return PrintedRate(1 / step)
+    likely = max(range(least, most + 1), key=_roundness) if least <= most else middle
+    if half <= _ROUNDED:
+        return PrintedRate(middle)
+    return PrintedRate(middle, Fact("rate_left_open", step=word, rate=likely, off=100 * half))
+
+
+def _roundness(rate: int) -> int:
+    """The largest power of two or of ten that divides a rate: rates are most often of these."""
+    return max(rate & -rate, 10 ** (len(str(rate)) - len(str(rate).rstrip("0"))))
+
+
+def rate_of_printed_times(
+    time: Float[np.ndarray, " row"], at: Int[np.ndarray, " row"] | None = None, unit: float = 1.0
+) -> PrintedRate | None:
+    """The rate (Hz) of times that are even but for the digits that they are printed with, or None.
+
+    A time has at most as many decimals and as many significant digits as any of them; it was
+    rounded or cut there. With t₀ + kΔ within these of every time, Δ lies between two steps.
+    Arguments: `at` are the numbers k of the samples, all in order by default; `unit` of the times
+    in s.
+    """
+    at = np.arange(len(time)) if at is None else at
+    resolution = _resolution(time)
+    if resolution is None or not at[-1] > at[0]:
+        return None
+    for rounded in (0.5, 1.0):  # or cut
+        low, high = time - rounded * resolution, time + rounded * resolution
+        steps = _steps_between(low, high, at)
+        if steps is not None:
+            break
+    else:
+        return None
+    least, most = steps
+    if not 0 < least <= most or (most - least) / (most + least) > _FEW_DIGITS:
+        return None
+    step = unit * 0.5 * (least + most)
+    round_step = float(f"{step:.{_ROUND_STEP - 1}e}")
+    return rate_between(1 / (unit * most), 1 / (unit * least), f"{step:.4g}", round_step)
+
+
+def _resolution(time: Float[np.ndarray, " row"]) -> Float[np.ndarray, " row"] | None:
+    """The unit of the last digit of every time, or None: they have too many digits for a print."""
+    significant, decimals = 1, 0
+    for value in time.tolist():
+        plain = f"{value:.{_MOST_DIGITS}e}"
+        if not math.isfinite(value) or float(plain) != value:
+            return None
+        mantissa, _, power = plain.partition("e")
+        count = len(mantissa.replace("-", "").replace(".", "").rstrip("0"))
+        significant = max(significant, count)
+        decimals = max(decimals, count - 1 - int(power))
+    size = np.abs(time)
+    exponent = np.floor(np.log10(size, out=np.full(len(time), -300.0), where=size > 0))
+    return np.maximum(10.0**-decimals, 10.0 ** (exponent - significant + 1))
+
+
+def _steps_between(
+    low: Float[np.ndarray, " row"], high: Float[np.ndarray, " row"], at: Int[np.ndarray, " row"]
+) -> tuple[float, float] | None:
+    """The least and the largest step Δ with low ≤ t₀ + kΔ ≤ high for some t₀, or None.
+
+    max(low − kΔ) − min(high − kΔ) is convex in Δ and not above zero for those.
+    """
+    span = float(at[-1] - at[0])
+    slack = 1e-9 * float(np.max(high - low))
+
+    def excess(step: float) -> float:
+        return float(np.max(low - at * step) - np.min(high - at * step)) - slack
+
+    least = float(low[-1] - high[0]) / span
+    most = float(high[-1] - low[0]) / span
+    left, right = least, most
+    for _ in range(_HALVINGS):
+        first, second = left + (right - left) / 3, right - (right - left) / 3
+        if excess(first) <= excess(second):
+            right = second
+        else:
+            left = first
+        if min(excess(left), excess(right)) <= 0:
+            break
+    inside = left if excess(left) <= excess(right) else right
+    if excess(inside) > 0:
+        return None
+    ends = []
+    for outside in (least, most):
+        good, bad = inside, outside
+        for _ in range(_HALVINGS):
+            middle = 0.5 * (good + bad)
+            good, bad = (middle, bad) if excess(middle) <= 0 else (good, middle)
+        ends.append(good)
+    return ends[0], ends[1]

@@ -1,0 +1,1 @@
+"""Texts of laboratories: separated columns, LabVIEW measurement files."""
