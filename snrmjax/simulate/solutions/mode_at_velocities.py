@@ -11,6 +11,7 @@ from snrmjax.model.modes import have_values
 from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.numerics.blocks import mapped
 from snrmjax.numerics.compiled import jitted
+from snrmjax.numerics.not_found import nan_unless
 from snrmjax.simulate.balance.given_numbers import positive
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, harmonic_balance
 from snrmjax.simulate.balance.harmonics import velocity_phasors, with_sines
@@ -38,8 +39,8 @@ def normal_mode_at_velocities(
     `snrmjax.condense` the backbone by the dimensions of a structure.
 
     Arguments: `velocities` in m/s, in any order; `steps` between one amplitude and the next.
-    Returns a `PeriodicMotion` with one motion a velocity; NaN, with derivatives of zero, where the
-    mode was not found, and at all larger velocities then. Raises `ValueError` for a velocity that
+    Returns a `PeriodicMotion` with one motion a velocity; NaN, with derivatives that are NaN, where
+    the mode was not found, and at all larger velocities then. Raises `ValueError` for a velocity that
     is not positive, fewer than one step, and a first sensor that does not see the mode.
     Validity: where the mode turns back in amplitude (at the tip of an internal resonance) it is not
     found, or a narrow tongue is stepped over; `nonlinear_normal_mode` traces such curves.
@@ -88,12 +89,8 @@ def _at_velocities(
         cosines, omega = scaled.coefficients(point), point[-1] * balance.frequency_scale
         whole = with_sines(cosines[None])[0]
         phasors = velocity_phasors(whole, omega, modes.mode_shape)
-        return PeriodicMotion(
-            frequency=jnp.where(converged, omega, jnp.nan),
-            coefficients=jnp.where(converged, whole, jnp.nan),
-            velocity=jnp.where(converged, phasors, jnp.nan),
-            converged=converged,
-        )
+        given = model, velocity
+        return PeriodicMotion(*nan_unless(converged, (omega, whole, phasors), given), converged)
 
     motions = mapped(motion_at, guesses, found, velocities[order], sizes[order])
     back = jnp.argsort(order)

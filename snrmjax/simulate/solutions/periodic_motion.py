@@ -10,6 +10,7 @@ from jaxtyping import Array, ArrayLike, Bool, Complex, Float
 
 from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.numerics.compiled import jitted
+from snrmjax.numerics.not_found import nan_unless
 from snrmjax.numerics.result import AbstractResult, Variable
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, harmonic_balance
 from snrmjax.simulate.balance.harmonics import velocity_phasors
@@ -34,8 +35,9 @@ class PeriodicMotion(AbstractResult):
     def amplitude(self) -> Float[Array, "*batch"]:
         """|velocity fundamental| at the first sensor, in m/s."""
         # The derivative of |NaN| would be NaN for all that share a parameter with it.
-        phasor = jnp.where(self.converged, self.velocity[..., 1, 0], 1.0)
-        return jnp.where(self.converged, jnp.abs(phasor), jnp.nan)
+        fundamental = self.velocity[..., 1, 0]
+        phasor = jnp.where(self.converged, fundamental, 1.0)
+        return jnp.where(self.converged, jnp.abs(phasor), fundamental.real)
 
     def variables(self) -> dict[str, Variable]:
         """Frequency and velocities of every motion."""
@@ -101,6 +103,7 @@ def _periodic_motion(
     value: Float[Array, ""] | None,
     iterations: int,
 ) -> PeriodicMotion:
+    given = model, force, value
     model = simulated_structure(model)
     coefficients, frequency = (jax.lax.stop_gradient(part) for part in start)
     largest = jnp.max(jnp.abs(coefficients))
@@ -118,12 +121,7 @@ def _periodic_motion(
     omega = point[-1] * balance.frequency_scale
     velocity = velocity_phasors(found, omega, model.modes.mode_shape)
     # Masked last: a NaN within would make the derivatives of a whole batch NaN.
-    return PeriodicMotion(
-        frequency=jnp.where(converged, omega, jnp.nan),
-        coefficients=jnp.where(converged, found, jnp.nan),
-        velocity=jnp.where(converged, velocity, jnp.nan),
-        converged=converged,
-    )
+    return PeriodicMotion(*nan_unless(converged, (omega, found, velocity), given), converged)
 
 
 def _solved(
@@ -150,7 +148,7 @@ def root_of(
     """The root of the balance and of `test(balance, target, point)`, and whether it was found.
 
     Differentiable by `balance` and `target`. Where it was not found the point is the guess, and the
-    derivatives are zero.
+    derivatives are zero: what is made of it passes through `nan_unless`.
     """
     harmless = jnp.where(jnp.isfinite(guess), guess, 1.0)
     fixed, aim = jax.lax.stop_gradient((balance, target))
