@@ -91,11 +91,11 @@ def periodic_motion(
     target = None if value is None else jnp.asarray(value, dtype=jnp.float64)
     near = tuple(jnp.asarray(part, dtype=jnp.float64) for part in start)
     load = jnp.asarray(force, dtype=jnp.float64)
-    return _periodic_motion(model, load, near, condition, target, iterations)
+    return motion_near(model, load, near, condition, target, iterations)
 
 
 @jitted
-def _periodic_motion(
+def motion_near(
     model: Structure,
     force: Float[Array, ""],
     start: tuple[Array, ...],
@@ -103,6 +103,7 @@ def _periodic_motion(
     value: Float[Array, ""] | None,
     iterations: int,
 ) -> PeriodicMotion:
+    """`periodic_motion` of arrays, without its checks."""
     given = model, force, value
     model = simulated_structure(model)
     coefficients, frequency = (jax.lax.stop_gradient(part) for part in start)
