@@ -1,7 +1,7 @@
 """Programs of many small steps, compiled to run one step after the other."""
 
 from collections.abc import Callable
-from functools import cache, wraps
+from functools import cache, partial, wraps
 from threading import Lock
 from typing import Any, ParamSpec, TypeVar
 
@@ -112,6 +112,40 @@ def value_of(array: Any) -> np.ndarray | None:
     if isinstance(array, jax.core.Tracer):
         array = jax.lax.stop_gradient(array)
     return None if isinstance(array, jax.core.Tracer) else np.asarray(array)
+
+
+def on_numbers(instead: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """A verb that works on numbers: where JAX traces its arguments it states what to use instead.
+
+    `instead` is a sentence. Without this such a verb ends somewhere inside in an error about
+    tracers, or its derivatives are silently zero.
+    """
+
+    def of(function: Callable[P, R]) -> Callable[P, R]:
+        @wraps(function)
+        def call(*arguments: P.args, **named: P.kwargs) -> R:
+            leaves = jax.tree.leaves((arguments, named))
+            if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+                raise ValueError(
+                    f"`{function.__name__}` works on numbers, and cannot be called inside "
+                    f"`jax.grad`, `jax.jit` or `jax.vmap` with what these vary. {instead}"
+                )
+            return function(*arguments, **named)
+
+        return call
+
+    return of
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(1,))
+def without_derivative(tree: T, instead: str) -> T:
+    """A tree as it is: what differentiates by it is refused with the sentence `instead`."""
+    return tree
+
+
+@without_derivative.defjvp
+def _refused(instead: str, *_: Any) -> Any:
+    raise ValueError(instead)
 
 
 def as_numpy(array: Any) -> Any:

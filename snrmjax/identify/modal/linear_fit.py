@@ -20,6 +20,7 @@ from snrmjax.identify.modal.weighted_fit import (
     weighted_fit,
 )
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
+from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.units import HERTZ
 
 ResidualTerms = Literal["auto", "both", "lower", "upper", "none"]
@@ -35,6 +36,7 @@ _CURVED = 12.0  # a sensor, in units of the noise, that a further residual term 
 _EVEN = 1e-3  # of the line spacing
 
 
+@on_numbers("Differentiate `sj.model.linear_response`.")
 def fit_linear_modes(
     responses: FrequencyResponses,
     *,
@@ -68,6 +70,7 @@ def fit_linear_modes(
     Raises `ValueError` as `response_data` does, for no pole that is stable, for poles outside the
     band, and for responses that seem to be conjugated.
     Validity: real modes (see `collinearity` and `mean_phase`), linear and time-invariant.
+    Not differentiable: differentiate `snrmjax.model.linear_response`.
 
     >>> w = 2 * np.pi * np.linspace(8, 12, 200)
     >>> h = 2.0 / ((2 * np.pi * 10) ** 2 - w**2 + 2j * 0.01 * 2 * np.pi * 10 * w)

@@ -39,8 +39,8 @@ def normal_mode_at_velocities(
     `snrmjax.condense` the backbone by the dimensions of a structure.
 
     Arguments: `velocities` in m/s, in any order; `steps` between one amplitude and the next.
-    Returns a `PeriodicMotion` with one motion a velocity; NaN, with derivatives that are NaN, where
-    the mode was not found, and at all larger velocities then. Raises `ValueError` for a velocity that
+    Returns a `PeriodicMotion` with one motion a velocity; NaN, as are its derivatives, where the
+    mode was not found, and at all larger velocities then. Raises `ValueError` for a velocity that
     is not positive, fewer than one step, and a first sensor that does not see the mode.
     Validity: where the mode turns back in amplitude (at the tip of an internal resonance) it is not
     found, or a narrow tongue is stepped over; `nonlinear_normal_mode` traces such curves.

@@ -63,16 +63,21 @@ def periodic_motion(
     Solves the harmonic balance together with Ω = `value` ("frequency"), |V₁| = `value` at the
     first sensor ("velocity"), dΩ/ds = 0 ("fold"), d|V₁|/ds = 0 ("peak") or Im V₁ = 0 of the mode
     of interest ("phase_resonance"), s being the arclength of the response curve, by Newton's
-    method with exact derivatives. The result is a differentiable function of `model`, `force` and
-    `value`, by the implicit function theorem: in forward and in reverse mode, and again; `start`
+    method with exact derivatives. The result is a differentiable function of every number of
+    `model`, of `force` and of `value`, by the implicit function theorem: in forward and in reverse
+    mode, and of second order (a Hessian times a vector is `jax.jvp` of `jax.grad`). `start`
     (coefficients in kg^1/2 m and frequency in rad/s, such as `ResponseCurve.point`) only says
-    which solution is meant.
+    which solution is meant: nothing is differentiable by it.
 
     Arguments: `force` in N; `value` in rad/s or m/s.
-    Returns a `PeriodicMotion` whose values are NaN where Newton's method did not converge: start
-    nearer. The derivatives of a motion that was not found are zero, so that under `jax.vmap`
-    those of the others are what they are. Raises `ValueError` for an unknown condition and for a
-    missing or needless `value`.
+    Returns a `PeriodicMotion`, for `jax.jit` and `jax.vmap` too (models of one kind: the same
+    modes, monomials and effects; all take as many iterations as the slowest). Where Newton's method
+    did not converge its values are NaN, and so are their derivatives: start nearer, or use
+    `TrackedMotion`. Members of a batch that a result leaves out add nothing to its derivatives;
+    leave them out before computing on, by `jnp.where(found.converged, found.frequency, 1.0)`.
+    From a start that is far away Newton's method may converge to another motion: in an
+    optimisation, use `TrackedMotion`.
+    Raises `ValueError` for an unknown condition and for a missing or needless `value`.
 
     >>> from snrmjax import forced_response
     >>> from snrmjax.model import flat_beam

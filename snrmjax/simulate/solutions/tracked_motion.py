@@ -152,7 +152,7 @@ def _carried(
     def body(way: _Way) -> _Way:
         share = jnp.minimum(way.share + way.step, 1.0)
         ahead = share - way.share
-        guess = tuple(a + ahead * b for a, b in zip(way.motion, way.slope, strict=True))
+        guess = jax.tree.map(lambda a, b: a + ahead * b, way.motion, way.slope)
         point, slope, good = solved(share, guess)
         back = point[0] - ahead * slope[0] - way.motion[0]  # what the new slope does not explain
         moves = point[0] - way.motion[0], point[0] - guess[0], back
