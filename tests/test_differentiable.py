@@ -1,4 +1,4 @@
-"""What is differentiable: docstrings state it, and what is not refuses JAX's tracers by a sentence."""
+"""Docstrings state what is differentiable; what is not refuses tracers of JAX in a sentence."""
 
 import inspect
 

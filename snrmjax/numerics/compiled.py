@@ -85,6 +85,7 @@ def compiled(
 
     @wraps(function)
     def call(*arguments: Any, **named: Any) -> R:
+        _in_double_precision()
         leaves, structure = jax.tree.flatten((arguments, named))
         leaves = [_number(a) for a in leaves]
         is_array = [isinstance(a, (jax.Array, np.ndarray, np.generic)) for a in leaves]
@@ -168,10 +169,20 @@ def jitted(function: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(function)
     def call(*arguments: P.args, **named: P.kwargs) -> R:
+        _in_double_precision()
         traceable, settings = numbers_as_arrays((arguments, named))
         return inside(*traceable, **settings)
 
     return call
+
+
+def _in_double_precision() -> None:
+    """Raises `ValueError` where JAX was switched to single precision: nothing would converge."""
+    if not jax.config.read("jax_enable_x64"):
+        raise ValueError(
+            "JAX computes in single precision: `jax_enable_x64`, which `import snrmjax` switches "
+            'on, was switched off. Switch it on: `jax.config.update("jax_enable_x64", True)`.'
+        )
 
 
 def _number(leaf: Any) -> Any:
