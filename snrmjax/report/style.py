@@ -290,7 +290,7 @@ def legend(figure: Figure) -> None:
     for axes in figure.axes:
         for handle, name in zip(*axes.get_legend_handles_labels(), strict=True):
             every.setdefault(name, {}).setdefault(_colour(handle), handle)
-    found = {name: tuple(of.values()) for name, of in every.items()}
+    found: dict[str, Any] = {name: tuple(of.values()) for name, of in every.items()}
     columns = _columns(list(found), figure.get_figwidth())
     order = [k for first in range(columns) for k in range(first, len(found), columns)]
     names = [list(found)[k] for k in order]
