@@ -11,10 +11,10 @@ from snrmjax.model.modes import have_values
 from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.numerics.blocks import mapped
 from snrmjax.numerics.compiled import jitted
-from snrmjax.numerics.not_found import nan_unless
 from snrmjax.simulate.balance.given_numbers import positive
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, harmonic_balance
 from snrmjax.simulate.balance.harmonics import velocity_phasors, with_sines
+from snrmjax.simulate.balance.not_found import nan_unless
 from snrmjax.simulate.solutions.periodic_motion import PeriodicMotion, root_of
 
 _ITERATIONS = 12  # of Newton's method, which starts from a prediction

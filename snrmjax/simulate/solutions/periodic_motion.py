@@ -10,11 +10,11 @@ from jaxtyping import Array, ArrayLike, Bool, Complex, Float
 
 from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.numerics.compiled import jitted
-from snrmjax.numerics.not_found import nan_unless
 from snrmjax.numerics.result import AbstractResult, Variable
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, harmonic_balance
 from snrmjax.simulate.balance.harmonics import velocity_phasors
 from snrmjax.simulate.balance.labelled import HERTZ, batch_variables
+from snrmjax.simulate.balance.not_found import nan_unless
 from snrmjax.simulate.continuation.events import velocities_along
 from snrmjax.simulate.continuation.newton import Linearised, Point
 
