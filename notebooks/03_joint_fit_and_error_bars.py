@@ -79,9 +79,14 @@ for name, fit in fits.items():
 # notebook 01; with damping little of it is left.)
 
 # %%
-# Natural frequency and damping against amplitude by both tests, on the true curves; the band of
-# the one response is wide.
-plot.fitted_curves_figure([plot.FitSeries(name, fit) for name, fit in fits.items()], truth=truth)
+# Natural frequency and damping against amplitude by both tests, on the true curves, with what
+# each measured state gives by itself; the band of the one response is wide.
+single = {
+    name: sj.identify.identify_points(t.steady_states, flat.modes) for name, t in tests.items()
+}
+plot.fitted_curves_figure(
+    [plot.FitSeries(name, fit, single[name]) for name, fit in fits.items()], truth=truth
+)
 
 
 # %%

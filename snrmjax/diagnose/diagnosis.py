@@ -67,10 +67,12 @@ from snrmjax.model.effect_base import AbstractLinearChange
 from snrmjax.model.effects import EFFECTS
 from snrmjax.model.structures import Structure, linear_terms_of
 from snrmjax.numerics.blocks import on_one_core
+from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
 
 
+@on_numbers("Differentiate the force that a motion needs: `sj.identify.inverse_force`.")
 @on_one_core
 @naming_wrong_phases
 def diagnose_model(
@@ -103,6 +105,8 @@ def diagnose_model(
     for too few states, an unknown force or sensors other than the model's.
     Validity: steady motions with the period of the force; effects that change the motion
     moderately, so that two of them add up.
+    Not differentiable: differentiate the force that a motion needs:
+    `snrmjax.identify.inverse_force`.
     """
     gain, notes = None, list[Fact | str]()
     if driven_by_voltage(data):

@@ -127,7 +127,12 @@ class ForceMisfit(NamedTuple):
 
 
 class Diagnosis(AbstractResult):
-    """What a model lacks, how well that is known, and what would decide what is open."""
+    """What a model lacks, how well that is known, and what would decide what is open.
+
+    Its effects act on the mode of interest. Where the force acts at a point instead, the verdict
+    may be `UNKNOWN` here and `NAMED` for the whole test: see `snrmjax.pipelines.diagnose_test`,
+    whose result has the verdict of `diagnosis.json`.
+    """
 
     coordinates: ClassVar[tuple[str, ...]] = ("candidate", "part", "parameter")
 

@@ -14,6 +14,7 @@ from snrmjax.identify.calibrate.inverse_force import inverse_force
 from snrmjax.identify.pointwise.missing_resonance import jump_at_resonance
 from snrmjax.measure.states import SteadyStates, steady_states
 from snrmjax.model.structures import Structure
+from snrmjax.numerics.compiled import on_numbers
 from snrmjax.simulate.continuation.continuation import CurveStatus
 from snrmjax.simulate.continuation.response_curve import Branch, ResponseCurve
 from snrmjax.simulate.solutions.forced_response import ResponseSettings, forced_response_batch
@@ -59,10 +60,13 @@ class LevelPredictions(NamedTuple):
     after: list[ResponseCurve]  # of the completed one
 
 
+@on_numbers("Differentiate the force that a motion needs: `sj.identify.inverse_force`.")
 def predict_levels(diagnosis: Diagnosis, model: Structure) -> LevelPredictions:
     """Simulates every level's response with the model as given and with the completed one.
 
     Arguments: `model` as it was diagnosed. Raises `ValueError` where there is no completed model.
+    Not differentiable: differentiate the force that a motion needs:
+    `snrmjax.identify.inverse_force`.
     """
     if diagnosis.completed is None:
         raise ValueError("there is no completed model to simulate: see the notes of the diagnosis.")

@@ -28,9 +28,11 @@ from snrmjax.doctor.scale_findings import is_other_scale, scale_findings, shaker
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.states import SteadyStates, join_steady_states
 from snrmjax.model.structures import Structure
+from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.facts import Fact
 
 
+@on_numbers("Differentiate `sj.identify.identify_points`.")
 def check_test(
     tables: SteadyStates | Sequence[SteadyStates],
     model: Structure | None = None,
@@ -53,6 +55,7 @@ def check_test(
     Validity: one well-separated mode and tests near its resonance; at least eight states. A
     factor of the force and the same one of the modal mass look alike in one table: both are named
     then.
+    Not differentiable: differentiate `snrmjax.identify.identify_points`.
 
     >>> from snrmjax.measure import steady_states
     >>> w = np.linspace(480.0, 520.0, 30)

@@ -30,6 +30,7 @@ from snrmjax.methods.steady.harmonic_force_surface import harmonic_force_surface
 from snrmjax.methods.steady.phase_resonance import phase_resonance
 from snrmjax.methods.steady.rct import rct
 from snrmjax.model.modes import LinearModes
+from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.facts import Fact
 
 _log = logging.getLogger(__name__)
@@ -121,6 +122,7 @@ class Comparison(NamedTuple):
         return tuple(distances)
 
 
+@on_numbers("Differentiate `sj.identify.identify_points`.")
 def compare_methods(
     data: SteadyStates | Sequence[SteadyStates | TimeRecording],
     modes: LinearModes,
@@ -136,6 +138,7 @@ def compare_methods(
     not allow is in `stopped` with the reason; the others still run.
     Raises `ValueError` for a name that no method has, and where not one method could run
     or found anything.
+    Not differentiable: differentiate `snrmjax.identify.identify_points`.
     """
     known = (*METHODS, *RECORD_METHODS)
     names = list(known) if methods is None else list(methods)

@@ -42,11 +42,12 @@ def crossings(displacement: Samples, place: Float[Array, ""]) -> Crossings:
     known = jnp.arange(_MOST) < jnp.sum(passes)
     around = displacement[(interval + np.arange(-1, 3)[:, None]) % n] - place
     first, c1, c2, c3 = _cubic(around)
-    value = first + share * (c1 + share * (c2 + share * c3))
-    # A last step of Newton's method carries the derivatives.
     slope = jax.lax.stop_gradient(c1 + share * (2 * c2 + share * 3 * c3))
     good = known & (slope != 0)
-    share = share - jnp.where(good, value / jnp.where(good, slope, 1.0), 0.0)
+    # Each further step of Newton's method with this slope carries one more order of derivatives.
+    for _ in range(2):
+        value = first + share * (c1 + share * (c2 + share * c3))
+        share = share - jnp.where(good, value / jnp.where(good, slope, 1.0), 0.0)
     rate = c1 + share * (2 * c2 + share * 3 * c3)
     return Crossings(known, interval, share, rate, 2 * c2 + 6 * share * c3)
 

@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Callable
-from functools import cache, wraps
+from functools import cache, partial, wraps
 from threading import Lock
 from typing import Any, ParamSpec, TypeVar
 
@@ -95,6 +95,7 @@ def compiled(
 
     @wraps(function)
     def call(*arguments: Any, **named: Any) -> R:
+        _in_double_precision()
         leaves, structure = jax.tree.flatten((arguments, named))
         leaves = [_number(a) for a in leaves]
         is_array = [isinstance(a, (jax.Array, np.ndarray, np.generic)) for a in leaves]
@@ -124,6 +125,40 @@ def value_of(array: Any) -> np.ndarray | None:
     return None if isinstance(array, jax.core.Tracer) else np.asarray(array)
 
 
+def on_numbers(instead: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """A verb that works on numbers: where JAX traces its arguments it states what to use instead.
+
+    `instead` is a sentence. Without this such a verb ends somewhere inside in an error about
+    tracers, or its derivatives are silently zero.
+    """
+
+    def of(function: Callable[P, R]) -> Callable[P, R]:
+        @wraps(function)
+        def call(*arguments: P.args, **named: P.kwargs) -> R:
+            leaves = jax.tree.leaves((arguments, named))
+            if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+                raise ValueError(
+                    f"`{function.__name__}` works on numbers, and cannot be called inside "
+                    f"`jax.grad`, `jax.jit` or `jax.vmap` with what these vary. {instead}"
+                )
+            return function(*arguments, **named)
+
+        return call
+
+    return of
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(1,))
+def without_derivative(tree: T, instead: str) -> T:
+    """A tree as it is: what differentiates by it is refused with the sentence `instead`."""
+    return tree
+
+
+@without_derivative.defjvp
+def _refused(instead: str, *_: Any) -> Any:
+    raise ValueError(instead)
+
+
 def as_numpy(array: Any) -> Any:
     """An array as NumPy's, of which parts are taken without a program; a traced one as it is."""
     return array if isinstance(array, jax.core.Tracer) else np.asarray(array)
@@ -144,10 +179,20 @@ def jitted(function: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(function)
     def call(*arguments: P.args, **named: P.kwargs) -> R:
+        _in_double_precision()
         traceable, settings = numbers_as_arrays((arguments, named))
         return inside(*traceable, **settings)
 
     return call
+
+
+def _in_double_precision() -> None:
+    """Raises `ValueError` where JAX was switched to single precision: nothing would converge."""
+    if not jax.config.read("jax_enable_x64"):
+        raise ValueError(
+            "JAX computes in single precision: `jax_enable_x64`, which `import snrmjax` switches "
+            'on, was switched off. Switch it on: `jax.config.update("jax_enable_x64", True)`.'
+        )
 
 
 def _number(leaf: Any) -> Any:

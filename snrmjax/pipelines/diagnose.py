@@ -18,6 +18,7 @@ from snrmjax.diagnose.response_prediction import (
     holds_response,
     predict_levels,
 )
+from snrmjax.io.diagnosis_results import placed_answer
 from snrmjax.io.files import FilePath
 from snrmjax.io.measurement_plans import read_further_states
 from snrmjax.io.models import read_model
@@ -50,6 +51,17 @@ class DiagnosedTest(NamedTuple):
         """Whether a law at one place explains what no effect on the mode alone does."""
         unknown = self.diagnosis.verdict is Verdict.UNKNOWN
         return unknown and self.where is not None and self.where.explains
+
+    @property
+    def verdict(self) -> Verdict:
+        """The verdict on the whole test, as `diagnosis.json` has it.
+
+        `diagnosis.verdict` is that on effects of the mode alone; where these explain nothing and a
+        law at one place does, its verdict takes the place of theirs.
+        """
+        if self.where is not None and self.is_placed:
+            return Verdict(placed_answer(self.where)["verdict"])
+        return self.diagnosis.verdict
 
     @property
     def predicted(self) -> tuple[LevelResponse, ...]:

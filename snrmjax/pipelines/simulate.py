@@ -259,12 +259,12 @@ def _notes_on_curve(curve: ResponseCurve, hold: Hold | None) -> Iterator[Fact]:
 
 
 def _notes_on_equilibria(model: Structure) -> tuple[Fact, ...]:
-    """That the structure has other equilibria than rest."""
-    others = [one for one in equilibria(model) if np.linalg.norm(one.displacement) > 0]
-    if not others:
+    """That the structure has other equilibria than the one of the smallest displacement."""
+    found = equilibria(model)
+    if len(found) < 2:
         return ()
     shape = np.asarray(model.modes.mode_shape)
-    places = tuple(float((shape @ other.displacement)[0]) for other in others)  # m
-    stable = tuple(bool(other.stable) for other in others)
-    sensor = model.modes.sensors[0]
-    return (Fact("further_equilibria", sensor=sensor, displacement=places, stable=stable),)
+    rest, *places = (float((shape @ one.displacement)[0]) for one in found)  # m
+    stable = tuple(bool(other.stable) for other in found[1:])
+    at = {"sensor": model.modes.sensors[0], "rest": rest}
+    return (Fact("further_equilibria", **at, displacement=tuple(places), stable=stable),)

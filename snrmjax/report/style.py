@@ -11,8 +11,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.collections import Collection
+from matplotlib.colors import to_hex
+from matplotlib.container import Container
 from matplotlib.figure import Figure
+from matplotlib.legend_handler import HandlerTuple
+from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator, MultipleLocator
 
 from snrmjax.io.files import FilePath, file_name, write_atomically
@@ -279,11 +285,12 @@ def explain_lines(figure: Figure) -> None:
 
 
 def legend(figure: Figure) -> None:
-    """One legend below all panels, each name once, to be read row by row."""
-    found: dict[str, Any] = {}
+    """One legend below all panels, each name once in all its colours, to be read row by row."""
+    every: dict[str, dict[str, Any]] = {}
     for axes in figure.axes:
         for handle, name in zip(*axes.get_legend_handles_labels(), strict=True):
-            found.setdefault(name, handle)
+            every.setdefault(name, {}).setdefault(_colour(handle), handle)
+    found: dict[str, Any] = {name: tuple(of.values()) for name, of in every.items()}
     columns = _columns(list(found), figure.get_figwidth())
     order = [k for first in range(columns) for k in range(first, len(found), columns)]
     names = [list(found)[k] for k in order]
@@ -296,7 +303,17 @@ def legend(figure: Figure) -> None:
         frameon=False,
         handlelength=1.8,
         columnspacing=1.6,
+        handler_map={tuple: HandlerTuple(ndivide=None, pad=0.2)},
     )
+
+
+def _colour(handle: Artist | Container) -> str:
+    """The colour of a line or of an area; the same of everything else."""
+    if isinstance(handle, Line2D):
+        return to_hex(handle.get_color())
+    if isinstance(handle, Collection) and len(handle.get_facecolor()):
+        return to_hex(np.asarray(handle.get_facecolor())[0])
+    return ""
 
 
 def _columns(names: list[str], width: float) -> int:

@@ -21,6 +21,7 @@ from .solutions.time_integration import (
     settled_motion,
     stepped_motions,
 )
+from .solutions.tracked_motion import TrackedMotion
 from .virtual_test.equipment import Instruments, Shaker
 from .virtual_test.laboratory import AbstractController, Laboratory, run_test
 from .virtual_test.phase_loop import LoopGains, phase_sweep
@@ -57,6 +58,7 @@ __all__ = [
     "Stability",
     "StepControl",
     "SweepSimulation",
+    "TrackedMotion",
     "damped_normal_mode",
     "decay_test",
     "floquet_multipliers",

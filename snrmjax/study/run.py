@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from snrmjax.io.files import shown
+from snrmjax.numerics.compiled import on_numbers
 from snrmjax.study.execution import (
     Workers,
     available_cores,
@@ -96,6 +97,7 @@ def open_study(path: str | os.PathLike[str]) -> "xarray.Dataset":
     return xarray.open_zarr(path, chunks=None, consolidated=True)
 
 
+@on_numbers("Derivatives by what varies: `sj.study.response_quantities`.")
 def run_study(
     study: Study,
     out: str | os.PathLike[str],
@@ -120,6 +122,7 @@ def run_study(
     Raises `ValueError` before anything is written for a study that cannot be run, and for an `out`
     that has another study, that another process is at work on, or that cannot be written;
     `ClusterGone` where the scheduler ends: call again.
+    Not differentiable: derivatives by what varies: `snrmjax.study.response_quantities`.
     """
     if processes is not None and processes < 1:
         raise ValueError(f"`processes` must be at least 1, but is {processes}.")

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from snrmjax.model.effects import make_effect
 from snrmjax.model.kinks import Kinks, crossings, with_kinks
 
 N = 256
@@ -77,3 +78,20 @@ def test_what_touches_nowhere_is_left_alone():
     x = jnp.asarray(motion(TAU))
     kinks = Kinks(jnp.array([5.0]), jnp.array([1.0]))
     np.testing.assert_array_equal(with_kinks(x**3, x, kinks), x**3)
+
+
+@pytest.mark.parametrize("amplitude", [1.3, 3.0])
+def test_second_derivatives_are_those_of_a_stop_in_closed_form(amplitude):
+    gap, stiffness = 0.5, 2.0
+    stop = make_effect("one_sided_stop", {"stiffness": stiffness, "gap": gap})
+    time = 2 * np.pi * np.arange(256) / 256 + 0.003
+
+    def fundamental(size):
+        force = stop.cycle_force(size * jnp.cos(time), -size * jnp.sin(time))
+        return 2 * jnp.mean(force * np.cos(time))
+
+    # (k/π) (A (θ + sin θ cos θ) − 2 g sin θ) with cos θ = g/A.
+    angle = np.arccos(gap / amplitude)
+    exact = 2 * stiffness / np.pi * gap * np.cos(angle) ** 2 / (amplitude**2 * np.sin(angle))
+    found = jax.jit(jax.grad(jax.grad(fundamental)))(amplitude)
+    assert float(found) == pytest.approx(exact, rel=1e-4)  # cubics between samples of 2π/256

@@ -1,6 +1,7 @@
 """Programs take floating-point numbers as arguments: other values do not compile anew."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -83,3 +84,12 @@ def test_a_backbone_at_other_amplitudes_compiles_nothing(compilations):
         for method in methods:
             assert np.isfinite(method(amplitude))
     assert len(compilations) == 0
+
+
+def test_single_precision_is_refused_by_name():
+    jax.config.update("jax_enable_x64", False)
+    try:
+        with pytest.raises(ValueError, match="`jax_enable_x64`, which `import snrmjax` switches"):
+            sj.forced_response(sj.model.flat_beam(), [2e-4], 480.0, 520.0, harmonic_order=1)
+    finally:
+        jax.config.update("jax_enable_x64", True)

@@ -94,3 +94,24 @@ def test_simulation(files, tmp_path):
 def test_only_results_of_pipelines_have_files(tmp_path):
     with pytest.raises(ValueError, match="a `dict` has no files"):
         sj.write_results({}, tmp_path)
+
+
+def test_equilibria_that_are_further_are_counted_without_the_one_that_curves_start_from():
+    def noted(potential, **effects):
+        modes = sj.model.linear_modes([2.0], [0.02], [[1.0]], [1.0], sensors=["tip"])
+        made = [sj.model.make_effect(kind, settings) for kind, settings in effects.items()]
+        potential = sj.model.polynomial_potential(potential, 1)
+        structure = sj.model.structure(modes, potential, effects=made)
+        found = sj.pipelines.simulate_responses(structure, [1e-3], 0.05, 0.06, harmonics=1)
+        return [str(note) for note in found.notes if note.kind == "further_equilibria"]
+
+    # 4 q + q³ = 1 has one root, which is not zero.
+    pressed = {"static_preload": {"constant_force": -1.0}}
+    assert noted({"1111": 0.25}, **pressed) == []
+    # 4 q − 3·2 q² + 2 q³ = 2 q (q − 1)(q − 2).
+    (note,) = noted({"111": -2.0, "1111": 0.5})
+    assert "2 further equilibria, at tip: unstable at 1e+03 mm and stable at 2e+03 mm" in note
+    assert note.endswith("Curves start from rest.")
+    # 4 q + 1.25 q² = 1.25 q (q + 3.2).
+    (note,) = noted({"111": 1.25 / 3})
+    assert "one further equilibrium, at tip: unstable at -3.2e+03 mm." in note

@@ -5,6 +5,7 @@ import re
 
 import numpy as np
 import pytest
+from matplotlib.patches import Rectangle
 from truths.exact_states import damping, modes, noisy, squared
 from truths.joint_fits import exact_fit, noisy_fit
 from truths.printed_page import unreadable
@@ -159,6 +160,18 @@ def test_lines_are_the_known_curves():
     )
     assert natural.get_ylabel() == "Natural frequency (Hz)"
     assert natural.get_xlabel() == ratio.get_xlabel() == "Velocity amplitude (m/s)"
+
+
+def test_a_legend_shows_a_name_in_all_its_colours():
+    # Drawn without bands of its own the second would have that of the first in the legend.
+    pair = [joint_plot.FitSeries(name, exact_fit()) for name in ("one", "two")]
+    figure = joint_plot.fitted_curves_figure(pair)
+    (box,) = figure.legends
+    areas = box.findobj(Rectangle)
+    drawn = [area.get_facecolor()[0][:3] for area in figure.axes[0].collections]
+    assert [area.get_facecolor()[:3] for area in areas] == [tuple(colour) for colour in drawn]
+    assert len({tuple(colour) for colour in drawn}) == 2
+    assert [text.get_text() for text in box.get_texts()].count("95 % band") == 1
 
 
 def test_curves_and_residuals_are_drawn_over_the_amplitude_that_is_asked_for():

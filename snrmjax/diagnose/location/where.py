@@ -24,6 +24,7 @@ from snrmjax.model.effects import EFFECTS, make_effect
 from snrmjax.model.modes import LinearModes
 from snrmjax.model.places import Row, row_over_points
 from snrmjax.model.structures import Structure
+from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, quantity, setting
 
@@ -116,6 +117,7 @@ class Whereabouts(AbstractResult):
         return dict(zip(self.name, self.probability.tolist(), strict=True))
 
 
+@on_numbers("Differentiate the force that a motion needs: `sj.identify.inverse_force`.")
 def locate_force(
     data: SteadyStates,
     model: Structure,
@@ -138,6 +140,8 @@ def locate_force(
     kinds of effects, by default all forces of the library.
     Returns `Whereabouts`. Raises `ValueError` for unknown points, no candidate, unknown phases.
     Validity: one force at one place beside a linear structure that is right.
+    Not differentiable: differentiate the force that a motion needs:
+    `snrmjax.identify.inverse_force`.
     """
     check_phases(data, "the search for the place of a force")
     chosen = calibration_states(model, data, _ORDERS)

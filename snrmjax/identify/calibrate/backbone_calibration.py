@@ -12,7 +12,7 @@ from snrmjax.identify.calibrate.calibrated_model import AbstractCalibration
 from snrmjax.identify.pointwise.inversion_result import PointStatus
 from snrmjax.identify.pointwise.points_result import BackbonePoints
 from snrmjax.model.structures import Structure
-from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.compiled import compiled, on_numbers
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.least_squares import inverse_of
 from snrmjax.numerics.levenberg_marquardt import MinimisationStatus, StepRule, minimise
@@ -79,6 +79,7 @@ class _Linear(NamedTuple):
     slope: Float[np.ndarray, " point"]  # of the frequency by the velocity
 
 
+@on_numbers("Differentiate `sj.simulate.normal_mode_at_velocities`.")
 def calibrate_to_backbone(
     model_of: ModelOf,
     start: Mapping[str, float],
@@ -106,6 +107,7 @@ def calibrate_to_backbone(
     factor of ten of their start. Standard deviations are linearised: a number that is known to
     worse than a tenth may lie several of them off. A backbone of one mode tells about its linear
     frequency, softening and hardening, as far as it was measured: two or three numbers, not more.
+    Not differentiable: differentiate `snrmjax.simulate.normal_mode_at_velocities`.
     Reference: for errors of both coordinates ("effective variance") J. Orear, Am. J. Phys. 50
     (1982) 912, doi:10.1119/1.12972.
     """

@@ -36,6 +36,7 @@ from snrmjax.model.parameters import (
     with_stated_std,
 )
 from snrmjax.model.structures import Structure
+from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.least_squares import inverse_of
 from snrmjax.numerics.levenberg_marquardt import (
@@ -43,6 +44,7 @@ from snrmjax.numerics.levenberg_marquardt import (
 )
 
 
+@on_numbers("Differentiate the force that a motion needs: `sj.identify.inverse_force`.")
 def calibrate_model(
     model: Structure,
     data: SteadyStates,

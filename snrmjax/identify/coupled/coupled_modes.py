@@ -21,6 +21,7 @@ from snrmjax.measure.states import SteadyStates, check_phases
 from snrmjax.model.parameters import stated_stds
 from snrmjax.model.potential import monomial_key, polynomial_potential
 from snrmjax.model.structures import Structure
+from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
 
@@ -93,6 +94,7 @@ class CoupledModes(AbstractResult):
         return {"interaction": where, **super().variables()}
 
 
+@on_numbers("Differentiate `sj.identify.identify_points`.")
 def coupled_modes(
     data: SteadyStates,
     model: Structure,
@@ -119,6 +121,7 @@ def coupled_modes(
     Raises what `calibrate_model` raises.
     Validity: smooth stiffness; mode shapes and participations are taken as they are. A mode near
     another harmonic than these, and one that no sensor tells apart, is not found.
+    Not differentiable: differentiate `snrmjax.identify.identify_points`.
     Reference: evidence as in MacKay, Neural Comput. 4 (1992) 415, doi:10.1162/neco.1992.4.3.415;
     the formulation with held modes is this package's own.
     """

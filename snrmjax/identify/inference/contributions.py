@@ -22,7 +22,7 @@ from snrmjax.identify.joint.free_unknowns import (
 )
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.test_model.states import LEVEL_ERRORS
-from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.compiled import compiled, on_numbers
 from snrmjax.numerics.least_squares import inverse_of
 
 _LISTED = 8  # sources on one screen
@@ -97,6 +97,9 @@ def _bend_slopes(fit: JointFit) -> Float[np.ndarray, "row unknown"]:
     return slopes
 
 
+@on_numbers(
+    "Differentiate `sj.identify.identify_points`, or the fitted curves themselves (`fit.unknowns`)."
+)
 def contributions(fit: JointFit) -> Contributions:
     """What noise, every level's errors and every linear parameter add to the bands of both curves.
 
@@ -106,6 +109,8 @@ def contributions(fit: JointFit) -> Contributions:
 
     Returns shares of the variance between the smallest and the largest measured displacement,
     largest first; they sum to one but for rounding.
+    Not differentiable: differentiate `snrmjax.identify.identify_points`, or the fitted curves
+    themselves (`fit.unknowns`).
     """
     program, problem = fit.packed(), padded_problem(fit.problem)
     derivatives = _first_order(program.vector, program.unravel, problem)

@@ -10,6 +10,7 @@ from snrmjax.identify.curves.family_base import AbstractFamily, Argument
 from snrmjax.identify.curves.splines import SmoothingSpline, Spline
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.pointwise.backbone import Backbone, BackboneValues, banded_values
+from snrmjax.numerics.compiled import on_numbers
 
 _SCAN = 256  # displacements of the backbone, on which a velocity is looked for
 _ITERATIONS = 12
@@ -17,6 +18,9 @@ _KNOTS = 120  # of curves of families by name, for what takes a `Backbone`
 _DOUBLINGS = 6  # of the displacement, to reach a velocity
 
 
+@on_numbers(
+    "Differentiate `sj.identify.identify_points`, or the fitted curves themselves (`fit.unknowns`)."
+)
 def fitted_values(
     fit: JointFit,
     velocity: Float[np.ndarray, " point"] | None = None,
@@ -30,6 +34,8 @@ def fitted_values(
     the bands are those of the next test: they include by how much one level differs from another.
     Raises `ValueError` for a velocity that the backbone has at several displacements, as it can
     have where it softens: give displacements there.
+    Not differentiable: differentiate `snrmjax.identify.identify_points`, or the fitted curves
+    themselves (`fit.unknowns`).
     """
     if (velocity is None) == (displacement is None):
         raise ValueError("give either `velocity` or `displacement`.")

@@ -28,6 +28,7 @@ from snrmjax.identify.prediction.resonance_distribution import (
     other_modes,
     resonance_distribution,
 )
+from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import quantity
 from snrmjax.numerics.units import HERTZ
@@ -74,6 +75,9 @@ class FittedResponse(PredictedResponse):
         return super().attributes() | more
 
 
+@on_numbers(
+    "Differentiate `sj.identify.identify_points`, or the fitted curves themselves (`fit.unknowns`)."
+)
 def fitted_response(
     fit: JointFit,
     force: float,
@@ -96,6 +100,8 @@ def fitted_response(
     Returns the connected curves, the main one first; resonances and folds with the first curve
     that has them; the `note` of each says where it extrapolates.
     Raises `ValueError` for a force or a ratio that is not positive.
+    Not differentiable: differentiate `snrmjax.identify.identify_points`, or the fitted curves
+    themselves (`fit.unknowns`).
     """
     ratio = {"largest_amplitude_ratio": largest_amplitude_ratio}
     level = new_level(fit, force) if of is None else of
@@ -147,6 +153,9 @@ def _notes_on(missing: tuple[FittedPoint, ...], force: float) -> tuple[Fact, ...
     return (Fact("points_not_located", points=points, force=force),) if points else ()
 
 
+@on_numbers(
+    "Differentiate `sj.identify.identify_points`, or the fitted curves themselves (`fit.unknowns`)."
+)
 def predicted_resonance(
     fit: JointFit,
     force: float,
@@ -162,6 +171,8 @@ def predicted_resonance(
 
     Arguments: `force` in N, looked for up to `largest_amplitude_ratio` times the largest measured
     amplitude; `of` the level where it is not `new_level`'s; `self_excited` allows negative damping.
+    Not differentiable: differentiate `snrmjax.identify.identify_points`, or the fitted curves
+    themselves (`fit.unknowns`).
     """
     new = new_level(fit, force) if of is None else of
     amplitude = amplitudes_to(fit.largest[0], largest_amplitude_ratio)

@@ -29,6 +29,7 @@ from snrmjax.measure.states import SteadyStates
 from snrmjax.model.modes import LinearModes
 from snrmjax.model.structures import Structure, modes_of
 from snrmjax.numerics.blocks import on_one_core
+from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, Variable
 from snrmjax.numerics.units import HERTZ
@@ -108,6 +109,7 @@ class Identification(AbstractResult):
         }
 
 
+@on_numbers("Differentiate `sj.identify.identify_points`.")
 @on_one_core
 @naming_wrong_phases
 def identify_backbone(

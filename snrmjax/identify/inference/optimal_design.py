@@ -25,7 +25,7 @@ from snrmjax.identify.joint.free_unknowns import Unravel, padded_levels, whitene
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.test_model.states import LEVEL_ERRORS
 from snrmjax.numerics.blocks import padded
-from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.compiled import compiled, on_numbers
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import Variable, setting
 from snrmjax.numerics.status import Status
@@ -123,6 +123,9 @@ class NextMeasurements(AbstractTable[NextMeasurement]):
         return {**super().attributes(), "status": self.status.message}
 
 
+@on_numbers(
+    "Differentiate `sj.identify.identify_points`, or the fitted curves themselves (`fit.unknowns`)."
+)
 def next_measurements(
     fit: JointFit,
     count: int,
@@ -148,6 +151,8 @@ def next_measurements(
     where the fitted data know the drive only. Frequencies in rad/s.
     Returns at most `count` states: fewer, or none, when a test can reach no more; `status` says so,
     and `notes` say that the fit has not converged.
+    Not differentiable: differentiate `snrmjax.identify.identify_points`, or the fitted curves
+    themselves (`fit.unknowns`).
     Reference: the one-step rule of sequential design, Fedorov, Theory of Optimal Experiments
     (1972), for a mean of standard deviations.
     """

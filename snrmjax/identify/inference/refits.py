@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from snrmjax.identify.joint.force_balance import BalanceProblem, filled
 from snrmjax.identify.joint.free_unknowns import Unravel, corrected_residuals, padded_problem
 from snrmjax.identify.joint.joint_fit import JointFit
-from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.compiled import compiled, on_numbers
 
 SOLVER: optx.AbstractLeastSquaresSolver = optx.LevenbergMarquardt(
     rtol=1e-10, atol=1e-10, linear_solver=lx.QR()
@@ -18,6 +18,9 @@ SOLVER: optx.AbstractLeastSquaresSolver = optx.LevenbergMarquardt(
 _MOST_STEPS = 200  # of a refit
 
 
+@on_numbers(
+    "Differentiate `sj.identify.identify_points`, or the fitted curves themselves (`fit.unknowns`)."
+)
 def bootstrap(
     fit: JointFit, n_samples: int = 200, *, seed: int = 0, levels: bool = False
 ) -> Float[np.ndarray, "sample unknown"]:
@@ -25,6 +28,9 @@ def bootstrap(
 
     With `levels` whole levels are drawn instead, which needs more of them than a curve has
     parameters. A refit that does not converge is a row of NaN.
+
+    Not differentiable: differentiate `snrmjax.identify.identify_points`, or the fitted curves
+    themselves (`fit.unknowns`).
     """
     rng = np.random.default_rng(seed)
     level = np.asarray(fit.data.level)

@@ -56,6 +56,7 @@ from snrmjax.measure.states import SteadyStates
 from snrmjax.model.modes import LinearModes
 from snrmjax.model.structures import Structure, modes_of
 from snrmjax.numerics.blocks import on_one_core
+from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
 from snrmjax.numerics.units import HERTZ
@@ -227,6 +228,9 @@ class JointFit(AbstractResult):
         }
 
 
+@on_numbers(
+    "Differentiate `sj.identify.identify_points`, or the fitted curves themselves (`fit.unknowns`)."
+)
 @on_one_core
 @naming_wrong_phases
 def fit_jointly(
@@ -265,6 +269,8 @@ def fit_jointly(
     than there are data, a gain, an offset or a phase that the data do not determine, and a fit
     whose residuals become infinite or undefined.
     Validity: one nonlinear mode whose ω̃ and 2ζ̃ω̃ are functions of amplitude alone.
+    Not differentiable: differentiate `snrmjax.identify.identify_points`, or the fitted curves
+    themselves (`fit.unknowns`).
     """
     level_std = stated_level_std(modes)
     for k, std in enumerate((level_gain_std, level_phase_std)):
@@ -332,10 +338,16 @@ def fit_jointly(
     return dataclasses.replace(fit, notes=tuple(notes))
 
 
+@on_numbers(
+    "Differentiate `sj.identify.identify_points`, or the fitted curves themselves (`fit.unknowns`)."
+)
 def corrected_states(data: SteadyStates, fit: JointFit) -> SteadyStates:
     """The states with the force and the phase that a joint fit found for their instruments.
 
     Where only a drive voltage is known, the force in N is that voltage times the fitted gain.
+
+    Not differentiable: differentiate `snrmjax.identify.identify_points`, or the fitted curves
+    themselves (`fit.unknowns`).
     """
     unknowns = fit.unknowns
     nominal = np.asarray(data.drive if fit.drive_known_only else data.force)

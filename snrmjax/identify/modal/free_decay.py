@@ -22,6 +22,7 @@ from snrmjax.identify.modal.separable_fit import (
 )
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.time_recording import TimeRecording
+from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import quantity
 from snrmjax.numerics.units import HERTZ
@@ -66,6 +67,7 @@ class DecayModes(AbstractModalFit):
         return f"at {', '.join(self.sensor_names)} from {duration:.4g} s"
 
 
+@on_numbers("Differentiate `sj.model.linear_response`.")
 def fit_free_decay(
     decays: TimeRecording | Sequence[TimeRecording],
     *,
@@ -89,6 +91,7 @@ def fit_free_decay(
     Raises `ValueError` for recordings that differ in channels or rate, no motion, fewer than 40
     samples, signals of zeros, and where no pole is stable over the order.
     Validity: nothing acts on the structure in that part; linear and time-invariant.
+    Not differentiable: differentiate `snrmjax.model.linear_response`.
     """
     recordings = [decays] if isinstance(decays, TimeRecording) else list(decays)
     used = _channels(recordings, channels)

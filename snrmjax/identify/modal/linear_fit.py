@@ -20,6 +20,7 @@ from snrmjax.identify.modal.weighted_fit import (
     weighted_fit,
 )
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
+from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.units import HERTZ
 
 ResidualTerms = Literal["auto", "both", "lower", "upper", "none"]
@@ -42,6 +43,7 @@ class GrowingModes(ValueError):
         super().__init__(f"{found}: the responses seem to be conjugated, of e^(-iΩt).")
 
 
+@on_numbers("Differentiate `sj.model.linear_response`.")
 def fit_linear_modes(
     responses: FrequencyResponses,
     *,
@@ -75,6 +77,7 @@ def fit_linear_modes(
     Raises `ValueError` as `response_data` does, for no pole that is stable, for poles outside the
     band, and for responses that seem to be conjugated.
     Validity: real modes (see `collinearity` and `mean_phase`), linear and time-invariant.
+    Not differentiable: differentiate `snrmjax.model.linear_response`.
 
     >>> w = 2 * np.pi * np.linspace(8, 12, 200)
     >>> h = 2.0 / ((2 * np.pi * 10) ** 2 - w**2 + 2j * 0.01 * 2 * np.pi * 10 * w)

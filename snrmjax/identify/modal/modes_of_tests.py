@@ -21,6 +21,7 @@ from snrmjax.measure.recordings.frequency_responses import FrequencyResponses, f
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.states import SteadyStates, relative_errors
 from snrmjax.model.moving_base import SensorMotion
+from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.units import HERTZ
 
@@ -29,6 +30,7 @@ _POWERS = {"displacement": 0, "velocity": 1, "acceleration": 2}
 _OF_DECAYS = ("to_frequency", "poles", "highest_order")
 
 
+@on_numbers("Differentiate `sj.model.linear_response`.")
 def find_modes(
     source: FrequencyResponses | SteadyStates | Sequence[TimeRecording],
     *,
@@ -46,6 +48,7 @@ def find_modes(
     the reference is the motion of a base; `settings` those of `fit_linear_modes`, of which free
     decays take the poles, the highest order and the upper end of the band.
     Raises `ValueError` as the fits do.
+    Not differentiable: differentiate `snrmjax.model.linear_response`.
     """
     if isinstance(source, FrequencyResponses):
         return _of_responses(source, base, settings), ()

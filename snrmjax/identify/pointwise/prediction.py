@@ -15,6 +15,7 @@ from snrmjax.identify.pointwise.backbone import Backbone
 from snrmjax.identify.pointwise.prediction_result import PredictedResponse, Resonance
 from snrmjax.identify.pointwise.snrm import nonlinear_mode_velocity
 from snrmjax.model.modes import LinearModes, residual_velocity
+from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.facts import Fact
 
 LARGEST_AMPLITUDE_RATIO = 1.5
@@ -24,6 +25,7 @@ _SCAN = 4096  # amplitudes
 _SMALLEST = 0.02  # of its largest amplitude: where the main curve starts
 
 
+@on_numbers("Differentiate the curves of the backbone themselves.")
 def resonances(
     backbone: Backbone,
     modes: LinearModes,
@@ -60,6 +62,7 @@ def resonances(
     return tips
 
 
+@on_numbers("Differentiate `sj.identify.snrm_velocity`.")
 def predict_response(
     backbone: Backbone,
     modes: LinearModes,

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.test_model.states import LEVEL_ERRORS
 from snrmjax.model.modes import LinearModes
+from snrmjax.numerics.compiled import on_numbers
 
 _FEWEST = 3  # levels, of which a straight line leaves something
 _CHANCE = 0.05  # of a trend where levels differ at random
@@ -60,6 +61,9 @@ ON_THE_CURVES = NewLevel(np.zeros(len(LEVEL_ERRORS)))
 """No level at all: the force in newtons moves the fitted mode itself."""
 
 
+@on_numbers(
+    "Differentiate `sj.identify.identify_points`, or the fitted curves themselves (`fit.unknowns`)."
+)
 def new_level(
     fit: JointFit,
     force: float,
@@ -77,6 +81,8 @@ def new_level(
     it, whose gain then errs too; `day` what another day's test differs by; `at` the sensor or point
     where the force acts, if not where it did in the test.
     Raises what `LinearModes.forced_at` raises.
+    Not differentiable: differentiate `snrmjax.identify.identify_points`, or the fitted curves
+    themselves (`fit.unknowns`).
     """
     std = np.array(fit.prior.level, dtype=float)
     forced = None if at is None else fit.modes.forced_at(at)

@@ -11,6 +11,7 @@ from snrmjax.identify.modal.modal_fit import LinearModalFit
 from snrmjax.identify.scaling.added_mass import squared_shapes
 from snrmjax.identify.scaling.rigid_body import rigid_body_mode
 from snrmjax.identify.scaling.scaled_modes import ScaledModes
+from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.facts import Fact
 
 _PER = {"force": "N", "voltage": "V", "acceleration": "m/s²"}
@@ -218,6 +219,7 @@ class Calibration(NamedTuple):
     relative_std: float = 0.0  # of response over force, all modes alike
 
 
+@on_numbers("Differentiate `sj.model.linear_response`.")
 def scale_modes(
     fit: LinearModalFit | DecayModes,
     by: Scale | None,
@@ -242,6 +244,7 @@ def scale_modes(
     voltage without newtons per volt, a free decay, a negative residue at the drive point (a sensor
     turned), an added mass that does not lower the frequencies, a mass below zero, an unknown
     sensor.
+    Not differentiable: differentiate `snrmjax.model.linear_response`.
     Reference: Ewins, Modal Testing, 2nd ed. (2000), chapters 2 and 5; for the added mass Parloo,
     Verboven, Guillaume & Van Overmeire, MSSP 16 (2002) 757, doi:10.1006/mssp.2001.1461.
     """

@@ -205,7 +205,10 @@ def _modes(m: Any, k: Any, n_modes: int | None) -> tuple[np.ndarray, np.ndarray,
     if squared[0] < -rigid:
         raise ValueError(
             "`stiffness` must not be negative, but one of the squared natural frequencies is "
-            f"{squared[0]:g} 1/s²."
+            f"{squared[0]:g} 1/s²: what displacements are counted from is no stable position of "
+            "rest. Write the model about one, x = x₀ + y, where all springs together exert no "
+            "force: k x + c x³ with k < 0 rests at x₀ = √(−k/c), and has there the stiffness −2k, "
+            "a quadratic spring 3 c x₀ and the cubic spring c."
         )
     shapes = shapes * np.where(shapes[np.argmax(np.abs(shapes), 0), range(len(order))] < 0, -1, 1)
     floats = squared <= rigid

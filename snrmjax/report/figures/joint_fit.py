@@ -105,7 +105,7 @@ def fitted_curves_figure(
             if len(series) > 1:
                 style["color"] = colour
             for axes, y, kept in zip((natural, damping), each, dots, strict=True):
-                marks(axes, own, y, style, None if len(series) > 1 else "single states")
+                marks(axes, own, y, style, "single states")
                 kept += [*y]
         if len(series) == 1 and np.any(one.fit.noise.level_std[2:] > 0):
             wide = sample_fit(one.fit, of_a_new_level=True)

@@ -146,7 +146,7 @@ def answer_in_words(found: DiagnosedTest) -> str:
     """The verdict with the effects of the answer, or of the best attempt."""
     diagnosis, where = found.diagnosis, found.where
     if found.is_placed and where is not None and where.places[0].law is not None:
-        return f"{Verdict.NAMED} ({where.places[0].law.kind} at {where.places[0].name})"
+        return f"{found.verdict} ({where.places[0].law.kind} at {where.places[0].name})"
     effects = ", ".join(diagnosis.effects)
     if effects:
         effects = f" ({effects})" if diagnosis.verdict.is_answer else f"; best attempt: {effects}"

@@ -12,15 +12,16 @@ def _not_followed(status: Status) -> str:
     return f"the mode {status.message}."
 
 
-def _equilibria(sensor: str, displacement: tuple[float, ...], stable: tuple[bool, ...]) -> str:
+def _equilibria(
+    sensor: str, rest: float, displacement: tuple[float, ...], stable: tuple[bool, ...]
+) -> str:
     listed = [
         f"{'stable' if holds else 'unstable'} at {1e3 * place:.3g} mm"
         for place, holds in zip(displacement, stable, strict=True)
     ]
-    return (
-        f"the model has {len(listed)} further equilibria, at {sensor}: {enumerated(listed)}. "
-        "Curves start from rest."
-    )
+    several = "one further equilibrium" if len(listed) == 1 else f"{len(listed)} further equilibria"
+    start = "rest" if rest == 0.0 else f"the one at {1e3 * rest:.3g} mm"
+    return f"the model has {several}, at {sensor}: {enumerated(listed)}. Curves start from {start}."
 
 
 def _load(force: float, drive: float | None, at: str | None = None, unit: str = "N") -> str:

@@ -119,7 +119,7 @@ def velocity_phasors(
     frequency: Float[Array | np.ndarray, "*batch"],
     mode_shape: Float[Array | np.ndarray, "sensor mode"],
 ) -> Complex[Array, "*batch harmonic sensor"]:
-    """Velocity phasors ihΩ Φ X_h at the sensors, h = 0…H, in m/s.
+    """Velocity phasors ihΩ Φ X_h at the sensors, h = 0…H, in m/s; differentiable.
 
     Of NumPy's arrays on the host: a curve is done there before a program has its arguments, and no
     number of points compiles.

@@ -8,7 +8,7 @@ from jaxtyping import Array, Complex, Float, Int
 
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import by_member, mapped, on_one_core, stacked
-from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.compiled import compiled, on_numbers
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance
 from snrmjax.simulate.continuation.monodromy import monodromy
 
@@ -24,6 +24,7 @@ class Stability(IntEnum):
     STABLE = 1
 
 
+@on_numbers("The motion itself is differentiable: `sj.simulate.periodic_motion`.")
 @on_one_core
 def floquet_multipliers(
     model: Structure,
@@ -45,6 +46,7 @@ def floquet_multipliers(
     rad/s, `steps_per_cycle` of the fastest tangent frequency. Points are worked on in blocks of
     one size, so that neither their number nor that of the steps compiles anew.
     Returns NaN for points that are not finite, and where more than 8192 steps would be needed.
+    Not differentiable; the motion itself is: `snrmjax.simulate.periodic_motion`.
     """
     values = np.asarray(coefficients, dtype=np.float64)
     omega = np.asarray(frequency, dtype=np.float64)

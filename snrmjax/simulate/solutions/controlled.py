@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from snrmjax.model.elements import elements_of
 from snrmjax.model.structures import Structure, linear_terms_of, simulated_structure
 from snrmjax.numerics.blocks import on_one_core
-from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.compiled import compiled, on_numbers
 from snrmjax.numerics.result import quantity
 from snrmjax.simulate.balance.given_numbers import frequency_range, positive
 from snrmjax.simulate.balance.harmonic_balance import (
@@ -56,6 +56,10 @@ class ControlledCurve(MotionCurve):
     force: Float[np.ndarray, " point"] = quantity("point", "N", "force amplitude")
 
 
+@on_numbers(
+    "Differentiate single motions: `sj.simulate.periodic_motion` with "
+    '`condition="phase_resonance"`.'
+)
 @on_one_core
 def damped_normal_mode(
     model: Structure,
@@ -75,6 +79,8 @@ def damped_normal_mode(
     most; the curve starts at a hundredth of it and ends beyond it.
     Returns a `DampedModeBranch` whose `status` says how it ended.
     Raises `ValueError` for a velocity that is not positive and finite.
+    Not differentiable: differentiate single motions: `snrmjax.simulate.periodic_motion` with
+    `condition="phase_resonance"`.
     Reference: Krack, Comput. Struct. 154 (2015) 59, doi:10.1016/j.compstruc.2015.03.008.
     """
     positive("largest_velocity", largest_velocity)
@@ -156,6 +162,7 @@ def _trace_damped(
     return trace_curve(linearised, start, outward, within, steps, start_across=outward)
 
 
+@on_numbers("Differentiate single motions: `sj.simulate.periodic_motion`.")
 @on_one_core
 def phase_controlled(
     model: Structure,
@@ -175,6 +182,7 @@ def phase_controlled(
     Arguments: `largest_force` in N; the curve starts at a hundredth of it. `phase` φ in rad.
     Returns a `ControlledCurve`; its `status` is UPPER_END when the largest force was reached.
     Raises `ValueError` for a force that is not positive and a phase beyond ±π/2.
+    Not differentiable: differentiate single motions: `snrmjax.simulate.periodic_motion`.
     Reference: Peeters, Kerschen & Golinval, J. Sound Vib. 330 (2011) 486,
     doi:10.1016/j.jsv.2010.08.028.
     """
@@ -225,6 +233,9 @@ def _trace_phase(
     return trace_curve(linearised, start, rising, CurveRange(lower=0.0, upper=1.0), steps)
 
 
+@on_numbers(
+    'Differentiate single motions: `sj.simulate.periodic_motion` with `condition="velocity"`.'
+)
 @on_one_core
 def response_controlled(
     model: Structure,
@@ -245,6 +256,8 @@ def response_controlled(
     Returns a `ControlledCurve` from the lower to the upper frequency, traced from the upper one
     where the lower one gives no start; its `status` is UPPER_END when it spans the range.
     Raises `ValueError` for a velocity that is not positive and an empty range.
+    Not differentiable: differentiate single motions: `snrmjax.simulate.periodic_motion` with
+    `condition="velocity"`.
     Reference: Karaağaçlı & Özgüven, Mech. Syst. Signal Process. 144 (2020) 107023,
     doi:10.1016/j.ymssp.2020.107023.
     """

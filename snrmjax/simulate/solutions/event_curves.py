@@ -9,7 +9,7 @@ from jaxtyping import Array, ArrayLike, Float
 from snrmjax.model.parameters import checked_names, parameter_unit, parameter_value
 from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.numerics.blocks import on_one_core
-from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.compiled import compiled, on_numbers
 from snrmjax.numerics.result import Variable, quantity, setting
 from snrmjax.numerics.status import Status
 from snrmjax.numerics.units import unit_in_print
@@ -140,6 +140,11 @@ class EventCurve(MotionCurve):
         ]
 
 
+@on_numbers(
+    "Call it outside, and differentiate single motions of its curve: "
+    "`sj.simulate.periodic_motion`, or `sj.simulate.TrackedMotion` where parameters move "
+    "far."
+)
 @on_one_core
 def follow_event(
     model: Structure,
@@ -171,6 +176,9 @@ def follow_event(
     Raises `ValueError` for an unknown kind or parameter, for a range that does not hold the
     parameter's value, for no pair of multipliers to follow, and for a Neimark-Sacker point with
     friction, which Hill's method does not linearise.
+    Not differentiable: call it outside, and differentiate single motions of its curve:
+    `snrmjax.simulate.periodic_motion`, or `snrmjax.simulate.TrackedMotion` where parameters move
+    far.
     Reference: Detroux, Renson, Masset & Kerschen, Comput. Methods Appl. Mech. Eng. 296 (2015) 18,
     doi:10.1016/j.cma.2015.07.017.
 
@@ -216,6 +224,7 @@ def follow_event(
     )
 
 
+@on_numbers("Differentiate single motions: `sj.simulate.periodic_motion`.")
 @on_one_core
 def starts_beside_folds(model: Structure, folds: EventCurve, value: float) -> list[Start]:
     """Motions beside the folds at one value of a fold curve's parameter, for `IsolatedSearch`.
@@ -227,6 +236,7 @@ def starts_beside_folds(model: Structure, folds: EventCurve, value: float) -> li
     Arguments: `model` and `folds` as `follow_event` took and gave them.
     Returns one motion for every fold that was found. Raises `ValueError` for a curve of another
     event.
+    Not differentiable: differentiate single motions: `snrmjax.simulate.periodic_motion`.
     """
     if folds.kind != "fold":
         raise ValueError(f'`folds` must be a curve of kind "fold", but is one of {folds.kind!r}.')

@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.numerics.blocks import mapped, on_one_core, taken
-from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.compiled import compiled, on_numbers, without_derivative
 from snrmjax.numerics.lanes import lanes_for
 from snrmjax.numerics.result import AbstractResult, quantity
 from snrmjax.simulate.balance.given_numbers import frequency_range, positive
@@ -44,6 +44,11 @@ class ResponseSettings(eqx.Module):
 DEFAULT_SETTINGS = ResponseSettings()
 
 
+@on_numbers(
+    "Call it outside, and differentiate single motions of its curve: "
+    "`sj.simulate.periodic_motion`, or `sj.simulate.TrackedMotion` where parameters move "
+    "far."
+)
 @on_one_core
 def forced_response(
     model: Structure,
@@ -78,6 +83,9 @@ def forced_response(
     `isolated_responses`.
     Raises `ValueError` for a force that is not positive and for an empty or endless frequency
     range.
+    Not differentiable: call it outside, and differentiate single motions of its curve:
+    `snrmjax.simulate.periodic_motion`, or `snrmjax.simulate.TrackedMotion` where parameters move
+    far.
 
     >>> from snrmjax.model import flat_beam
     >>> curve = forced_response(flat_beam(), [2e-4], 480.0, 520.0, harmonic_order=1)[0]
@@ -113,6 +121,11 @@ class ResponseBatch(AbstractResult):
     n_not_located: Int[np.ndarray, " member"] = quantity("member", "1", "events not located")
 
 
+@on_numbers(
+    "Call it outside, and differentiate single motions of its curve: "
+    "`sj.simulate.periodic_motion`, or `sj.simulate.TrackedMotion` where parameters move "
+    "far."
+)
 @on_one_core
 def forced_response_batch(
     models: Structure | Sequence[Structure],
@@ -137,6 +150,9 @@ def forced_response_batch(
     Returns a `ResponseBatch`. A member that fails has its status, and NaN in its values; the
     others are untouched. Raises `ValueError` when the numbers of models and forces disagree, for
     models of different kinds and for an empty or endless frequency range.
+    Not differentiable: call it outside, and differentiate single motions of its curve:
+    `snrmjax.simulate.periodic_motion`, or `snrmjax.simulate.TrackedMotion` where parameters move
+    far.
     """
     ends = frequency_range(from_frequency, to_frequency)
     members, loads = _paired(models, forces)
@@ -298,16 +314,16 @@ def solve_at_frequency(
     Arguments: `force` and `frequency` of each state, or one of all states; `start` the Fourier
     coefficients of the guesses in kg^1/2 m.
     Returns the Fourier coefficients (kg^1/2 m), NaN where Newton's method did not converge, and
-    whether it did.
+    whether it did. For `jax.jit` and `jax.vmap`, but not differentiable: use `periodic_motion`.
     """
     guesses = jnp.asarray(start, dtype=jnp.float64)
     loads, speeds = (
         jnp.broadcast_to(jnp.asarray(part, dtype=jnp.float64), guesses.shape[:1])
         for part in (force, frequency)
     )
-    coefficients, converged = _solve_batch(
-        simulated_structure(model), loads, speeds, guesses, n_samples
-    )
+    instead = "`solve_at_frequency` is not differentiable: use `sj.simulate.periodic_motion`."
+    given = without_derivative((simulated_structure(model), loads, speeds, guesses), instead)
+    coefficients, converged = _solve_batch(*given, n_samples)
     return jnp.where(converged[:, None, None], coefficients, jnp.nan), converged
 
 

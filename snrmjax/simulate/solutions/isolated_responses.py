@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from snrmjax.model.structures import Structure, equilibria, simulated_structure
 from snrmjax.numerics.blocks import as_arrays, on_one_core, padded, taken
+from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.result import AbstractResult, Variable, setting
 from snrmjax.simulate.balance.given_numbers import frequency_range, positive
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, linear_coefficients
@@ -94,6 +95,11 @@ class IsolatedResponses(AbstractResult):
         }
 
 
+@on_numbers(
+    "Call it outside, and differentiate single motions of its curve: "
+    "`sj.simulate.periodic_motion`, or `sj.simulate.TrackedMotion` where parameters move "
+    "far."
+)
 @on_one_core
 def isolated_responses(
     model: Structure,
@@ -122,6 +128,9 @@ def isolated_responses(
     A search, not a proof: none found is none found by `n_starts` starts.
     Raises `ValueError` for a force that is not positive, an empty frequency range and starts of
     other harmonics than `harmonic_order`.
+    Not differentiable: call it outside, and differentiate single motions of its curve:
+    `snrmjax.simulate.periodic_motion`, or `snrmjax.simulate.TrackedMotion` where parameters move
+    far.
     """
     model = simulated_structure(model)
     (load,) = positive("force", force).tolist()

@@ -14,6 +14,7 @@ from snrmjax.numerics.compiled import jitted
 from snrmjax.simulate.balance.given_numbers import positive
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, harmonic_balance
 from snrmjax.simulate.balance.harmonics import velocity_phasors, with_sines
+from snrmjax.simulate.balance.not_found import nan_unless
 from snrmjax.simulate.solutions.periodic_motion import PeriodicMotion, root_of
 
 _ITERATIONS = 12  # of Newton's method, which starts from a prediction
@@ -39,7 +40,7 @@ def normal_mode_at_velocities(
     `snrmjax.condense` the backbone by the dimensions of a structure.
 
     Arguments: `velocities` in m/s, in any order; `steps` between one amplitude and the next.
-    Returns a `PeriodicMotion` with one motion a velocity; NaN, with derivatives of zero, where the
+    Returns a `PeriodicMotion` with one motion a velocity; NaN, as are its derivatives, where the
     mode was not found, and at all larger velocities then. Raises `ValueError` for a velocity that
     is not positive, fewer than one step, and a first sensor that does not see the mode.
     Validity: where the mode turns back in amplitude (at the tip of an internal resonance) it is not
@@ -89,12 +90,8 @@ def _at_velocities(
         cosines, omega = scaled.coefficients(point), point[-1] * balance.frequency_scale
         whole = with_sines(cosines[None])[0]
         phasors = velocity_phasors(whole, omega, modes.mode_shape)
-        return PeriodicMotion(
-            frequency=jnp.where(converged, omega, jnp.nan),
-            coefficients=jnp.where(converged, whole, jnp.nan),
-            velocity=jnp.where(converged, phasors, jnp.nan),
-            converged=converged,
-        )
+        given = model, velocity
+        return PeriodicMotion(*nan_unless(converged, (omega, whole, phasors), given), converged)
 
     motions = mapped(motion_at, guesses, found, velocities[order], sizes[order])
     back = jnp.argsort(order)

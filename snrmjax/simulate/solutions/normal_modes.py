@@ -17,7 +17,7 @@ from snrmjax.model.structures import (
     simulated_structure,
 )
 from snrmjax.numerics.blocks import by_blocks, on_one_core
-from snrmjax.numerics.compiled import as_numpy, compiled
+from snrmjax.numerics.compiled import as_numpy, compiled, on_numbers
 from snrmjax.numerics.result import quantity
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, harmonic_balance
 from snrmjax.simulate.balance.harmonics import with_sines
@@ -90,6 +90,7 @@ class NormalModeBranch(MotionCurve):
         )
 
 
+@on_numbers("Differentiate `sj.simulate.normal_mode_at_velocities`.")
 @on_one_core
 def nonlinear_normal_mode(
     model: Structure,
@@ -120,6 +121,7 @@ def nonlinear_normal_mode(
     of them, for shifts in time and in energy, are one and left out.
     Returns a `NormalModeBranch` whose `status` says how it ended.
     Raises `ValueError` for a frequency that is not positive or the linear one.
+    Not differentiable: differentiate `snrmjax.simulate.normal_mode_at_velocities`.
     Reference: Kerschen et al., Mech. Syst. Signal Process. 23 (2009) 170,
     doi:10.1016/j.ymssp.2008.04.002.
     """

@@ -14,6 +14,7 @@ from snrmjax.numerics.result import AbstractResult, Variable
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, harmonic_balance
 from snrmjax.simulate.balance.harmonics import velocity_phasors
 from snrmjax.simulate.balance.labelled import HERTZ, batch_variables
+from snrmjax.simulate.balance.not_found import nan_unless
 from snrmjax.simulate.continuation.events import velocities_along
 from snrmjax.simulate.continuation.newton import Linearised, Point
 
@@ -34,8 +35,9 @@ class PeriodicMotion(AbstractResult):
     def amplitude(self) -> Float[Array, "*batch"]:
         """|velocity fundamental| at the first sensor, in m/s."""
         # The derivative of |NaN| would be NaN for all that share a parameter with it.
-        phasor = jnp.where(self.converged, self.velocity[..., 1, 0], 1.0)
-        return jnp.where(self.converged, jnp.abs(phasor), jnp.nan)
+        fundamental = self.velocity[..., 1, 0]
+        phasor = jnp.where(self.converged, fundamental, 1.0)
+        return jnp.where(self.converged, jnp.abs(phasor), fundamental.real)
 
     def variables(self) -> dict[str, Variable]:
         """Frequency and velocities of every motion."""
@@ -61,16 +63,21 @@ def periodic_motion(
     Solves the harmonic balance together with Ω = `value` ("frequency"), |V₁| = `value` at the
     first sensor ("velocity"), dΩ/ds = 0 ("fold"), d|V₁|/ds = 0 ("peak") or Im V₁ = 0 of the mode
     of interest ("phase_resonance"), s being the arclength of the response curve, by Newton's
-    method with exact derivatives. The result is a differentiable function of `model`, `force` and
-    `value`, by the implicit function theorem: in forward and in reverse mode, and again; `start`
+    method with exact derivatives. The result is a differentiable function of every number of
+    `model`, of `force` and of `value`, by the implicit function theorem: in forward and in reverse
+    mode, and of second order (a Hessian times a vector is `jax.jvp` of `jax.grad`). `start`
     (coefficients in kg^1/2 m and frequency in rad/s, such as `ResponseCurve.point`) only says
-    which solution is meant.
+    which solution is meant: nothing is differentiable by it.
 
     Arguments: `force` in N; `value` in rad/s or m/s.
-    Returns a `PeriodicMotion` whose values are NaN where Newton's method did not converge: start
-    nearer. The derivatives of a motion that was not found are zero, so that under `jax.vmap`
-    those of the others are what they are. Raises `ValueError` for an unknown condition and for a
-    missing or needless `value`.
+    Returns a `PeriodicMotion`, for `jax.jit` and `jax.vmap` too (models of one kind: the same
+    modes, monomials and effects; all take as many iterations as the slowest). Where Newton's method
+    did not converge its values are NaN, and so are their derivatives: start nearer, or use
+    `TrackedMotion`. Members of a batch that a result leaves out add nothing to its derivatives;
+    leave them out before computing on, by `jnp.where(found.converged, found.frequency, 1.0)`.
+    From a start that is far away Newton's method may converge to another motion: in an
+    optimisation, use `TrackedMotion`.
+    Raises `ValueError` for an unknown condition and for a missing or needless `value`.
 
     >>> from snrmjax import forced_response
     >>> from snrmjax.model import flat_beam
@@ -89,11 +96,11 @@ def periodic_motion(
     target = None if value is None else jnp.asarray(value, dtype=jnp.float64)
     near = tuple(jnp.asarray(part, dtype=jnp.float64) for part in start)
     load = jnp.asarray(force, dtype=jnp.float64)
-    return _periodic_motion(model, load, near, condition, target, iterations)
+    return motion_near(model, load, near, condition, target, iterations)
 
 
 @jitted
-def _periodic_motion(
+def motion_near(
     model: Structure,
     force: Float[Array, ""],
     start: tuple[Array, ...],
@@ -101,6 +108,8 @@ def _periodic_motion(
     value: Float[Array, ""] | None,
     iterations: int,
 ) -> PeriodicMotion:
+    """`periodic_motion` of arrays, without its checks."""
+    given = model, force, value
     model = simulated_structure(model)
     coefficients, frequency = (jax.lax.stop_gradient(part) for part in start)
     largest = jnp.max(jnp.abs(coefficients))
@@ -118,12 +127,7 @@ def _periodic_motion(
     omega = point[-1] * balance.frequency_scale
     velocity = velocity_phasors(found, omega, model.modes.mode_shape)
     # Masked last: a NaN within would make the derivatives of a whole batch NaN.
-    return PeriodicMotion(
-        frequency=jnp.where(converged, omega, jnp.nan),
-        coefficients=jnp.where(converged, found, jnp.nan),
-        velocity=jnp.where(converged, velocity, jnp.nan),
-        converged=converged,
-    )
+    return PeriodicMotion(*nan_unless(converged, (omega, found, velocity), given), converged)
 
 
 def _solved(
@@ -150,7 +154,7 @@ def root_of(
     """The root of the balance and of `test(balance, target, point)`, and whether it was found.
 
     Differentiable by `balance` and `target`. Where it was not found the point is the guess, and the
-    derivatives are zero.
+    derivatives are zero: what is made of it passes through `nan_unless`.
     """
     harmless = jnp.where(jnp.isfinite(guess), guess, 1.0)
     fixed, aim = jax.lax.stop_gradient((balance, target))

@@ -10,7 +10,7 @@ from jaxtyping import Array, Complex, Float
 from snrmjax.model.moving_base import BaseMotion
 from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.numerics.blocks import on_one_core
-from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.compiled import compiled, on_numbers
 from snrmjax.numerics.result import AbstractResult, quantity, setting
 from snrmjax.numerics.status import Status
 from snrmjax.simulate.balance.given_numbers import frequency_range
@@ -113,6 +113,10 @@ class QuasiPeriodicBranch(AbstractResult):
         )
 
 
+@on_numbers(
+    "Nothing that is quasi-periodic is differentiable; periodic motions are: "
+    "`sj.simulate.periodic_motion`."
+)
 @on_one_core
 def quasi_periodic_branch(
     model: Structure,
@@ -136,6 +140,7 @@ def quasi_periodic_branch(
     Neimark-Sacker point; `within`, frequencies in rad/s where the branch ends, by default those of
     the response. At most 20 modes, no friction with memory.
     Raises `ValueError` for a response without such a point and for models beyond these limits.
+    Not differentiable; periodic motions are: `snrmjax.simulate.periodic_motion`.
     Reference: Guillot, Cochelin & Vergez, Nonlinear Dyn. 97 (2019) 1711 (two base frequencies);
     Schilder, Osinga & Vogt, SIAM J. Appl. Dyn. Syst. 4 (2005) 459, doi:10.1137/040611240.
     """

@@ -116,7 +116,8 @@ def settled_motion(
     Raises `ValueError` for a force or a frequency that is not positive, fewer than eight cycles
     and a start of another shape, `ImportError` without diffrax.
     Validity: a transient e^(−ζωt) takes about 2/ζ cycles to fall to 1e-5. Motions that friction
-    brings to a stop creep at its smoothing velocity.
+    brings to a stop creep at its smoothing velocity. Its loops are not differentiable
+    by `jax.grad`: use `periodic_motion`.
     Reference: Tsitouras, Comput. Math. Appl. 62 (2011) 770, doi:10.1016/j.camwa.2011.06.002.
 
     >>> from snrmjax.model import flat_beam, linear_response
@@ -157,7 +158,7 @@ def stepped_motions(
     Arguments: `force` in N; `frequencies` in rad/s, in the order of the test; `test_orders` from
     0 to 1, the time of each step for a model that drifts; the others as in `settled_motion`.
     Returns an `IntegratedMotion` whose arrays lead with the step. Another number of steps
-    compiles anew. Raises as `settled_motion` does.
+    compiles anew. Raises as `settled_motion` does, and is not differentiable by `jax.grad` either.
     """
     positive("force", force)
     positive("frequencies", frequencies)

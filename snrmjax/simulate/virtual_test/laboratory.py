@@ -32,6 +32,7 @@ from snrmjax.model.effect_base import (
 from snrmjax.model.elements import elements_of
 from snrmjax.model.modes import reference_sensor
 from snrmjax.model.structures import Structure, simulated_structure
+from snrmjax.numerics.compiled import on_numbers
 from snrmjax.simulate.solutions.hysteresis_cycles import (
     friction_rows,
     inner_force,
@@ -195,6 +196,7 @@ class Laboratory(eqx.Module):
         return scaled_friction(self.structure, reach, reach * self.frequency / np.sqrt(2))
 
 
+@on_numbers("Differentiate the steady states of a model by `sj.simulate.periodic_motion`.")
 def run_test(
     laboratory: Laboratory,
     controller: AbstractController,
@@ -208,6 +210,8 @@ def run_test(
     Arguments: `start` is where another run ended, by default rest; `seed` draws the noise.
     Returns the record and the state at its end. Deterministic for a seed.
     Raises `ValueError` where a structure with friction went beyond `largest_displacement`.
+    Not differentiable: differentiate the steady states of a model by
+    `snrmjax.simulate.periodic_motion`.
     """
     begin = laboratory.at_rest(controller) if start is None else start
     noise = np.random.default_rng(seed).standard_normal((samples, 2))

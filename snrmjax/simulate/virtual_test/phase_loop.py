@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
+from snrmjax.numerics.compiled import on_numbers
 from snrmjax.simulate.balance.given_numbers import positive
 from snrmjax.simulate.virtual_test.laboratory import (
     AbstractController,
@@ -117,6 +118,7 @@ class PhaseSweep(NamedTuple):
     test_seconds: float
 
 
+@on_numbers("Differentiate the steady states of a model by `sj.simulate.periodic_motion`.")
 def phase_sweep(
     laboratory: Laboratory,
     voltage: float,
@@ -135,6 +137,8 @@ def phase_sweep(
     Arguments: `voltage` in V; `phases` in rad in the order of the test, positive below resonance;
     the others as in `locked_motions`. Returns a `PhaseSweep`.
     Raises `ValueError` for a voltage that is not positive and phases beyond ±90°.
+    Not differentiable: differentiate the steady states of a model by
+    `snrmjax.simulate.periodic_motion`.
     Reference: V. Denis, M. Jossic, C. Giraud-Audine, B. Chomette, A. Renault & O. Thomas, Mech.
     Syst. Signal Process. 106 (2018) 430, doi:10.1016/j.ymssp.2018.01.014.
     """

@@ -10,6 +10,7 @@ from jaxtyping import ArrayLike, Float
 
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.structures import Structure
+from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.result import AbstractResult, Variable, setting
 from snrmjax.simulate.balance.given_numbers import frequency_range, positive
 from snrmjax.simulate.continuation.response_curve import ResponseCurve
@@ -64,6 +65,7 @@ class VirtualTest(AbstractResult):
         return self.steady_states.variables()
 
 
+@on_numbers("Differentiate the steady states of a model by `sj.simulate.periodic_motion`.")
 def phase_resonance_test(
     model: Structure,
     forces: float | Sequence[float] | Float[ArrayLike, " level"],
@@ -99,6 +101,8 @@ def phase_resonance_test(
     integration that had not settled.
     Raises `ValueError` for an empty range of the indicator, for one that no stable state falls
     into, and for harmonics, errors or steps that make no sense.
+    Not differentiable: differentiate the steady states of a model by
+    `snrmjax.simulate.periodic_motion`.
     Reference: Kwarta & Allen, sections 1.2 and 3.1.
     """
     limits = phase_limits(appropriation)

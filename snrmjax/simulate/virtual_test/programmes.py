@@ -23,6 +23,7 @@ from snrmjax.measure.recordings.stepped_sine import stepped_sine_states
 from snrmjax.measure.recordings.time_recording import time_recording
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.modes import reference_sensor
+from snrmjax.numerics.compiled import on_numbers
 from snrmjax.simulate.balance.given_numbers import positive
 from snrmjax.simulate.virtual_test.laboratory import (
     AbstractController,
@@ -146,6 +147,7 @@ class SteppedSineDrive(AbstractController):
         return after, size * jnp.cos(angle), angle
 
 
+@on_numbers("Differentiate the steady states of a model by `sj.simulate.periodic_motion`.")
 def stepped_sine_test(
     laboratory: Laboratory,
     target: float,
@@ -169,6 +171,8 @@ def stepped_sine_test(
     Returns a `LaboratoryTest` with its steps, for `steady_states_of`. An amplitude that is not
     reached is seen there: the law has no status. Raises `ValueError` for numbers that are not
     positive and for an unknown quantity to hold.
+    Not differentiable: differentiate the steady states of a model by
+    `snrmjax.simulate.periodic_motion`.
     """
     if held not in get_args(Held):
         raise ValueError(f"`held` must be one of {', '.join(get_args(Held))}, but is {held!r}.")
@@ -201,6 +205,7 @@ def stepped_sine_test(
     return LaboratoryTest(record, count / laboratory.sampling_rate, TestSteps(steps, first, keep))
 
 
+@on_numbers("Differentiate the steady states of a model by `sj.simulate.periodic_motion`.")
 def multisine_test(
     laboratory: Laboratory,
     rms_voltage: float,
@@ -218,6 +223,8 @@ def multisine_test(
     Returns a `LaboratoryTest` of `periods` periods, the first of them with the transient.
     Raises `ValueError` for lines outside 1 to half of `period_samples`, and for numbers that are
     not positive.
+    Not differentiable: differentiate the steady states of a model by
+    `snrmjax.simulate.periodic_motion`.
     """
     distinct = np.unique(np.asarray(lines, dtype=int))
     for name, value in (
@@ -245,6 +252,7 @@ def multisine_test(
     return LaboratoryTest(record, len(voltages) / laboratory.sampling_rate)
 
 
+@on_numbers("Differentiate the steady states of a model by `sj.simulate.periodic_motion`.")
 def decay_test(
     laboratory: Laboratory,
     voltage: float,
@@ -260,6 +268,8 @@ def decay_test(
     Arguments: `voltage` in V of the resonance; `decay_seconds` after it; the others as in
     `locked_motions`. Returns a `DecayTest`, whose velocity goes into `resonant_decay`.
     Raises `ValueError` for numbers that are not positive.
+    Not differentiable: differentiate the steady states of a model by
+    `snrmjax.simulate.periodic_motion`.
     """
     positive("decay_seconds", decay_seconds)
     (resonance,), state, seconds = locked_motions(
@@ -278,6 +288,7 @@ def decay_test(
     return DecayTest(record, seconds + decay_seconds, resonance)
 
 
+@on_numbers("Differentiate the steady states of a model by `sj.simulate.periodic_motion`.")
 def steady_states_of(
     laboratory: Laboratory,
     test: LaboratoryTest,
@@ -291,6 +302,8 @@ def steady_states_of(
     Returns `SteadyStates` of the reference sensor, one a step, with standard deviations: a step
     that has not settled, or on which the motion jumps, has a large one.
     Raises `ValueError` for a test without steps, and for a step that cannot be fitted.
+    Not differentiable: differentiate the steady states of a model by
+    `snrmjax.simulate.periodic_motion`.
     """
     if test.steps is None:
         raise ValueError("`test` must be a stepped sine: other records have no steady states.")

@@ -24,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
+from snrmjax.numerics.compiled import on_numbers
 from snrmjax.simulate.balance.given_numbers import positive
 from snrmjax.simulate.virtual_test.laboratory import (
     AbstractController,
@@ -221,6 +222,7 @@ def _harmonics(signal: np.ndarray, angle: np.ndarray) -> np.ndarray:
     return np.mean(through_hann_window(signal, _ORDERS[:, None] * angle), axis=1)
 
 
+@on_numbers("Differentiate the steady states of a model by `sj.simulate.periodic_motion`.")
 def s_curve(
     laboratory: Laboratory,
     frequency: float,
@@ -236,6 +238,8 @@ def s_curve(
     velocity rises, an open loop under that force would jump. Motions whose feedback kept harmonics
     of its own, or that were not steady within 1 %, are NaN.
     Raises `ValueError` for numbers that are not positive.
+    Not differentiable: differentiate the steady states of a model by
+    `snrmjax.simulate.periodic_motion`.
     """
     (omega,) = positive("frequency", frequency)
     bench = FeedbackBench(laboratory, settings, seed)

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy import optimize, stats
 
+from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
 from snrmjax.study.uncertainty.quantities import Quantities
@@ -75,6 +76,10 @@ class Propagation(AbstractResult):
         }
 
 
+@on_numbers(
+    "`sj.study.response_quantities` gives derivatives; in a program of your own "
+    "differentiate `sj.simulate.periodic_motion`."
+)
 def propagate_uncertainty(quantities: Quantities) -> Propagation:
     """Uncertainty of quantities from that of their inputs, by derivatives at the medians.
 
@@ -86,6 +91,8 @@ def propagate_uncertainty(quantities: Quantities) -> Propagation:
     Arguments: `quantities` by `response_quantities`, or `function_quantities` of your own function.
     Validity: the derivatives know nothing of what happens away from the medians. To solve members
     instead, make a `Study` of the same variations.
+    Not differentiable: `snrmjax.study.response_quantities` gives derivatives; in a program of your
+    own differentiate `snrmjax.simulate.periodic_motion`.
     Reference: Anderson, J. Aircraft 36 (1999) and Putko et al., J. Fluids Eng. 124 (2002) 60,
     doi:10.1115/1.1446068.
 

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from snrmjax.model.parameters import checked_names, with_parameters
 from snrmjax.model.structures import Structure
-from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.compiled import compiled, on_numbers
 from snrmjax.numerics.facts import Fact
 from snrmjax.simulate.balance.labelled import HERTZ
 from snrmjax.simulate.continuation.response_curve import ResponseCurve
@@ -55,6 +55,10 @@ def function_quantities(
     return Quantities(value, gradient, hessian, tuple(names))
 
 
+@on_numbers(
+    "Its result holds the derivatives; in a program of your own differentiate "
+    "`sj.simulate.periodic_motion`."
+)
 def response_quantities(
     model: Structure,
     varied: Sequence[AbstractVariation],

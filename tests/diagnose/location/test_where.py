@@ -1,12 +1,18 @@
 """The place of a force; truth from a harmonic balance of a chain of its own."""
 
+import dataclasses
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from truths import two_modes
 from truths.chain_states import steady_states, structure
 
 import snrmjax as sj
+from snrmjax.diagnose.decide import Verdict
 from snrmjax.io.diagnosis_results import placed_answer, summarise_whereabouts
+from snrmjax.pipelines.diagnose import DiagnosedTest
+from snrmjax.report.pages.diagnosis import answer_in_words
 
 ROW = (0.0, -1.0, 1.0, 0.0)  # x3 less x2
 CUBIC = 2e7  # N/m³
@@ -51,6 +57,16 @@ def test_one_sensor_tells_it_by_the_law():
     answer = placed_answer(found)
     assert answer["effects"] == ["cubic_stiffness"]
     assert sum(answer["probabilities"].values()) == pytest.approx(1.0)
+    # The verdict of the test in Python is that of the file.
+    by_mode = SimpleNamespace(verdict=Verdict.UNKNOWN)
+    test = DiagnosedTest(by_mode, model, where=found)
+    assert test.verdict == answer["verdict"] == Verdict.NAMED
+    assert answer_in_words(test) == "named (cubic_stiffness at x3-x2)"
+    shared = found.places[0]._replace(laws={"cubic_stiffness": 0.6, "quintic_stiffness": 0.4})
+    shared = dataclasses.replace(found, places=(shared, *found.places[1:]))
+    test = DiagnosedTest(by_mode, model, where=shared)
+    assert test.verdict == placed_answer(shared)["verdict"] == Verdict.AMBIGUOUS
+    assert answer_in_words(test) == "ambiguous (cubic_stiffness at x3-x2)"
 
 
 def test_a_force_on_the_mode_is_everywhere():

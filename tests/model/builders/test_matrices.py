@@ -125,7 +125,7 @@ def changed(matrix, entry, value):
         ((M, changed(C, (0, 1), 0.1), K), {}, r"`damping` must be symmetric"),
         ((-M, C, K), {}, r"`mass` must be positive definite"),
         ((M * 0, C, K), {}, r"`mass` must be positive definite"),
-        ((M, C, -K), {}, r"`stiffness` must not be negative"),
+        ((M, C, -K), {}, r"`stiffness` must not be negative.* rests at x₀ = √\(−k/c\)"),
         ((M, C, K * np.nan), {}, r"`stiffness` must be finite"),
         ((M, C, np.eye(3)), {}, r"`mass` has shape \(2, 2\), but `stiffness` has \(3, 3\)"),
         ((M, np.eye(3), K), {}, r"`damping` has shape \(3, 3\), but there are 2"),

@@ -1,0 +1,182 @@
+"""A periodic motion that is carried along as the model and the force change: for optimisations."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
+
+from snrmjax.model.modes import have_values
+from snrmjax.model.structures import Structure
+from snrmjax.numerics.compiled import jitted, numbers_as_arrays
+from snrmjax.simulate.solutions.periodic_motion import (
+    Condition,
+    PeriodicMotion,
+    motion_near,
+    periodic_motion,
+)
+
+_ITERATIONS = 12  # of Newton's method, which starts from a prediction
+_LATE = 0.3  # correction over step, beyond which the step may have gone to another motion
+_ROUNDING = 1e-6  # of the motion: corrections below it are none
+_TURN = 0.1  # of the frequency, in one step
+_SHORTEST = 2.0**-12  # of the way
+_TRIALS = 400
+
+
+class TrackedMotion(eqx.Module):
+    """A periodic motion at known parameters, from which it is continued to others.
+
+    `periodic_motion` needs a start near the motion that is meant. In an optimisation the parameters
+    move away from where a start was found, and from there Newton's method ends nowhere or at
+    another motion. `at` goes from the known parameters to the new ones on a straight line, in as
+    many steps as the motion needs: Newton's method corrects what its derivative along the line
+    predicts. The result depends on the new parameters alone, not on those asked for before, and is
+    differentiable as that of `periodic_motion` is: in `jax.jit`, `jax.grad` and `jax.vmap`, in the
+    loops of scipy.optimize and of optimistix.
+
+    Arguments: `model`, `force` in N, `start`, `condition` and `value` as `periodic_motion` has
+    them; `start` is corrected.
+    Raises `ValueError` where there is no such motion near `start`, and as `periodic_motion` does.
+
+    >>> import jax
+    >>> from snrmjax import forced_response
+    >>> from snrmjax.model import flat_beam
+    >>> beam = flat_beam()
+    >>> curve = forced_response(beam, [2e-4], 480.0, 520.0, harmonic_order=1)[0]
+    >>> peak = TrackedMotion(beam, 2e-4, curve.point(curve.at_events("peak")[0]), condition="peak")
+    >>> slope = jax.grad(lambda force: peak.at(beam, force).amplitude)
+    >>> bool(slope(8e-4) > 0)  # four times the force: too far for `periodic_motion`
+    True
+    """
+
+    model: Structure
+    force: Float[Array, ""]  # N
+    motion: PeriodicMotion
+    condition: Condition = eqx.field(static=True)
+    value: Float[Array, ""] | None = None  # rad/s or m/s
+
+    def __init__(
+        self,
+        model: Structure,
+        force: float | Float[ArrayLike, ""],
+        start: tuple[Float[ArrayLike, "coefficient mode"], float | Float[ArrayLike, ""]],
+        *,
+        condition: Condition = "frequency",
+        value: float | Float[ArrayLike, ""] | None = None,
+    ) -> None:
+        self.motion = periodic_motion(model, force, start, condition=condition, value=value)
+        if have_values(self.motion.converged) and not bool(self.motion.converged):
+            raise ValueError(
+                f'no motion with `condition="{condition}"` was found near `start`: take a point of '
+                "a response to this force, such as `curve.point(curve.at_events(…)[0])`."
+            )
+        self.model, self.condition = model, condition
+        self.force = jnp.asarray(force, dtype=jnp.float64)
+        self.value = None if value is None else jnp.asarray(value, dtype=jnp.float64)
+
+    def at(
+        self,
+        model: Structure | None = None,
+        force: float | Float[ArrayLike, ""] | None = None,
+        *,
+        value: float | Float[ArrayLike, ""] | None = None,
+    ) -> PeriodicMotion:
+        """The motion at other parameters, differentiable by them; left out, they are the known.
+
+        Returns a `PeriodicMotion`; NaN, with derivatives that are NaN, where the motion ends on the
+        way, as a pair of folds does at a cusp: see where by `follow_event`.
+        Raises `ValueError` for a model of another kind (modes, monomials, effects) and for a
+        needless `value`.
+        """
+        if value is not None and self.value is None:
+            raise ValueError(f'`condition="{self.condition}"` takes no `value`.')
+        known = self.model, self.force, self.value
+        new = (
+            self.model if model is None else model,
+            self.force if force is None else jnp.asarray(force, dtype=jnp.float64),
+            self.value if value is None else jnp.asarray(value, dtype=jnp.float64),
+        )
+        _check_alike(known[0], new[0])
+        return _carried(known, numbers_as_arrays(new), self.motion, self.condition)
+
+
+def _check_alike(known: Structure, new: Structure) -> None:
+    def kind(model: Structure) -> tuple:
+        effects = tuple(type(effect) for effect in model.effects)
+        return model.n_modes, model.potential.monomials, effects, _shapes(model)
+
+    parts = ("modes", "monomials", "effects", "numbers")
+    for what, one, other in zip(parts, kind(known), kind(new), strict=True):
+        if one != other:
+            raise ValueError(f"`model` has other {what} than the one that the motion is known of.")
+
+
+def _shapes(model: Structure) -> list[tuple[int, ...]]:
+    return [np.shape(leaf) for leaf in jax.tree.leaves(model)]
+
+
+class _Way(NamedTuple):
+    """How far along the line a motion was carried: its unknowns, and their derivatives by it."""
+
+    share: Float[Array, ""]  # of the line
+    motion: tuple[Array, Array]  # coefficients and frequency
+    slope: tuple[Array, Array]
+    step: Float[Array, ""]
+    trials: Int[Array, ""]
+    known: Bool[Array, ""]
+
+
+@jitted
+def _carried(
+    known: tuple, new: tuple, motion: PeriodicMotion, condition: Condition
+) -> PeriodicMotion:
+    here, there, begin = jax.lax.stop_gradient((known, new, motion))
+    # By their leaves: what is no number, such as a name, is that of the new parameters.
+    (begins, _), (ends, kind) = jax.tree.flatten(here), jax.tree.flatten(there)
+
+    def solved(share: Array, start: tuple[Array, Array]) -> tuple[tuple, tuple, Array]:
+        """The motion at a share of the line, its derivatives by that, and whether it was found."""
+
+        def at(share: Array) -> tuple[tuple[Array, Array], Array]:
+            moved = [a + share * (b - a) for a, b in zip(begins, ends, strict=True)]
+            model, force, value = jax.tree.unflatten(kind, moved)
+            found = motion_near(model, force, start, condition, value, _ITERATIONS)
+            return (found.coefficients, found.frequency), found.converged
+
+        point, slope, good = jax.jvp(at, (share,), (jnp.ones_like(share),), has_aux=True)
+        return point, slope, good
+
+    def body(way: _Way) -> _Way:
+        share = jnp.minimum(way.share + way.step, 1.0)
+        ahead = share - way.share
+        guess = jax.tree.map(lambda a, b: a + ahead * b, way.motion, way.slope)
+        point, slope, good = solved(share, guess)
+        back = point[0] - ahead * slope[0] - way.motion[0]  # what the new slope does not explain
+        moves = point[0] - way.motion[0], point[0] - guess[0], back
+        far, *misses = (jnp.max(jnp.abs(move)) for move in moves)
+        off, size = jnp.maximum(*misses), jnp.max(jnp.abs(way.motion[0]))
+        near = (off <= _LATE * far) | (off <= _ROUNDING * size)
+        near &= jnp.abs(point[1] - way.motion[1]) <= _TURN * way.motion[1]
+        good &= near
+        longer = jnp.where(off <= 0.3 * _LATE * far, 2.0, 1.0)
+        onward = _Way(
+            share, point, slope, jnp.where(good, longer, 0.5) * way.step, way.trials + 1, good
+        )
+        kept = way._replace(step=0.5 * way.step, trials=way.trials + 1)
+        return jax.tree.map(lambda a, b: jnp.where(good, a, b), onward, kept)
+
+    def going(way: _Way) -> Array:
+        unfinished = way.known & (way.share < 1.0)
+        return unfinished & (way.step >= _SHORTEST) & (way.trials < _TRIALS)
+
+    zero = jnp.zeros(())
+    start, slope, good = solved(zero, (begin.coefficients, begin.frequency))
+    way = _Way(zero, start, slope, jnp.ones(()), jnp.zeros((), dtype=int), good)
+    way = jax.lax.while_loop(going, body, way)
+    arrived = way.known & (way.share >= 1.0)
+    end = jax.tree.map(lambda a: jnp.where(arrived, a, jnp.nan), way.motion)
+    model, force, value = new
+    return motion_near(model, force, end, condition, value, _ITERATIONS)
