@@ -7,6 +7,8 @@ from jaxtyping import Complex, Float
 from scipy.optimize import least_squares
 
 from snrmjax.diagnose.location.element_motion import (
+    JUMP_ORDERS,
+    OWN_ORDERS,
     ElementForces,
     SurroundedElement,
     element_forces,
@@ -16,6 +18,7 @@ from snrmjax.diagnose.location.source_patterns import SensorRecords, SourceFit, 
 from snrmjax.diagnose.misfit.candidates import candidate
 from snrmjax.model.effect_metadata import MotionScales
 from snrmjax.model.effects import EFFECTS, make_effect
+from snrmjax.model.library.friction import CoulombFriction
 
 _SMALL = 1e-3  # of 1σ, of differences by the records' errors
 _ROUNDING = 1e-9
@@ -45,33 +48,48 @@ class LawAtPlace:
 
     The fundamental of the motion along the row is what sensors and linear structure make of it;
     its other harmonics are the element's own. Those of one trial are where the next one starts.
+    Jumps of a force are resolved where it is not to be `rough`.
     """
 
-    def __init__(self, kind: str, records: SensorRecords, place: SourcePattern, free: SourceFit):
+    def __init__(
+        self,
+        kind: str,
+        records: SensorRecords,
+        place: SourcePattern,
+        free: SourceFit,
+        rough: bool,
+    ):
         self.records, self.place, self.free = records, place, free
         self.scales = _scales(records, place, free)
         self.start = candidate(kind, self.scales)
         names = tuple(EFFECTS[kind].parameters())
         self.effect: Any = make_effect(kind, dict(zip(names, self.start.starts[0], strict=True)))
-        motion = np.zeros_like(place.own)
+        jumps = kind == CoulombFriction.kind and not rough
+        own = place.own[:, : 1 + max(JUMP_ORDERS if jumps else OWN_ORDERS, *records.orders)]
+        motion = np.zeros_like(own)
         motion[:, 1] = _fundamental(records, place, free)[1]
-        self.first = SurroundedElement(records.frequency, place.own, motion)
+        self.first = SurroundedElement(records.frequency, own, motion)
         self._near, self._last = self.first, (np.zeros(0), None)
 
-    def forces(self, values: np.ndarray) -> ElementForces:
-        """The law's forces with its own motion."""
+    def forces(self, values: np.ndarray, *, exact: bool = False) -> ElementForces:
+        """The law's forces with its own motion; `exact` slopes belong to covariances."""
         known, found = self._last
-        if found is None or not np.array_equal(known, values):
-            found = element_forces(self.effect, values, self._near)
-            lost = ~found.settled
-            if lost.any():  # from a sinusoidal motion, in place of another law's
-                again = element_forces(self.effect, values, self.first)
-                found = ElementForces(*(
-                    np.where(_like(lost & again.settled, one), two, one)
+        if found is not None and np.array_equal(known, values) and not exact:
+            return found
+        found = element_forces(self.effect, values, self._near, exact=exact)
+        lost = ~found.settled
+        if lost.any():  # from a sinusoidal motion, in place of another law's
+            again = element_forces(self.effect, values, self.first)
+            better = lost & again.settled
+            found = ElementForces(
+                *(
+                    np.where(better.reshape(-1, *(1,) * (one.ndim - 1)), two, one)
                     for one, two in zip(found, again, strict=True)
-                ))
-            motion = np.where(found.settled[:, None], found.motion, self.first.motion)
-            self._near, self._last = self._near._replace(motion=motion), (values.copy(), found)
+                )
+            )
+        if found.settled.all():
+            self._near = self._near._replace(motion=found.motion, slopes=found.slopes)
+        self._last = values.copy(), found
         return found
 
     def _along_sinusoids(self, values: np.ndarray) -> Complex[np.ndarray, "state order"]:
@@ -93,7 +111,7 @@ class LawAtPlace:
         They count directly and by the fundamental along the row, which turns into the law's force.
         """
         records, place, count = self.records, self.place, len(self.records.seen)
-        by_motion = self.forces(values).by_motion[:, list(records.orders)]
+        by_motion = self.forces(values, exact=True).by_motion[:, list(records.orders)]
         slopes = []
         for unit in np.eye(records.n_inputs):
             erring = records.erring(np.tile(_SMALL * unit, (count, 1))) - records.seen
@@ -139,7 +157,7 @@ def law_fit(
     takes the errors of all numbers as independent and ends early. Others go on until parameters
     and covariances belong to each other.
     """
-    law = LawAtPlace(kind, records, place, free)
+    law = LawAtPlace(kind, records, place, free, rough)
     start = law.start
     lower, upper, unit = map(np.array, (start.lower, start.upper, start.unit))
     starts = [np.clip(law.scaled_start(np.array(first)), lower, upper) for first in start.starts]
@@ -182,10 +200,6 @@ def law_fit(
         dict(zip(names, values.tolist(), strict=True)),
         dict(zip(names, np.where(done, spread, np.nan).tolist(), strict=True)),
     )
-
-
-def _like(states: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    return states.reshape(-1, *(1,) * (rows.ndim - 1))
 
 
 def _parts(rows: Complex[np.ndarray, "state order sensor"]) -> Float[np.ndarray, "state entry"]:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 
-from snrmjax.diagnose.location.element_motion import OWN_ORDERS
+from snrmjax.diagnose.location.element_motion import JUMP_ORDERS
 from snrmjax.identify.calibrate.calibration_states import ComparedColumns
 from snrmjax.model.modes import LinearModes, phasor_of_load
 
@@ -94,7 +94,7 @@ def source_pattern(
     force = np.asarray(chosen.states.force)
     shape = np.asarray(modes.mode_shape)[list(chosen.sensors)]
     both = np.stack([load.astype(complex), row.astype(complex)], axis=1)
-    orders, count = np.array(records.orders), max(OWN_ORDERS, *records.orders) + 1
+    orders, count = np.array(records.orders), max(JUMP_ORDERS, *records.orders) + 1
     moved = np.array(
         [[_receptance(modes, h * omega, both) for h in range(count)] for omega in records.frequency]
     )
