@@ -5,9 +5,9 @@ Run: python benchmarks/location_sets/generate.py --out DIR [--sets 80] [--seed 1
 Writes DIR/sets/NAME.csv and NAME.toml (the matrices without the element) and, apart from them,
 DIR/keys/NAME.json (the truth). No code is shared with the package that is tested: M ẍ + C ẋ + K x
 + b f(b·x, b·ẋ) = force, by Runge and Kutta's fourth-order method with 256 steps a period, all sets
-side by side, until nothing changes from period to period. `--strong` elements change the frequency by 6 to
-25 % and the damping by up to six times; "harmonics" of a key is the largest third (of a stop,
-second) harmonic of an element's own motion over its fundamental. One JSON line at the end.
+side by side, until nothing changes from period to period. `--strong`
+elements change the frequency by 6 to 25 % and the damping by up to three times; "harmonics" of a
+key is the largest second or third harmonic of an element's own motion over its fundamental. One JSON line at the end.
 """
 
 import json
@@ -67,7 +67,9 @@ def drawn(rng, kind, strong=False):
     # Of the frequency, or of what damping is added.
     shift = rng.uniform(0.06, 0.25) if strong else rng.uniform(0.01, 0.03)
     law = {"stiffness": 2 * shift * omega[0] ** 2 / s**2, "x": x, "v": x * omega[0]}
-    law["damping"] = 2 * zeta * omega[0] / s**2 * rng.uniform(0.3, 0.8) * (rng.uniform(2, 6) if strong else 1)
+    law["damping"] = (
+        2 * zeta * omega[0] / s**2 * rng.uniform(0.3, 0.8) * (rng.uniform(1.5, 3) if strong else 1)
+    )
     law["gap"] = x * rng.uniform(0.2, 0.5)
     low, high = omega[0] * (1 - 3 * zeta), omega[0] * (1 + 1.2 * shift + 3 * zeta)
     return {

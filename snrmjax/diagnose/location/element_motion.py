@@ -8,6 +8,7 @@ Reference: Krack & Gross, Harmonic Balance for Nonlinear Vibration Problems (201
 """
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -25,7 +26,7 @@ JUMP_ORDERS = 31  # where the force jumps
 _SAMPLES = 256  # of a cycle
 _FINE = 1024  # of one in which the force jumps
 _WIDTHS = (0.2, 0.1, 0.05, 0.02)  # of a jump, over the rms velocity, from far off to the last
-_ROUNDS = 25  # of Newton's method, at most
+_ROUNDS = 16  # of Newton's method, at most
 _SETTLED = 1e-5  # of the fundamental, that a motion may still miss
 _LEAST_STEP = 1 / 64  # of Newton's, below which a state is given up
 _QUICK = 0.2  # of what a motion missed, that a step with earlier slopes may leave
@@ -69,7 +70,8 @@ def element_forces(
     their forces are those of the nearest motion that was.
     """
     if isinstance(effect, CoulombFriction):
-        far, last = (_WIDTHS[:3], _WIDTHS[3]) if _resolves_jumps(element) else ((), _WIDTHS[2])
+        resolved = element.motion.shape[1] > OWN_ORDERS + 1
+        *far, last = _WIDTHS if resolved else _WIDTHS[:-1]
         for width in far if element.slopes is None else ():
             nearby = _solved_motion(_with_width(effect, width), values, element)
             element = element._replace(motion=nearby.motion)
@@ -77,12 +79,8 @@ def element_forces(
     return _solved_motion(effect, values, element, exact=exact)
 
 
-def _resolves_jumps(element: SurroundedElement) -> bool:
-    return element.motion.shape[1] > OWN_ORDERS + 1
-
-
 def _with_width(effect: CoulombFriction, width: float) -> CoulombFriction:
-    return dataclasses.replace(effect, smoothing=np.asarray(width))
+    return dataclasses.replace(effect, smoothing=jnp.asarray(width))
 
 
 def _solved_motion(
@@ -189,7 +187,8 @@ def _force_and_slopes(
     effect: AbstractForce, values: np.ndarray, motion: np.ndarray, frequency: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Parts of the force, and their slopes by cosine and sine of the fundamental and by values."""
-    return _by_formulas(_some_slopes, effect, values, motion, frequency)
+    force, slopes = _by_formulas(_some_slopes, effect, values, motion, frequency)
+    return force, slopes
 
 
 def _slopes_by_free(
@@ -199,7 +198,13 @@ def _slopes_by_free(
     return _by_formulas(_other_slopes, effect, values, motion, frequency)[0]
 
 
-def _by_formulas(program, effect, values, motion, frequency) -> tuple[np.ndarray, ...]:
+def _by_formulas(
+    program: Callable[..., tuple],
+    effect: AbstractForce,
+    values: np.ndarray,
+    motion: np.ndarray,
+    frequency: np.ndarray,
+) -> tuple[np.ndarray, ...]:
     """By the shorter formula where there is one; NaN of it say where it does not hold."""
     given = tuple(effect.parameters()), values, motion, frequency
     if type(effect).has_quick_formula():

@@ -22,14 +22,14 @@ from snrmjax.model.library.friction import CoulombFriction
 
 _SMALL = 1e-3  # of 1σ, of differences by the records' errors
 _ROUNDING = 1e-9
-_ROUNDS = 8  # of fits at most, the first with all errors independent
+_ROUNDS = 6  # of fits at most, the first with all errors independent
 _STILL = 0.05  # of 1σ, by which parameters may still change from round to round
 _ROUGH = 8  # evaluations of a rough fit
-_TRIALS = 60  # of any other
+_TRIALS = 40  # of any other
 
 
 class PlacedLaw(NamedTuple):
-    """A law along one row; `std` is NaN where the fit has not converged."""
+    """A law along one row; `std` is NaN where a fit has not converged or determines too little."""
 
     kind: str
     chi_square: float
@@ -38,8 +38,8 @@ class PlacedLaw(NamedTuple):
     std: dict[str, float]
 
     @property
-    def converged(self) -> bool:
-        """Whether the parameters are the best ones, with a motion for every state."""
+    def determined(self) -> bool:
+        """Whether the parameters are the best ones, with a motion for every state, and have 1σ."""
         return bool(np.all(np.isfinite(list(self.std.values()))))
 
 
@@ -69,7 +69,8 @@ class LawAtPlace:
         motion = np.zeros_like(own)
         motion[:, 1] = _fundamental(records, place, free)[1]
         self.first = SurroundedElement(records.frequency, own, motion)
-        self._near, self._last = self.first, (np.zeros(0), None)
+        self._near = self.first
+        self._last: tuple[np.ndarray, ElementForces | None] = (np.zeros(0), None)
 
     def forces(self, values: np.ndarray, *, exact: bool = False) -> ElementForces:
         """The law's forces with its own motion; `exact` slopes belong to covariances."""
@@ -187,7 +188,7 @@ def law_fit(
             xtol=1e-6,
         )
         before, values = values, found.x * size
-        spread = np.sqrt(np.diag(np.linalg.pinv(found.jac.T @ found.jac))) * size
+        spread = _spread(found.jac) * size
         still = bool(np.all(np.abs(values - before) <= _STILL * spread))
         if turn > 0 and still and found.status > 0:
             break
@@ -200,6 +201,13 @@ def law_fit(
         dict(zip(names, values.tolist(), strict=True)),
         dict(zip(names, np.where(done, spread, np.nan).tolist(), strict=True)),
     )
+
+
+def _spread(slopes: Float[np.ndarray, "row parameter"]) -> Float[np.ndarray, " parameter"]:
+    """1σ of every parameter; NaN where the rows do not determine all of them."""
+    if np.linalg.matrix_rank(slopes) < slopes.shape[1]:
+        return np.full(slopes.shape[1], np.nan)
+    return np.asarray(np.linalg.norm(np.linalg.pinv(slopes), axis=1))
 
 
 def _parts(rows: Complex[np.ndarray, "state order sensor"]) -> Float[np.ndarray, "state entry"]:

@@ -317,8 +317,8 @@ class CoulombFriction(AbstractHysteresis):
 
     `force` F_c in kg^1/2 m/s². No memory, but a jump, which is smoothed with the cycle's own
     velocity: F_c tanh(q̇/(s q̇_rms)) with s = `smoothing`, 0.05. Its first harmonic is then 5.1e-4
-    below F_c·4/π for a sinusoidal motion, and a motion at rest meets no force. In time it is F_c tanh(q̇/v_s) with
-    v_s = `smoothing_velocity` in kg^1/2 m/s, or sgn q̇ where v_s = 0.
+    below F_c·4/π for a sinusoidal motion, and a motion at rest meets no force. In time it is
+    F_c tanh(q̇/v_s) with v_s = `smoothing_velocity` in kg^1/2 m/s, or sgn q̇ where v_s = 0.
     """
 
     kind: ClassVar[str] = "coulomb_friction"
