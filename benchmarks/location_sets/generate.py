@@ -5,9 +5,9 @@ Run: python benchmarks/location_sets/generate.py --out DIR [--sets 80] [--seed 1
 Writes DIR/sets/NAME.csv and NAME.toml (the matrices without the element) and, apart from them,
 DIR/keys/NAME.json (the truth). No code is shared with the package that is tested: M ẍ + C ẋ + K x
 + b f(b·x, b·ẋ) = force, by Runge and Kutta's fourth-order method with 256 steps a period, all sets
-side by side, until nothing changes from period to period. `--strong`
-elements change the frequency by 6 to 25 % and the damping by up to three times; "harmonics" of a
-key is the largest second or third harmonic of an element's own motion over its fundamental. One JSON line at the end.
+side by side, until nothing changes from period to period. `--strong` elements change the frequency
+by 6 to 25 % and the damping by up to three times; "harmonics" of a key is the largest second or
+third harmonic of an element's own motion over its fundamental. One JSON line at the end.
 """
 
 import json

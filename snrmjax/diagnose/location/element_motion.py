@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
-from snrmjax.model.effect_base import AbstractForce, AbstractMemoryless
+from snrmjax.model.effect_base import AbstractForce, AbstractKinked, AbstractMemoryless
 from snrmjax.model.library.friction import CoulombFriction
 from snrmjax.numerics.compiled import compiled
 from snrmjax.simulate.balance.harmonics import HarmonicBasis, harmonic_basis, tangent_blocks
@@ -223,14 +223,19 @@ def _some_slopes(
     motion: Float[Array, "state part"],
     frequency: Float[Array, " state"],
 ) -> tuple[Float[Array, "state part"], Float[Array, "state part argument"]]:
+    # Slopes need no exact times of contact, whose derivatives take long to compile.
+    kinked = isinstance(effect, AbstractKinked)
+
     def one(motion: Array, omega: Array) -> tuple[Array, Array]:
         def force(given: Array) -> tuple[Array, Array]:
             x, of = jnp.split(given, [2])
-            found = _parts(effect, quick, names, of, motion.at[1:3].set(x), omega)
+            found = _parts(
+                effect, quick, names, of, motion.at[1:3].set(x), omega, at_samples=kinked
+            )
             return found, found
 
         slopes, found = jax.jacfwd(force, has_aux=True)(jnp.concatenate([motion[1:3], values]))
-        return found, slopes
+        return _parts(effect, quick, names, values, motion, omega) if kinked else found, slopes
 
     return jax.vmap(one)(motion, frequency)
 
@@ -294,9 +299,14 @@ def _parts(
     values: Float[Array, " parameter"],
     motion: Float[Array, " part"],
     omega: Float[Array, ""],
+    *,
+    at_samples: bool = False,
 ) -> Float[Array, " part"]:
     """Parts of a law's force along a motion."""
     law, basis = _set(effect, names, values, motion)
     x, v = _motion(basis, motion, omega)
-    force = law.quick_cycle_force(x, v) if quick else law.cycle_force(x, v)
+    if at_samples:
+        force = jax.vmap(law.force)(x, v)
+    else:
+        force = law.quick_cycle_force(x, v) if quick else law.cycle_force(x, v)
     return jnp.asarray(basis.analysis) @ force
