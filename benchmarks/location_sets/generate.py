@@ -1,11 +1,13 @@
 """Blind tests of chains with one nonlinear element at a hidden place: by time integration.
 
-Run: python benchmarks/location_sets/generate.py --out DIR [--sets 80] [--seed 1]
+Run: python benchmarks/location_sets/generate.py --out DIR [--sets 80] [--seed 1] [--strong]
 
 Writes DIR/sets/NAME.csv and NAME.toml (the matrices without the element) and, apart from them,
 DIR/keys/NAME.json (the truth). No code is shared with the package that is tested: M ẍ + C ẋ + K x
 + b f(b·x, b·ẋ) = force, by Runge and Kutta's fourth-order method with 256 steps a period, all sets
-side by side, until nothing changes from period to period. One JSON line at the end.
+side by side, until nothing changes from period to period. `--strong` elements change the frequency
+by 6 to 25 % and the damping by up to three times; "harmonics" of a key is the largest second or
+third harmonic of an element's own motion over its fundamental. One JSON line at the end.
 """
 
 import json
@@ -32,7 +34,7 @@ SETTLED, STRETCH, LONGEST = 3e-5, 61, 25  # odd: a motion of two periods never s
 SMOOTH = 2e-3  # of the largest velocity: width of the jump of friction
 
 
-def drawn(rng, kind):
+def drawn(rng, kind, strong=False):
     """A chain, its element and its test."""
     mass = rng.uniform(0.5, 2.0, N)
     spring = 1e4 * 10 ** rng.uniform(-0.4, 0.4, N + 1)
@@ -62,9 +64,12 @@ def drawn(rng, kind):
     force = size * omega[0] ** 2 * 2 * zeta / abs(push)
     s = float(row @ shapes[:, 0])  # how far the element moves with the mode
     x = abs(s) * size
-    shift = rng.uniform(0.01, 0.03)  # of the frequency, or of what damping is added
+    # Of the frequency, or of what damping is added.
+    shift = rng.uniform(0.06, 0.25) if strong else rng.uniform(0.01, 0.03)
     law = {"stiffness": 2 * shift * omega[0] ** 2 / s**2, "x": x, "v": x * omega[0]}
-    law["damping"] = 2 * zeta * omega[0] / s**2 * rng.uniform(0.3, 0.8)
+    law["damping"] = (
+        2 * zeta * omega[0] / s**2 * rng.uniform(0.3, 0.8) * (rng.uniform(1.5, 3) if strong else 1)
+    )
     law["gap"] = x * rng.uniform(0.2, 0.5)
     low, high = omega[0] * (1 - 3 * zeta), omega[0] * (1 + 1.2 * shift + 3 * zeta)
     return {
@@ -199,6 +204,8 @@ def written(name, case, frequency, motion, rng, out):
     ]
     (out / "sets" / f"{name}.toml").write_text("\n".join(model) + "\n")
     key = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in case.items()}
+    along = np.abs(np.concatenate(motion).transpose(0, 2, 1) @ case["row"])
+    key["harmonics"] = float(np.nanmax(along[:, 2:4] / along[:, 1:2]))
     key["candidates"] = [named(place) for place in case["candidates"]]
     key["true"] = (
         "everywhere" if case["kind"] == "everywhere" else named(case["candidates"][case["true"]])
@@ -209,12 +216,12 @@ def written(name, case, frequency, motion, rng, out):
 
 def main() -> None:
     """Draw, integrate and write all sets."""
-    chosen = options(__doc__, out=Path, sets=80, seed=1)
+    chosen = options(__doc__, out=Path, sets=80, seed=1, strong=False)
     begin = time.perf_counter()
     for part in ("sets", "keys"):
         (chosen.out / part).mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng([chosen.seed, 47])
-    cases = [drawn(rng, KINDS[k % len(KINDS)]) for k in range(chosen.sets)]
+    cases = [drawn(rng, KINDS[k % len(KINDS)], chosen.strong) for k in range(chosen.sets)]
     order = rng.permutation(chosen.sets)
     frequencies, answers = integrated(cases)
     n, rows = len(LEVELS), 0

@@ -67,9 +67,15 @@ def main() -> None:
         lines.append(
             {
                 **{"set": path.stem, "kind": key["kind"], "sensors": len(data.sensors)},
-                **{"noise": key["noise"], "true": key["true"], "found": first.name},
+                **{
+                    "noise": key["noise"],
+                    "harmonics": key.get("harmonics"),
+                    "true": key["true"],
+                    "found": first.name,
+                },
                 **{"probability": first.probability, "misfit": found.misfit},
                 "law": None if first.law is None else first.law.kind,
+                "determined": first.law is not None and first.law.determined,
                 "of_true": dict(zip(found.name, found.probability.tolist(), strict=True)).get(
                     key["true"]
                 ),

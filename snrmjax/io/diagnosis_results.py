@@ -155,6 +155,7 @@ def summarise_whereabouts(found: Whereabouts) -> dict:
     return {
         "where": found.by_place,
         "where_misfit": found.misfit,
+        "where_fits": found.fits,
         "where_law": None if law is None else {"kind": law.kind, "parameters": law.parameters},
         "where_settled_by_sensor": None if found.told else found.settled_by,
     }

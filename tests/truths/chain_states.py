@@ -40,16 +40,26 @@ def displacement(force, row, law, omega, start):
     return real + 1j * imaginary
 
 
-def steady_states(row, law, sensors, *, noise=3e-3, seed=1, forces=(0.5, 1.0, 1.5)):
-    """A noisy table of three levels around the first resonance."""
+def steady_states(
+    row,
+    law,
+    sensors,
+    *,
+    noise=3e-3,
+    seed=1,
+    forces=(0.5, 1.0, 1.5),
+    span=(0.985, 1.01),
+    stored=STORED,
+):
+    """A noisy table of three levels around the first resonance, or over another `span` of it."""
     rows, x = [], None
     for level, force in enumerate(forces):
         x = None
-        for omega in np.linspace(0.985, 1.01, 6) * FIRST:
+        for omega in np.linspace(*span, 6) * FIRST:
             x = displacement(force, np.asarray(row), law, omega, x)
             rows.append((level + 1, omega, force, 1j * np.arange(ORDER + 1) * omega * x))
     level, omega, force, velocity = map(np.array, zip(*rows, strict=True))
-    orders = np.array(STORED)
+    orders = np.array(stored)
     seen = velocity[:, [POINTS.index(s) for s in sensors]][:, :, orders]
     rng = np.random.default_rng(seed)
     floor = 0.05 * noise * np.abs(seen[..., 0]).max()
@@ -64,7 +74,7 @@ def steady_states(row, law, sensors, *, noise=3e-3, seed=1, forces=(0.5, 1.0, 1.
         phase_std=np.full(seen.shape[:2], noise),
         harmonics=seen[..., 1:],
         harmonic_std=np.full(seen.shape[:2], floor),
-        harmonic_order=STORED[1:],
+        harmonic_order=stored[1:],
         sensors=sensors,
     )
 

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 
+from snrmjax.diagnose.location.element_motion import JUMP_ORDERS
 from snrmjax.identify.calibrate.calibration_states import ComparedColumns
 from snrmjax.model.modes import LinearModes, phasor_of_load
 
@@ -78,9 +79,8 @@ class SourcePattern(NamedTuple):
 
     driven: Complex[np.ndarray, "state order sensor"]  # m/s, by the measured force
     pattern: Complex[np.ndarray, "state order sensor"]  # m/s per unit of a force along the row
-    own_driven: Complex[np.ndarray, "state order"]  # displacement along the row, by the force
-    own: Complex[np.ndarray, "state order"]  # and per unit of a force along it
-    static: float  # the same of a constant force
+    own_driven: Complex[np.ndarray, " state"]  # displacement along the row, by the force
+    own: Complex[np.ndarray, "state own"]  # and per unit of a force along it, orders from 0
 
 
 def source_pattern(
@@ -93,15 +93,18 @@ def source_pattern(
     load = np.asarray(phasor_of_load(modes))
     force = np.asarray(chosen.states.force)
     shape = np.asarray(modes.mode_shape)[list(chosen.sensors)]
-    omega = records.frequency[:, None] * np.array(records.orders)
     both = np.stack([load.astype(complex), row.astype(complex)], axis=1)
-    moved = np.array([[_receptance(modes, at, both) for at in line] for line in omega])
-    moved[:, 0, :, 0] *= force[:, None]
-    moved[:, 1:, :, 0] = 0.0  # the force has one harmonic
-    velocity = 1j * omega[..., None, None] * (shape @ moved)
+    orders, count = np.array(records.orders), max(JUMP_ORDERS, *records.orders) + 1
+    moved = np.array(
+        [[_receptance(modes, h * omega, both) for h in range(count)] for omega in records.frequency]
+    )
+    moved[:, 1, :, 0] *= force[:, None]
+    seen = moved[:, orders]
+    seen[:, 1:, :, 0] = 0.0  # the force has one harmonic
+    rate = 1j * records.frequency[:, None] * orders
+    velocity = rate[..., None, None] * (shape @ seen)
     along = row @ moved
-    static = float(np.sum(row**2 / np.asarray(modes.natural_frequency) ** 2))
-    return SourcePattern(velocity[..., 0], velocity[..., 1], along[..., 0], along[..., 1], static)
+    return SourcePattern(velocity[..., 0], velocity[..., 1], along[:, 1, 0], along[..., 1])
 
 
 class SourceFit(NamedTuple):

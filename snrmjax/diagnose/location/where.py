@@ -38,6 +38,7 @@ _MOST = 16  # candidates that are made unasked
 _HOPELESS = 30.0  # times the best misfit of rough fits, beyond which a law is not fitted
 _FEWEST = 3.0  # numbers that count where no law fits
 _AS_NOISE = 1.2  # times the noise, up to which a law leaves no more than that
+_NOT_THERE = 1.5  # times the noise, from which on no candidate explains the sensors
 _STILL = 0.02  # of the largest motion, below which a row says nothing
 
 
@@ -78,6 +79,9 @@ class Whereabouts(AbstractResult):
             "misfit": self.misfit,
             "sensor": self.settled_by,
         }
+        if not self.fits:
+            law = first.law
+            return Fact("no_place_fits", **values, kind="" if law is None else law.kind)
         if self.told:
             return Fact("force_placed", **values)
         return Fact("force_not_placed", **values)
@@ -96,6 +100,11 @@ class Whereabouts(AbstractResult):
         return self.told and first.row is not None and law
 
     @property
+    def fits(self) -> bool:
+        """Whether what the best place leaves is about as large as the noise, if that is known."""
+        return not self.misfit > _NOT_THERE
+
+    @property
     def told(self) -> bool:
         """Whether one place is more probable than all others together."""
         return bool(self.probability[0] > _SURE)
@@ -103,6 +112,7 @@ class Whereabouts(AbstractResult):
     def summary(self) -> tuple[str, ...]:
         """See `AbstractResult`."""
         head = self.name[0] if self.told else "cannot be told"
+        head = head if self.fits else "no candidate fits"
         lines = [f"Whereabouts: {head}"]
         for place in self.places:
             law = "" if place.law is None else f", as {place.law.kind}"

@@ -316,9 +316,9 @@ class CoulombFriction(AbstractHysteresis):
     """f = F_c sgn q̇ (dry friction); 2ζ̃ω̃ rises by 4F_c/(πΩQ).
 
     `force` F_c in kg^1/2 m/s². No memory, but a jump, which is smoothed with the cycle's own
-    velocity: F_c tanh(q̇/(0.05 q̇_rms)). Its first harmonic is then 5.1e-4 below F_c·4/π for a
-    sinusoidal motion, and a motion at rest meets no force. In time it is F_c tanh(q̇/v_s) with
-    v_s = `smoothing_velocity` in kg^1/2 m/s, or sgn q̇ where v_s = 0.
+    velocity: F_c tanh(q̇/(s q̇_rms)) with s = `smoothing`, 0.05. Its first harmonic is then 5.1e-4
+    below F_c·4/π for a sinusoidal motion, and a motion at rest meets no force. In time it is
+    F_c tanh(q̇/v_s) with v_s = `smoothing_velocity` in kg^1/2 m/s, or sgn q̇ where v_s = 0.
     """
 
     kind: ClassVar[str] = "coulomb_friction"
@@ -341,15 +341,16 @@ class CoulombFriction(AbstractHysteresis):
         "kg^1/2 m/s²", "friction force", rules=(NOT_NEGATIVE,), prior=NOT_BELOW_ZERO
     )
     smoothing_velocity: Scalar = eqx.field(default_factory=lambda: jax.device_put(np.zeros(())))
+    smoothing: Scalar = eqx.field(default_factory=lambda: jax.device_put(np.asarray(SMOOTHING)))
 
     def cycle_force(self, displacement: Samples, velocity: Samples) -> Samples:
         mean_square = jnp.mean(velocity**2)
         moving = mean_square > 0
-        width = SMOOTHING * jnp.sqrt(jnp.where(moving, mean_square, 1.0))
+        width = self.smoothing * jnp.sqrt(jnp.where(moving, mean_square, 1.0))
         return jnp.where(moving, self.force * jnp.tanh(velocity / width), 0.0)
 
     def scaled_for(self, displacement: Scalar, velocity: Scalar) -> Self:
-        width = SMOOTHING * jnp.asarray(velocity, dtype=jnp.float64)
+        width = self.smoothing * jnp.asarray(velocity, dtype=jnp.float64)
         return dataclasses.replace(self, smoothing_velocity=width)
 
     def initial_states(self) -> States:

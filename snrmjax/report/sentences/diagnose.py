@@ -29,7 +29,6 @@ _COMPLETED = {
     "not_physical": ", but no structure can have these parameters: there is no completed model",
 }
 _UNITS = {"velocity": "m/s", "displacement": "m"}
-_NOT_THERE = 1.5  # times the noise, that the best place leaves
 
 
 def effect_name(kind: str) -> str:
@@ -179,10 +178,18 @@ def _level_force(*, level: int, gain: float, std: float) -> str:
 
 def _placed(place: str, probability: float, other: str, misfit: float, sensor: str | None) -> str:
     where = "on the mode as a whole" if place == "everywhere" else f"at {place}"
-    said = f"the missing force acts {where} ({probability_in_words(probability)})"
-    if misfit > _NOT_THERE:
-        said += f", although what it leaves there is {misfit:.2g} times the noise"
-    return f"{said}."
+    return f"the missing force acts {where} ({probability_in_words(probability)})."
+
+
+def _no_place_fits(
+    place: str, probability: float, other: str, misfit: float, sensor: str | None, kind: str
+) -> str:
+    law = f"{effect_name(kind)} at {place}" if kind else place
+    return (
+        f"no candidate explains the sensors: the best, {law}, leaves {misfit:.2g} times the noise. "
+        "The force acts elsewhere, at several places or by another law, or the linear structure "
+        "is not right."
+    )
 
 
 def _not_placed(
@@ -202,6 +209,7 @@ SENTENCES: dict[str, Wording] = {
         "place does, to the noise."
     ),
     "force_not_placed": _not_placed,
+    "no_place_fits": _no_place_fits,
     # The verdict and what a result says first.
     "verdict": _verdict,
     "level_force": _level_force,

@@ -97,3 +97,34 @@ def test_what_cannot_be_placed_is_told():
     )
     with pytest.raises(ValueError, match="needs the phases"):
         sj.diagnose.locate_force(unknown, model)
+
+
+LIGHT = (0.0, 0.0, -1.0, 1.0)  # x4 less x3
+
+
+def stiffening(x, v):
+    return 3e9 * x**3
+
+
+def test_a_place_counts_with_the_own_harmonics_of_its_element():
+    # Recorded are fundamentals only: the third harmonic of x4 − x3 is up to 9 % of its
+    # fundamental, without which the coefficient is 8 % too low.
+    sensors = ("x3", "x4")
+    data = steady_states(
+        *(LIGHT, stiffening, sensors),
+        **{"forces": (15.0, 30.0, 45.0), "span": (0.72, 0.84), "stored": (1,), "noise": 5e-4},
+    )
+    found = sj.diagnose.locate_force(data, structure(sensors), ("x4-x3", "x2", "x4"), laws=LAWS)
+    law = found.places[0].law
+    assert (found.places[0].name, law.kind) == ("x4-x3", "cubic_stiffness")
+    assert found.explains
+    assert law.parameters["coefficient"] == pytest.approx(3e9, rel=0.04)
+
+
+def test_where_no_candidate_fits_the_words_say_so():
+    sensors = ("x1", "x2", "x4")
+    data, model = steady_states(ROW, hardening, sensors, forces=(2.0, 4.0)), structure(sensors)
+    found = sj.diagnose.locate_force(data, model, ("x1", "x2-x1"), laws=LAWS)
+    assert not found.fits
+    assert "no candidate explains the sensors" in str(found.words)
+    assert not summarise_whereabouts(found)["where_fits"]
