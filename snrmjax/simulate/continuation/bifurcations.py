@@ -20,8 +20,6 @@ _FOLDS_OWN = 12  # points from a fold at which its multiplier may cross
 _CROSSING = 5e-7  # of a step, to which the crossing of the circle is located
 _SHARES = 4  # of the way through an interval that are looked at side by side
 _ROUNDS = 24  # of looking closer, at most; three or four do
-_JUMP = 1e-4  # of a modulus over a located crossing: no smooth one changes as much
-_AT_FOLD = 0.1  # of an interval from a fold, within which such a jump is the fold's own
 
 
 class _Crossing(NamedTuple):
@@ -155,25 +153,14 @@ def _located_bifurcations(
         value_low[still], value_high[still] = height[at, behind - 1], height[at, behind]
         share[still] = _closer(whole, height, behind)
     located = (high - low <= _CROSSING) & (inside | ~missed)
-    jumps = value_high - value_low > _JUMP
     new_points = [
         NewPoint(int(o), int(k), point[e], tangent[e], _crossing_kind(passed[e]), passed[e])
         for e, (o, k, _) in enumerate(crossings)
-        if located[e] and not (jumps[e] and _at_fold(curves[o].events, int(k), float(high[e])))
+        if located[e]
     ]
     for o in owner[~located].tolist():
         curves[o] = curves[o]._replace(not_located=(*curves[o].not_located, "bifurcation"))
     return inserted(curves, new_points)
-
-
-def _at_fold(events: Sequence[CurveEvent], before: int, share: float) -> bool:
-    """Whether a share of the way from one point to the next is beside a fold at either of them.
-
-    Where a contact opens or a slider slips, a curve may turn in a corner and its multipliers jump:
-    that is one event, the fold, whatever multipliers cross the circle in the jump.
-    """
-    here, there = (events[before + ahead] == CurveEvent.FOLD for ahead in (0, 1))
-    return (here and share < _AT_FOLD) or (there and share > 1 - _AT_FOLD)
 
 
 def _closer(share: np.ndarray, height: np.ndarray, behind: np.ndarray) -> np.ndarray:
