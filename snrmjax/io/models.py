@@ -31,7 +31,7 @@ from snrmjax.model.potential import (
 )
 from snrmjax.model.structures import Structure, structure
 from snrmjax.numerics.names import near_miss, suggestion
-from snrmjax.numerics.rules import BELOW_ONE, IN_RANGE_HZ, NOT_NEGATIVE, NOT_ZERO, POSITIVE, Rule
+from snrmjax.numerics.rules import BELOW_ONE, IN_RANGE_HZ, NOT_NEGATIVE, POSITIVE, Rule
 
 _TOP_KEYS = (
     *("name", "mode_of_interest", "mode", "rigid_body_mode", "damping_coupling"),
@@ -46,7 +46,7 @@ _MODE: _Rules = {
     "frequency_hz": (POSITIVE, IN_RANGE_HZ),
     "damping_ratio": (BELOW_ONE,),
     "shape": (),
-    "participation": (NOT_ZERO,),
+    "participation": (),
 }
 _MODE_STD: _Rules = {
     "frequency_std_hz": (NOT_NEGATIVE, IN_RANGE_HZ),
@@ -54,7 +54,7 @@ _MODE_STD: _Rules = {
     "modal_mass_std": (NOT_NEGATIVE,),
 }
 _MODE_FURTHER: _Rules = {"participation_lag": ()}
-_RIGID_BODY_MODE: _Rules = {"shape": (), "participation": (NOT_ZERO,)}
+_RIGID_BODY_MODE: _Rules = {"shape": (), "participation": ()}
 _MEASUREMENT: _Rules = dict.fromkeys(
     (
         *("level_gain_std", "level_phase_std_deg"),
@@ -172,6 +172,11 @@ def _modes(top: TomlTable, file: str) -> LinearModes:
             f"({of_interest}) is zero at every sensor."
         )
 
+    if not any(m["participation"] or m.get("participation_lag") for m in (*flexible, *rigid)):
+        raise ValueError(
+            f"{file} has no mode that the force moves: expected a `participation` other than zero "
+            "of one mode at least."
+        )
     base = moving_base(top, file)
     if base is not None and rigid_tables:
         raise ValueError(f"{file} has both [base] and [[rigid_body_mode]]: a base holds it.")

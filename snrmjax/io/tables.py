@@ -74,7 +74,14 @@ def read_steady_states(
 
 
 def check_driven_alike(data: SteadyStates, modes: LinearModes, file: str) -> None:
-    """Refuse a force where the model has a base, and the other way round."""
+    """Refuse a force where the model has a base, the other way round, and one on other modes."""
+    one = modes.mode_of_interest
+    if not modes.driven()[one]:
+        raise ValueError(
+            f"{file} is a test of mode {one + 1}, the model's `mode_of_interest`, which its force "
+            f"does not move (`participation` {modes.participation.item(one):g}): expected another "
+            "`mode_of_interest`, or the participation of this one."
+        )
     if (data.base is None) == (modes.base is None):
         return
     if modes.base is None:

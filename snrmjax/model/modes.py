@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float, Shaped
+from jaxtyping import Array, Bool, Complex, Float, Shaped
 
 from snrmjax.model.moving_base import BaseMotion
 from snrmjax.numerics.compiled import compiled
@@ -17,7 +17,7 @@ from snrmjax.numerics.rules import BELOW_ONE, POSITIVE, require
 from snrmjax.numerics.units import HERTZ
 
 _SHOWN = 12  # modes, in a text
-_STILL = 1e-9  # of the largest shape at a point, below which a mode has a node there
+STILL = 1e-9  # of the largest shape at a point, below which a mode has a node there
 
 UNSTATED_MODAL_MASS_STD = 0.05
 """1σ, relative, of a modal mass of which nobody stated one.
@@ -101,9 +101,7 @@ class LinearModes(AbstractShown):
         participation = self.shape_at(point)
         if self.base is not None:
             raise ValueError("a base drives the structure: its modes say nothing of newtons.")
-        if not np.abs(participation[self.mode_of_interest]) > _STILL * np.max(
-            np.abs(participation)
-        ):
+        if not np.abs(participation[self.mode_of_interest]) > STILL * np.max(np.abs(participation)):
             raise ValueError(f"a force at {point!r} does not move the mode of interest.")
         rigid = self.rigid_body_participation
         if rigid.size and point not in self.sensors:
@@ -140,6 +138,11 @@ class LinearModes(AbstractShown):
     def force_unit(self) -> str:
         """Unit of what drives the structure: of a force, or of a base's acceleration."""
         return "N" if self.base is None else "m/s²"
+
+    def driven(self) -> Bool[np.ndarray, " mode"]:
+        """Which flexible modes the force moves by itself, not by rounding alone."""
+        drive = np.abs(np.asarray(phasor_of_load(self)))
+        return drive > STILL * np.max(drive, initial=0.0)
 
     @property
     def own_modal_mass_std(self) -> Float[Array, ""] | None:

@@ -14,12 +14,12 @@ from snrmjax.model.effect_metadata import Entries
 from snrmjax.model.places import unit_at
 from snrmjax.model.potential import monomial_key
 from snrmjax.model.structures import Structure
-from snrmjax.numerics.rules import BELOW_ONE, NOT_ZERO, POSITIVE, Rule
+from snrmjax.numerics.rules import BELOW_ONE, POSITIVE, Rule
 
 _MODE_RULES = {
     "natural_frequency": (POSITIVE,),
     "damping_ratio": (BELOW_ONE,),
-    "participation": (NOT_ZERO,),
+    "participation": (),
 }
 _MODE_UNITS = {"natural_frequency": "rad/s", "damping_ratio": "1", "participation": "kg^-1/2"}
 _MODE_FIELDS = tuple(_MODE_RULES)

@@ -1,7 +1,8 @@
 """Simulation of a model: responses and nonlinear normal mode, with what they do not show."""
 
+import dataclasses
 from collections.abc import Callable, Iterator, Sequence
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from snrmjax.io.units import HERTZ
 from snrmjax.model.parameters import checked_names, parameter_values
 from snrmjax.model.structures import Structure, equilibria, simulated_structure
 from snrmjax.numerics.facts import Fact
+from snrmjax.simulate.balance.harmonic_balance import resonant_modes
 from snrmjax.simulate.continuation.continuation import CurveStatus
 from snrmjax.simulate.continuation.event_equations import FORCE, EventKind
 from snrmjax.simulate.continuation.response_curve import Branch, ResponseCurve
@@ -81,7 +83,10 @@ def simulate_responses(
         check_quasi_periodic(simulated_structure(model))
     if follow and parameter != FORCE:
         checked_names(model, [parameter], "parameter")
+    # Events are located where the files and figures show the response.
     ends, settings = (from_hz * HERTZ, to_hz * HERTZ), ResponseSettings(harmonic_order=harmonics)
+    sensor = _most_moved(model, ends)
+    model = dataclasses.replace(model, modes=model.modes.with_first_sensor(sensor))
     hold = friction_hold(model, *ends)
     curves: list[ResponseCurve] = []
     notes = list(_notes_on_equilibria(model))
@@ -122,9 +127,7 @@ def simulate_responses(
     if quasi_periodic:
         tori, told = _tori(model, curves, ends)
         notes += told
-    return SimulatedResponses(
-        *(tuple(curves), _sensor(model), tuple(notes), tuple(events), tuple(tori))
-    )
+    return SimulatedResponses(*(tuple(curves), sensor, tuple(notes), tuple(events), tuple(tori)))
 
 
 def _tori(
@@ -204,7 +207,8 @@ def simulate_mode(
     ]
     if branch.status not in _ENDS:
         notes.append(Fact("mode_not_followed", status=branch.status))
-    return SimulatedMode(branch, _sensor(model), tuple(notes))
+    sensor = model.modes.sensors[reference_sensor(model.modes)]
+    return SimulatedMode(branch, sensor, tuple(notes))
 
 
 def _notes_on_instability(branch: NormalModeBranch) -> Iterator[Fact]:
@@ -217,8 +221,11 @@ def _notes_on_instability(branch: NormalModeBranch) -> Iterator[Fact]:
         yield Fact("mode_unstable", n=stop - first, **ends)
 
 
-def _sensor(model: Structure) -> str:
-    return model.modes.sensors[reference_sensor(model.modes)]
+def _most_moved(model: Structure, ends: tuple[float, float]) -> str:
+    """The sensor that sees most of the mode of interest, or of another that moves in a range."""
+    modes = model.modes
+    (leading, *_) = [*resonant_modes(model, ends), modes.mode_of_interest]
+    return modes.sensors[reference_sensor(dataclasses.replace(modes, mode_of_interest=leading))]
 
 
 def _notes_on_force(
@@ -232,7 +239,6 @@ def _notes_on_force(
     if not shown:
         return
     at = {"force": curves[0].force, "unit": unit}
-    sensor = model.modes.sensors.index(_sensor(model))
     for one in hidden_branches(model, curves, *ends, settings=settings):
         yield Fact(
             "hidden_branch",
@@ -240,8 +246,8 @@ def _notes_on_force(
             begins=bool(one.found_from < ends[0]),
             at_hz=one.at_frequency / HERTZ,
             to_hz=one.to_frequency / HERTZ,
-            velocity=float(one.amplitude[sensor]),
-            sensor=model.modes.sensors[sensor],
+            velocity=float(one.amplitude[0]),
+            sensor=model.modes.sensors[0],
             from_hz=one.found_from / HERTZ,
         )
     for idle in idle_elements(model, shown):
@@ -249,16 +255,16 @@ def _notes_on_force(
 
 
 def _notes_on_curve(curve: ResponseCurve, hold: Hold | None) -> Iterator[Fact]:
-    no_start = curve.status == CurveStatus.NO_START
-    if hold is not None and no_start:
-        yield Fact("held_by_friction", force=curve.force, unit=curve.force_unit, **hold._asdict())
+    at: dict[str, Any] = {"force": curve.force, "unit": curve.force_unit}
+    if hold is not None and curve.status == CurveStatus.NO_START:
+        yield Fact("held_by_friction", **at, **hold._asdict())
     elif curve.branch == Branch.MAIN and curve.status != CurveStatus.UPPER_END:
-        yield Fact("curve_ended", force=curve.force, status=curve.status)
+        yield Fact("curve_ended", **at, status=curve.status)
     if curve.not_located:
-        yield Fact("curve_events_not_located", force=curve.force, kinds=curve.not_located)
+        yield Fact("curve_events_not_located", **at, kinds=curve.not_located)
     unknown = int(np.sum(curve.stability == int(Stability.NOT_COMPUTED)))
     if unknown:
-        yield Fact("stability_not_computed", force=curve.force, n=unknown)
+        yield Fact("stability_not_computed", **at, n=unknown)
 
 
 def _notes_on_equilibria(model: Structure) -> tuple[Fact, ...]:

@@ -150,7 +150,9 @@ class ResponseCurve(MotionCurve):
                 f"events: {events or 'none'}",
             ]
         if self.not_located:
-            lines.append(f"not located: {_counted(self.not_located)}")
+            names = {"branch": "branch that comes in at the upper end"}
+            missed = _counted(names.get(kind, kind) for kind in self.not_located)
+            lines.append(f"there, but not located: {missed}")
         return (*lines, f"status: {self.status.message}")
 
     def variables(self) -> dict[str, Variable]:

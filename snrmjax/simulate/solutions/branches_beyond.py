@@ -48,7 +48,9 @@ def hidden_branches(
     ends = frequency_range(from_frequency, to_frequency)
     expanded = simulated_structure(model)
     force = np.array([curves[0].force])
-    balance = response_balances([expanded], force, settings.harmonic_order, settings.n_samples)
+    balance = response_balances(
+        [expanded], force, settings.harmonic_order, settings.n_samples, ends
+    )
     known = _known_at_ends(balance, curves, ends)
     found = []
     for begin, end in _starts_beyond(np.asarray(expanded.modes.natural_frequency), ends):

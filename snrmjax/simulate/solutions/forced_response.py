@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
+from snrmjax.model.modes import STILL
 from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.numerics.blocks import mapped, taken
 from snrmjax.numerics.compiled import compiled
@@ -222,7 +223,7 @@ def _chunk_of_curves(
     if not good:
         return [tuple(curves) for curves in results]
     balances = response_balances(
-        [models[k] for k in good], forces[good], settings.harmonic_order, settings.n_samples
+        [models[k] for k in good], forces[good], settings.harmonic_order, settings.n_samples, ends
     )
     walk = (ends, settings.steps, 1 if alone else lanes_for(balances.size + 1))
     upward = trace_from_rest(balances, np.arange(len(good)), *walk, downward=False)
@@ -279,15 +280,19 @@ def _chunk_of_curves(
 
 def _ends_near_rest(balances: HarmonicBalance, member: int, curve: TracedCurve) -> bool:
     """Whether a curve's last point is about the linear response there: then it is alone."""
-    model, j = balances.model, balances.model.modes.mode_of_interest
-    omega = float(curve.points[-1, -1])  # over the natural frequency
-    damping = model.modes.damping_ratio.item(member, j)
-    natural = model.modes.natural_frequency.item(member, j)
-    load = float(balances.force[member]) * model.modes.participation.item(member, j)
-    linear = load / (natural**2 * (1 - omega**2 + 2j * damping * omega))
-    x = curve.points[-1, :-1].reshape(balances.n_coefficients, -1)[1:3, j]
-    last = complex(x[0], -x[1]) * float(balances.displacement_scale[member])
-    return abs(last - linear) < 0.5 * abs(linear)
+    modes, j = balances.model.modes, balances.model.modes.mode_of_interest
+    drive = np.asarray(modes.participation)[member]
+    own = np.abs(drive[j]) > STILL * np.max(np.abs(drive))
+    some = [j] if own else np.flatnonzero(drive)
+    natural, damping = (
+        np.asarray(part)[member, some] for part in (modes.natural_frequency, modes.damping_ratio)
+    )
+    omega = float(curve.points[-1, -1] * balances.frequency_scale[member])
+    load = float(balances.force[member]) * drive[some]
+    linear = load / (natural**2 - omega**2 + 2j * damping * natural * omega)
+    x = curve.points[-1, :-1].reshape(balances.n_coefficients, -1)[1:3, some]
+    last = (x[0] - 1j * x[1]) * float(balances.displacement_scale[member])
+    return bool(np.linalg.norm(last - linear) < 0.5 * np.linalg.norm(linear))
 
 
 def _same_point(first: np.ndarray, second: np.ndarray) -> bool:

@@ -40,7 +40,7 @@ class TorusEnd(Status):
 
     UPPER_END = 0, "the upper end of the frequency range"
     LOWER_END = 1, "the lower end of the frequency range"
-    POINT_LIMIT = 2, "the largest number of points; raise `max_points`"
+    POINT_LIMIT = 2, "the largest number of points (in Python: raise `max_points`)"
     STEP_TOO_SMALL = 3, "where Newton's method fails at the smallest step; raise `slow_order`"
     NO_START = 4, "at its start: there is no quasi-periodic motion near it with these harmonics"
     CLOSED = 6, "where it started: a closed branch"
