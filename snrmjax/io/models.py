@@ -106,8 +106,6 @@ def _read(text: str, file: str, path: Path) -> Structure:
         made = structure_of_matrices(top, file, path.parent, effects)
         modes, potential = made.modes, made.potential
     else:
-        if "force" in top.entries:
-            raise ValueError(f"{file} has [force] without [structure]: modes have participations.")
         modes = _modes(top, file)
         potential = _potential(top.table("potential", f"[potential] of {file}"), modes.n_modes)
         for k, effect in enumerate(effects, 1):
@@ -217,8 +215,24 @@ def _modes(top: TomlTable, file: str) -> LinearModes:
             _coupling(top, len(flexible)),
             lag if any(lag := stds("participation_lag")) else None,
             base,
+            _unbalance(top, file),
         ),
     )
+
+
+def _unbalance(top: TomlTable, file: str) -> float | None:
+    """The unbalance of [force], kg m; None where a force drives the modes."""
+    if "force" not in top.entries:
+        return None
+    table = top.table("force", f"[force] of {file}")
+    if "at" in table.entries:
+        raise ValueError(
+            f"{file} has `at` of [force] without [structure]: modes have participations."
+        )
+    if "base" in top.entries:
+        raise ValueError(f"{file} has both [force] and [base]: a force or a base that moves.")
+    table.check_keys(("unbalance_kg_m",))
+    return table.number("unbalance_kg_m", POSITIVE)
 
 
 def _coupling(top: TomlTable, n_modes: int) -> np.ndarray | None:
@@ -390,6 +404,9 @@ def _entries(model: Structure) -> dict[str, object]:
         "base": {}
         if modes.base is None
         else {"motion": modes.base.motion, "along": dict(modes.base.along)},
+        "force": {}
+        if modes.unbalance is None
+        else {"unbalance_kg_m": _one("unbalance", modes.unbalance)},
         "damping_coupling": []
         if modes.damping_coupling is None
         else np.asarray(modes.damping_coupling).tolist(),

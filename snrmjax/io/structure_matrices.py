@@ -16,7 +16,7 @@ from snrmjax.model.builders.matrices import from_matrices
 from snrmjax.model.effect_base import AbstractEffect
 from snrmjax.model.moving_base import MOTIONS, BaseMotion, base_motion
 from snrmjax.model.structures import Structure
-from snrmjax.numerics.rules import BELOW_ONE, NOT_ZERO
+from snrmjax.numerics.rules import BELOW_ONE, NOT_ZERO, POSITIVE
 
 _MATRICES = ("mass", "stiffness", "damping")
 
@@ -52,11 +52,15 @@ def structure_of_matrices(
     base = moving_base(top, file)
     if base is not None and "force" in top.entries:
         raise ValueError(f"{file} has both [force] and [base]: a force or a base that moves.")
+    force = None if base else top.table("force", f"[force] of {file}")
     try:
         return from_matrices(
             *(matrices["mass"], damping, matrices["stiffness"], points),
-            force=None if base else _force(top.table("force", f"[force] of {file}")),
+            force=None if force is None else _force(force),
             base=base,
+            unbalance=force.number("unbalance_kg_m", POSITIVE)
+            if force is not None and "unbalance_kg_m" in force.entries
+            else None,
             effects=effects,
             n_modes=table.whole("modes", 1) if "modes" in parts else None,
             mode_of_interest=top.whole("mode_of_interest", 1, 1) - 1,
@@ -138,7 +142,7 @@ def _matrix(key: str, value: Any, table: TomlTable) -> Float[np.ndarray, "unknow
 
 def _force(table: TomlTable) -> dict[str, complex]:
     """Newtons at points per newton of the recorded force, as phasors."""
-    table.check_keys(("at",))
+    table.check_keys(("at",), ("unbalance_kg_m",))
     at = table.entries["at"]
     if isinstance(at, str):
         return {at: 1.0}

@@ -53,6 +53,8 @@ class LinearModes(AbstractShown):
     participation_lag: Float[Array, " mode"] | None = None  # kg^-1/2
     # Where the acceleration of a base drives it: participations are then −Γ, kg^1/2 per m/s².
     base: BaseMotion | None = eqx.field(static=True, default=None)
+    # A rotating unbalance U = m r, kg m, drives by U Ω²: a "force" is then a multiple of U.
+    unbalance: Float[Array, ""] | None = None
 
     def has_screen(self) -> bool:
         """Whether these are the modes of one structure, with values."""
@@ -72,6 +74,8 @@ class LinearModes(AbstractShown):
             lines.append(f"… and {self.n_modes - _SHOWN} more")
         if self.base is not None:
             lines.append(f"driven by the acceleration of its base, {self.base.motion} motion")
+        if self.unbalance is not None:
+            lines.append(f"driven by an unbalance of {float(self.unbalance):.6g} kg m")
         return tuple(lines)
 
     @property
@@ -136,8 +140,8 @@ class LinearModes(AbstractShown):
 
     @property
     def force_unit(self) -> str:
-        """Unit of what drives the structure: of a force, or of a base's acceleration."""
-        return "N" if self.base is None else "m/s²"
+        """Unit of what drives the structure: a force, a base's acceleration, or an unbalance."""
+        return drive_unit(self.base, self.unbalance)
 
     def driven(self) -> Bool[np.ndarray, " mode"]:
         """Which flexible modes the force moves by itself, not by rounding alone."""
@@ -172,6 +176,7 @@ class Beside(NamedTuple):
     damping_coupling: Shaped[np.ndarray | Array, "mode mode"] | None = None
     participation_lag: Shaped[np.ndarray | Array, " mode"] | list[float] | None = None  # kg^-1/2
     base: BaseMotion | None = None  # whose acceleration stands in the place of the force
+    unbalance: float | Float[Array, ""] | None = None  # kg m, in the place of the force
 
 
 class RigidBodyModes(NamedTuple):
@@ -277,6 +282,11 @@ def linear_modes(
         numbers["participation_lag"] = lag
     if further.base is not None:
         _check_base(further.base, (*names, *points), participations)
+    if further.unbalance is not None:
+        require("`beside.unbalance`", further.unbalance, POSITIVE)
+        numbers["unbalance"] = _numbers(further.unbalance)
+    if further.base is not None and further.unbalance is not None:
+        raise ValueError("a base and an unbalance cannot both drive a structure.")
     modes = LinearModes(
         **numbers,
         sensors=tuple(names),
@@ -379,6 +389,25 @@ def linear_response(
     return jnp.einsum("...m,sm->...s", modal, modes.mode_shape) + _rigid_body_velocity(
         modes, frequency, force
     )
+
+
+def newtons(
+    modes: LinearModes,
+    frequency: Float[Array | np.ndarray, "*batch"] | float,
+    force: Float[Array | np.ndarray, "*batch"] | float,
+) -> Any:
+    """The force (N) at a frequency Ω (rad/s): of a multiple c of an unbalance U it is c U Ω².
+
+    A force, and a base's acceleration in its place, is what it is at every frequency.
+    """
+    return force if modes.unbalance is None else force * modes.unbalance * frequency**2
+
+
+def drive_unit(base: BaseMotion | None, unbalance: Any = None) -> str:
+    """Unit of what drives a structure: newtons, m/s² of a base, or an unbalance (kg m)."""
+    if unbalance is not None:
+        return f"× {float(unbalance):.6g} kg m"
+    return "N" if base is None else "m/s²"
 
 
 def phasor_of_load(modes: LinearModes) -> Complex[Array, " mode"]:

@@ -300,6 +300,13 @@ def simulated_structure(model: Structure) -> Structure:
     return dataclasses.replace(model, modes=modes, potential=potential, effects=rest)
 
 
+def driven_in_newtons(model: Structure) -> Structure:
+    """The structure as tests see it, whose states have forces in N: without an unbalance."""
+    if model.modes.unbalance is None:
+        return model
+    return dataclasses.replace(model, modes=dataclasses.replace(model.modes, unbalance=None))
+
+
 class Equilibrium(NamedTuple):
     """A static state: its displacement (kg^1/2 m), energy (J) and whether it is stable."""
 

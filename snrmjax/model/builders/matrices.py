@@ -47,6 +47,7 @@ def from_matrices(
     *,
     force: str | Mapping[str, Phasor] | None = None,
     base: BaseMotion | None = None,
+    unbalance: float | None = None,
     effects: AbstractEffect | Iterable[AbstractEffect] = (),
     n_modes: int | None = None,
     residuals: bool = True,
@@ -63,6 +64,7 @@ def from_matrices(
     `base` in its place: the structure stands on a base that moves, whose acceleration a acts as
     the force −M r a, r being how far each unknown goes with the base (`base_motion`'s `along`); all
     motion, that of the effects too, is relative to it.
+    `unbalance` (kg m) of something that turns: the force is U Ω² then, at the points of `force`.
     `effects` act at points by their `at`, in N and m; the matrices hold no part of them.
     `n_modes` keeps so many modes of lowest frequency, and for every place of an effect and for
     the force one vector more: what the left out modes give way there statically, exactly, as
@@ -124,7 +126,9 @@ def from_matrices(
         sensors=watched,
         mode_of_interest=mode_of_interest,
         rigid_body=RigidBodyModes(rigid[seen], (load @ rigid).real),
-        beside=Beside(other, coupling, -acting.imag if np.any(acting.imag) else None, base),
+        beside=Beside(
+            other, coupling, -acting.imag if np.any(acting.imag) else None, base, unbalance
+        ),
     )
     return structure(modes, effects=made, name=name)
 

@@ -5,6 +5,7 @@ the natural frequency of the mode of interest, and the residual accordingly.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -15,7 +16,7 @@ from jaxtyping import Array, Float, Int
 from snrmjax.model.averaging import AveragedForce
 from snrmjax.model.effect_base import AbstractHysteresis, AbstractKinked
 from snrmjax.model.elements import AlikeForces, elements_of
-from snrmjax.model.modes import phasor_of_load
+from snrmjax.model.modes import newtons, phasor_of_load
 from snrmjax.model.structures import Structure, linear_terms_of
 from snrmjax.numerics.compiled import as_numpy, compiled
 from snrmjax.simulate.balance.harmonics import (
@@ -37,7 +38,7 @@ class HarmonicBalance(eqx.Module):
     """
 
     model: Structure
-    force: Float[Array, ""]  # N, amplitude of a cosine
+    force: Float[Array, ""]  # N, amplitude of a cosine; or the multiple of an unbalance
     displacement_scale: Float[Array, ""]  # kg^1/2 m
     frequency_scale: Float[Array, ""]  # rad/s
     harmonic_order: int = eqx.field(static=True)
@@ -82,8 +83,12 @@ class HarmonicBalance(eqx.Module):
         shape = (len(points), self.n_coefficients, self.model.n_modes)
         return rows.reshape(shape), points[:, -1] * unit
 
+    def newtons(self, omega: Float[Array, ""]) -> Any:
+        """The force (N) at a scaled frequency; see `newtons` of modes."""
+        return newtons(self.model.modes, omega * self.frequency_scale, self.force)
+
     def load(self) -> Float[Array, " equation"]:
-        """Scaled force of one newton: the right-hand side for `force` = 1."""
+        """Scaled force of one newton: the right-hand side where `newtons` is 1."""
         model = self.model
         if self.cosine_only:
             return jnp.zeros(self.size)
@@ -123,7 +128,7 @@ class HarmonicBalance(eqx.Module):
         internal = jnp.asarray(basis.analysis) @ (model.nonlinear_force(samples, rate) / unit)
         damped = terms.damped(slope) / fs
         balance = (stiffness - omega**2 * inertia) * x + omega * damped + internal
-        residual = balance.reshape(-1) - self.force * self.load()
+        residual = balance.reshape(-1) - self.newtons(omega) * self.load()
         if not with_jacobian:
             return residual, jnp.zeros((0,))
         # Adding zeros beside the diagonal is faster than writing to its entries one by one.
@@ -137,6 +142,8 @@ class HarmonicBalance(eqx.Module):
         blocks = blocks - of_inertia * (omega**2 * jnp.diag(terms.mass))
         blocks = blocks + of_damping * (omega * terms.damping_matrix() / fs)
         column = damped - 2 * omega * inertia * x
+        if model.modes.unbalance is not None:
+            column = column - (2 / omega * self.newtons(omega) * self.load()).reshape(size, n)
         if model.forces:
             added, by_omega = self._elements(samples, by_omega, omega)
             blocks, column = blocks + added, column + by_omega
@@ -298,7 +305,8 @@ def linear_coefficients(
     model: Structure, force: Float[Array, ""], frequency: Float[Array, ""], harmonic_order: int
 ) -> Float[Array, "coefficient mode"]:
     """Displacement coefficients of the linear response: where a forced response starts."""
-    terms, load = model.linear_terms(), force * phasor_of_load(model.modes)
+    terms = model.linear_terms()
+    load = newtons(model.modes, frequency, force) * phasor_of_load(model.modes)
     stiffness = terms.stiffness - terms.mass * frequency**2 + 1j * terms.damping * frequency
     if terms.coupling is None:
         phasor = load / stiffness
@@ -321,7 +329,7 @@ def resonance_displacement(
     terms = linear_terms_of(model)
     mass, damping, stiffness = (np.asarray(part) for part in terms[:3])
     omega = np.sqrt(stiffness / mass)
-    load = np.abs(force * np.asarray(phasor_of_load(model.modes)))
+    load = np.abs(newtons(model.modes, omega, force) * np.asarray(phasor_of_load(model.modes)))
     springs = stiffness > 0
     scale = float(np.max(load[springs] / stiffness[springs], initial=0.0))
     for mode in resonant_modes(model, within):

@@ -139,7 +139,7 @@ def _tracer(balance: HarmonicBalance, ends: Array, steps: StepControl, way: _Way
     if way != "rising":
         groups, closes = (balance.n_coefficients, balance.model.n_modes), way == "through"
         return CurveTracer(balance.linearised, CurveRange(lower, upper), steps, groups, closes)
-    load = balance.force * balance.load()
+    load = balance.newtons(lower) * balance.load()
 
     def linearised(point: Array) -> tuple[Array, Array]:
         """Unknowns x and the share of the force."""

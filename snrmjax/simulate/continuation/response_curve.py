@@ -9,6 +9,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
+from snrmjax.model.modes import drive_unit
 from snrmjax.model.moving_base import BaseMotion
 from snrmjax.numerics.blocks import by_member, mapped, taken
 from snrmjax.numerics.compiled import compiled
@@ -43,11 +44,13 @@ class MotionCurve(AbstractResult):
     sensors: tuple[str, ...] = quantity("sensor", "", "sensor", name="sensor", static=True)
     # Where a base drives it, "forces" are its accelerations and velocities relative to it.
     base: BaseMotion | None = eqx.field(static=True, default=None, kw_only=True)
+    # Where an unbalance U (kg m) drives it, by the force c U Ω², "forces" are the numbers c.
+    unbalance: float | None = eqx.field(static=True, default=None, kw_only=True)
 
     @property
     def force_unit(self) -> str:
-        """Unit of what drives it: newtons, or m/s² of a base."""
-        return "N" if self.base is None else "m/s²"
+        """Unit of what drives it: newtons, m/s² of a base, or a number of unbalances."""
+        return drive_unit(self.base, self.unbalance)
 
     def variables(self) -> dict[str, Variable]:
         """The quantities of the curve, and its velocities by the names of the files' columns."""
@@ -65,7 +68,8 @@ def motions_of(balance: HarmonicBalance, points: Float[np.ndarray, "point unknow
     whole = with_sines(coefficients) if balance.cosine_only else coefficients
     velocity = velocity_phasors(whole, frequency, np.asarray(modes.mode_shape))
     named = {"frequency": frequency, "coefficients": coefficients, "velocity": velocity}
-    return {**named, "sensors": modes.sensors, "base": modes.base}
+    unbalance = None if modes.unbalance is None else float(modes.unbalance)
+    return {**named, "sensors": modes.sensors, "base": modes.base, "unbalance": unbalance}
 
 
 def velocity_at_sensors(

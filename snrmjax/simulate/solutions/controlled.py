@@ -314,5 +314,5 @@ def _with_force(
     """Residual and Jacobian under a share of the force, the last column for the share."""
     now = eqx.tree_at(lambda b: b.force, balance, balance.force * share)
     residual, jacobian = now.linearised(point)
-    column = -balance.force * balance.load()
+    column = -balance.newtons(point[-1]) * balance.load()
     return residual, jnp.concatenate([jacobian, column[:, None]], axis=1)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from snrmjax.model.modes import STILL
+from snrmjax.model.modes import STILL, newtons
 from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.numerics.blocks import mapped, taken
 from snrmjax.numerics.compiled import compiled
@@ -288,7 +288,8 @@ def _ends_near_rest(balances: HarmonicBalance, member: int, curve: TracedCurve) 
         np.asarray(part)[member, some] for part in (modes.natural_frequency, modes.damping_ratio)
     )
     omega = float(curve.points[-1, -1] * balances.frequency_scale[member])
-    load = float(balances.force[member]) * drive[some]
+    force = newtons(taken(modes, member), omega, float(balances.force[member]))
+    load = force * drive[some]
     linear = load / (natural**2 - omega**2 + 2j * damping * natural * omega)
     x = curve.points[-1, :-1].reshape(balances.n_coefficients, -1)[1:3, some]
     last = (x[0] - 1j * x[1]) * float(balances.displacement_scale[member])
@@ -308,6 +309,7 @@ def _no_curve(model: Structure, force: float, harmonic_order: int) -> ResponseCu
         status=CurveStatus.INVALID,
         sensors=sensors,
         base=model.modes.base,
+        unbalance=None if model.modes.unbalance is None else float(model.modes.unbalance),
         force=force,
         event=(),
     )
@@ -347,7 +349,8 @@ def _solve_batch(
 
     def solved(force: Array, frequency: Array, start: Array) -> tuple[Array, Array]:
         # A guess of zero is allowed: the static displacement keeps the unknowns of order one.
-        static = force * model.modes.participation / model.modes.natural_frequency**2
+        static = newtons(model.modes, frequency, force) * model.modes.participation
+        static = static / model.modes.natural_frequency**2
         scale = jnp.maximum(jnp.max(jnp.abs(start)), jnp.max(jnp.abs(static)))
         balance = harmonic_balance(
             model, force, scale, harmonic_order=harmonic_order, n_samples=n_samples

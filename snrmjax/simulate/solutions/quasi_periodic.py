@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
+from snrmjax.model.modes import drive_unit
 from snrmjax.model.moving_base import BaseMotion
 from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.numerics.compiled import compiled
@@ -81,11 +82,12 @@ class QuasiPeriodicBranch(AbstractResult):
     status: TorusEnd = setting()
     sensors: tuple[str, ...] = quantity("sensor", "", "sensor", name="sensor", static=True)
     base: BaseMotion | None = eqx.field(static=True, default=None)
+    unbalance: float | None = eqx.field(static=True, default=None)  # kg m
 
     @property
     def force_unit(self) -> str:
-        """Unit of what drives it: newtons, or m/s² of a base."""
-        return "N" if self.base is None else "m/s²"
+        """Unit of what drives it: newtons, m/s² of a base, or a number of unbalances."""
+        return drive_unit(self.base, self.unbalance)
 
     @property
     def slow_period(self) -> Float[np.ndarray, " point"]:
@@ -294,6 +296,7 @@ def _as_result(torus: TorusBalance, points: np.ndarray, status: TorusEnd) -> Qua
         status=status,
         sensors=modes.sensors,
         base=modes.base,
+        unbalance=None if modes.unbalance is None else float(modes.unbalance),
     )
 
 
