@@ -69,7 +69,11 @@ class LinearModes(AbstractShown):
         for k in range(min(self.n_modes, _SHOWN)):
             hertz, ratio = self.natural_frequency.item(k) / HERTZ, self.damping_ratio[k]
             chosen = ", of interest" if k == self.mode_of_interest else ""
-            lines.append(f"mode {k + 1}: {hertz:.6g} Hz, damping {100 * ratio:.3g} %{chosen}")
+            std = float(self.damping_ratio_std[k])
+            known = f" ± {100 * std:.1g}" if std > 0 else ""
+            lines.append(
+                f"mode {k + 1}: {hertz:.6g} Hz, damping {100 * ratio:.3g}{known} %{chosen}"
+            )
         if self.n_modes > _SHOWN:
             lines.append(f"… and {self.n_modes - _SHOWN} more")
         if self.base is not None:

@@ -30,9 +30,9 @@ def parameter_names(model: Structure) -> tuple[str, ...]:
     """Names of the numbers of a model: of its potential, its modes and its effects.
 
     Names such as "potential.1111", "mode_1.natural_frequency" (rad/s), "mode_1.damping_ratio",
-    "mode_1.participation" (kg^-1/2), "unbalance_kg_m" and "quadratic_damping.coefficient"; of several effects of a
-    kind the second is "quadratic_damping_2". The values of a law at its knots are
-    "stiffness_law.restoring_force_1" and so on; the knots themselves are no parameters, nor are
+    "mode_1.participation" (kg^-1/2), "unbalance_kg_m" and "quadratic_damping.coefficient"; of
+    several effects of a kind the second is "quadratic_damping_2". The values of a law at its knots
+    are "stiffness_law.restoring_force_1" and so on; the knots themselves are no parameters, nor are
     other arrays.
 
     >>> from snrmjax.model import curved_beam

@@ -68,8 +68,9 @@ def simulate_responses(
     """Responses to harmonic forces, around folds and with unstable parts.
 
     Arguments: `forces` in N, or multiples of the model's unbalance; `harmonics` that are balanced;
-    `isolated` also searches for curves that are not connected to the one from rest; `follow` kinds of events that are followed as the
-    `parameter` goes from its value to `to`, and back where it turns (see `follow_event`);
+    `isolated` also searches for curves that are not connected to the one from rest; `follow` kinds
+    of events that are followed as the `parameter` goes from its value to `to`, and back where it
+    turns (see `follow_event`);
     `quasi_periodic` follows the motions with two frequencies from every Neimark-Sacker point;
     `progress` is told each force when it begins.
     Raises `ValueError` as `forced_response` and `follow_event` do, where no curve has a point,

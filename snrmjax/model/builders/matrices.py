@@ -1,6 +1,7 @@
 """Structures from their mass, damping and stiffness matrices."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,7 +11,7 @@ import scipy.sparse.linalg
 from jaxtyping import Float
 
 from snrmjax.model.effect_base import AbstractEffect, AbstractForce, checked_effects
-from snrmjax.model.modes import Beside, RigidBodyModes, linear_modes
+from snrmjax.model.modes import Beside, LinearModesStd, RigidBodyModes, linear_modes
 from snrmjax.model.moving_base import BaseMotion
 from snrmjax.model.places import Row, row_over_points
 from snrmjax.model.structures import Structure, structure
@@ -26,6 +27,12 @@ _DEPENDENT = 1e-10  # of its length: what is left of a vector that others alread
 _DENSE = 2000  # unknowns, above which only the wanted modes are computed
 _OVERDAMPED = 0.99  # damping ratio, beyond which the rest counts as coupling
 _NO_COUPLING = 1e-12  # of the damping of both modes
+_ROUNDED = 2e-15  # of its parts: rounding of a damping made from mass and stiffness
+_ENTRIES, _TRIALS = 100_000, 200  # looked at, and pairs of them that are tried, for that
+_LOST, _NOTED = 1e-3, 1e-6  # of a modal damping, to rounding of the entries: refused, stated
+_LOWEST, _CAUTION = 10, 5.0  # modes that lose most; the error over what two ways differ by
+_CANCELLED = 1e-8  # of a modal damping: what rounding may do to it
+_SLICES = 3  # of the digits of numbers that are multiplied without rounding
 
 Phasor = float | complex
 
@@ -114,18 +121,18 @@ def from_matrices(
                 "rigid-body mode: support the structure, by soft springs where it hangs free."
             )
     omega = np.sqrt(squared)
-    ratio, coupling = _damping(damping, shapes, omega)
+    ratio, coupling, ratio_std = _damping(damping, m, k, shapes, omega)
     watched = tuple(sensors) if sensors is not None else names
-    for sensor in watched:
-        _place(names, sensor, "`sensors`")
-    seen = [names.index(sensor) for sensor in watched]
-    other = {n: shapes[i] for i, n in enumerate(names) if n not in set(watched)}
+    seen = np.array(_places(names, watched, "`sensors`"))
+    unseen = np.setdiff1d(np.arange(size), seen).tolist()
+    other = {names[i]: shapes[i] for i in unseen}
     acting = load @ shapes
     modes = linear_modes(
         *(omega, ratio, shapes[seen], acting.real),
         sensors=watched,
         mode_of_interest=mode_of_interest,
         rigid_body=RigidBodyModes(rigid[seen], (load @ rigid).real),
+        std=LinearModesStd(damping_ratio=ratio_std),
         beside=Beside(
             other, coupling, -acting.imag if np.any(acting.imag) else None, base, unbalance
         ),
@@ -144,8 +151,7 @@ def _load(
         raise ValueError("a structure has either a `force` or a `base` that moves.")
     if base is None:
         return _column(names, force or {}, "`force`")
-    for point, _ in base.along:
-        _place(names, point, "the base's `along`")
+    _places(names, [point for point, _ in base.along], "the base's `along`")
     return -(mass @ base.cosines(names))
 
 
@@ -168,24 +174,26 @@ def _checked(name: str, matrix: Any) -> Any:
 def _check_names(names: tuple[str, ...], size: int) -> None:
     if len(names) != size:
         raise ValueError(f"`points` names {len(names)} points, but there are {size} unknowns.")
-    for name in names:
-        if names.count(name) > 1:
-            raise ValueError(f"`points` names {name!r} twice.")
+    name, count = Counter(names).most_common(1)[0]
+    if count > 1:
+        raise ValueError(f"`points` names {name!r} twice.")
 
 
-def _place(names: tuple[str, ...], point: str, what: str) -> int:
-    if point not in names:
-        near = suggestion(point, names) or f"; known are {', '.join(names[:12])}"
-        raise ValueError(f"{what} names the point {point!r}, which does not exist{near}.")
-    return names.index(point)
+def _places(names: tuple[str, ...], points: Iterable[str], what: str) -> list[int]:
+    """Where points are among the unknowns."""
+    place = {name: k for k, name in enumerate(names)}
+    for point in points:
+        if point not in place:
+            near = suggestion(point, names) or f"; known are {', '.join(names[:12])}"
+            raise ValueError(f"{what} names the point {point!r}, which does not exist{near}.")
+    return [place[point] for point in points]
 
 
 def _column(names: tuple[str, ...], at: str | Mapping[str, Phasor] | Row, what: str) -> np.ndarray:
     """Weights of all unknowns; complex of a force with phases."""
-    pairs = at.items() if isinstance(at, Mapping) else row_over_points(at)
+    weights = dict(at.items() if isinstance(at, Mapping) else row_over_points(at))
     column = np.zeros(len(names), dtype=complex)
-    for point, weight in pairs:
-        column[_place(names, point, what)] += weight
+    column[_places(names, weights, what)] = list(weights.values())
     return column if np.any(column.imag) else column.real
 
 
@@ -223,12 +231,17 @@ def _lowest_modes(m: Any, k: Any, wanted: int) -> tuple[np.ndarray, np.ndarray]:
     A shift as large as the lowest natural frequency squared loses no digits of it; one that is far
     larger, as entries of a fine mesh suggest, loses all.
     """
-    mass, stiffness = scipy.sparse.csc_matrix(m), scipy.sparse.csc_matrix(k)
-    entries = abs(stiffness.diagonal()).min() / abs(mass.diagonal()).max()
-    shifts = [0.0] if _regular(stiffness) else [-1e-3 * entries]
+    entries = abs(k.diagonal()).min() / abs(m.diagonal()).max()
+    shifts, inverse = [0.0], _Inverse(k)
+    if not inverse.regular:
+        shifts = [-1e-3 * entries]
     for _ in range(_PASSES):
         try:
-            squared, shapes = scipy.sparse.linalg.eigsh(stiffness, wanted, mass, sigma=shifts[-1])
+            solve = inverse if not shifts[-1] else _Inverse(k - shifts[-1] * m)
+            operator = scipy.sparse.linalg.LinearOperator(k.shape, solve.solve)
+            squared, shapes = scipy.sparse.linalg.eigsh(
+                k, wanted, m, sigma=shifts[-1], OPinv=operator
+            )
         except RuntimeError as error:
             raise ValueError(
                 "the lowest modes are lost to rounding: the mesh is too fine for these matrices, "
@@ -241,13 +254,25 @@ def _lowest_modes(m: Any, k: Any, wanted: int) -> tuple[np.ndarray, np.ndarray]:
     return squared, shapes
 
 
-def _regular(stiffness: Any) -> bool:
-    """Whether a stiffness has an inverse: no motion without a force."""
-    try:
-        pivots = np.abs(scipy.sparse.linalg.splu(stiffness).U.diagonal())
-    except RuntimeError:  # exactly singular
-        return False
-    return bool(pivots.min() > _ROUNDING * pivots.max())
+class _Inverse:
+    """A factorised symmetric matrix, dense or sparse."""
+
+    def __init__(self, matrix: Any) -> None:
+        self.solve: Callable[[np.ndarray], np.ndarray] = lambda right: np.full_like(right, np.nan)
+        if scipy.sparse.issparse(matrix):
+            try:
+                factors = scipy.sparse.linalg.splu(matrix)
+            except RuntimeError:  # exactly singular
+                self.regular = False
+                return
+            self.solve, pivots = factors.solve, factors.U.diagonal()
+        else:
+            upper, order, _ = scipy.linalg.lapack.dgetrf(matrix)
+            self.solve = lambda right: scipy.linalg.lapack.dgetrs(upper, order, right)[0]
+            pivots = np.diag(upper)
+        size = np.abs(pivots)
+        # A motion without a force leaves a pivot of rounding.
+        self.regular = bool(size.min() > _ROUNDING * size.max())
 
 
 def _dense(matrix: Any) -> np.ndarray:
@@ -268,10 +293,14 @@ def _with_residuals(
     kept = np.concatenate([rigid, shapes], axis=1)
     columns = np.stack(loads, axis=1)
     columns = columns - m @ (kept @ (kept.T @ columns))  # nothing that the kept modes carry
-    if scipy.sparse.issparse(k):
-        ways = scipy.sparse.linalg.splu(k).solve(columns)
-    else:
-        ways = scipy.linalg.lstsq(k, columns)[0]  # singular where rigid-body modes exist
+    stiffness, loads = k, columns
+    if rigid.shape[1]:  # further equations fix the rigid motion, which these loads do not drive
+        held = m @ rigid * (np.abs(k.diagonal()).max() / np.abs(m @ rigid).max())
+        sparse = scipy.sparse.issparse(k)
+        rows = [[k, held], [held.T, None if sparse else np.zeros((rigid.shape[1],) * 2)]]
+        stiffness = scipy.sparse.block_array(rows, format="csc") if sparse else np.block(rows)
+        loads = np.pad(columns, ((0, rigid.shape[1]), (0, 0)))
+    ways = _Inverse(stiffness).solve(loads)[: len(shapes)]
     vectors = np.zeros((len(shapes), 0))
     for way in ways.T:
         left = way
@@ -288,22 +317,146 @@ def _with_residuals(
 
 
 def _damping(
-    damping: Any, shapes: np.ndarray, omega: np.ndarray
-) -> tuple[np.ndarray, np.ndarray | None]:
-    """Damping ratios, and what of the modal damping matrix they do not hold."""
+    damping: Any, mass: Any, stiffness: Any, shapes: np.ndarray, omega: np.ndarray
+) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
+    """Damping ratios, what of the modal damping matrix they do not hold, and 1σ of the ratios."""
     if damping is None or (np.ndim(damping) == 0 and not scipy.sparse.issparse(damping)):
-        return np.full(omega.shape, 0.0 if damping is None else float(damping)), None
+        ratio = np.full(omega.shape, 0.0 if damping is None else float(damping))
+        return ratio, None, np.zeros(omega.shape)
     whole = _checked("damping", damping)
     if whole.shape[0] != len(shapes):
         raise ValueError(
             f"`damping` has shape {whole.shape}, but there are {len(shapes)} unknowns."
         )
-    modal = shapes.T @ (whole @ shapes)
+    # What is proportional to mass and stiffness is known from the frequencies. As a product with
+    # the shapes it would be a small difference of large numbers on a fine mesh.
+    by_mass, by_stiffness, rest = _proportional(whole, mass, stiffness)
+    modal = np.diag(by_mass + by_stiffness * omega**2) + _modal(rest, shapes)
     own = np.diag(modal)
     ratio = np.minimum(own / (2 * omega), _OVERDAMPED)
+    std = np.zeros(len(own))
+    if by_mass and by_stiffness:
+        some = slice(_LOWEST)
+        std[some] = ratio[some] * _rounding(_modal(whole, shapes[:, some]), own[some])
     rest = modal - np.diag(2 * ratio * omega)
     least = _NO_COUPLING * np.sqrt(np.abs(np.outer(own, own)))
-    return ratio, rest if np.any(np.abs(rest) > least) else None
+    return ratio, rest if np.any(np.abs(rest) > least) else None, std
+
+
+def _rounding(product: np.ndarray, own: np.ndarray) -> np.ndarray:
+    """1σ of modal dampings, relative, of a damping matrix whose entries have lost digits of them.
+
+    That of a sum of mass and stiffness of a fine mesh has: its product with the shapes then differs
+    from the damping by what of it is proportional. Refused where little is left.
+    """
+    miss = np.abs(np.diag(product) / own - 1)
+    if np.max(miss) > _LOST:
+        raise ValueError(
+            f"the damping of mode {int(np.argmax(miss)) + 1} is lost to rounding in `damping`: the "
+            "mesh is too fine for a sum of mass and stiffness. Give a damping ratio instead, or a "
+            "multiple of the stiffness alone, which is exact."
+        )
+    return np.where(miss > _NOTED, _CAUTION * miss, 0.0)
+
+
+def _proportional(damping: Any, mass: Any, stiffness: Any) -> tuple[float, float, Any]:
+    """a and b of the part a M + b K of a damping matrix, and the rest without what is rounding.
+
+    The simplest pair that most entries agree with to rounding: b alone, a alone, both. Where none
+    is, both are zero.
+    """
+    row, column = (abs(damping) + abs(mass) + abs(stiffness)).nonzero()
+    draw = np.random.default_rng(0)
+    if len(row) > _ENTRIES:
+        some = draw.choice(len(row), _ENTRIES, replace=False)
+        some = np.append(some, np.flatnonzero(row == column))
+        row, column = row[some], column[some]
+    c, m, k = (np.asarray(part[row, column]).ravel() for part in (damping, mass, stiffness))
+    for a, b in _candidates(c, m, k, draw):
+        rest = damping - a * mass - b * stiffness
+        size = abs(damping.diagonal()) + abs(a * mass.diagonal()) + abs(b * stiffness.diagonal())
+        rounding = _ROUNDED * np.sqrt(size)
+        left = np.asarray(rest[row, column]).ravel()
+        if np.count_nonzero(np.abs(left) > rounding[row] * np.sqrt(size[column])) < 0.5 * len(c):
+            if scipy.sparse.issparse(rest):
+                rest = rest.tocoo()
+                kept = np.abs(rest.data) > rounding[rest.row] * np.sqrt(size[rest.col])
+                at = (rest.row[kept], rest.col[kept])
+                return a, b, scipy.sparse.csr_array((rest.data[kept], at), rest.shape)
+            return a, b, np.where(np.abs(rest) > rounding[:, None] * np.sqrt(size), rest, 0.0)
+    return 0.0, 0.0, damping
+
+
+def _candidates(
+    c: np.ndarray, m: np.ndarray, k: np.ndarray, draw: np.random.Generator
+) -> Iterator[tuple[float, float]]:
+    """Pairs a, b of c = a m + b k: by b alone, by a alone, by both as most entries have it."""
+    yield 0.0, float(np.median(c[k != 0] / k[k != 0])) if np.any(k) else 0.0
+    yield float(np.median(c[m != 0] / m[m != 0])), 0.0
+    best, agreed = None, 0
+    for one, two in draw.integers(0, len(c), (_TRIALS, 2)):
+        determinant = m[one] * k[two] - m[two] * k[one]
+        if abs(determinant) <= 1e-6 * (abs(m[one] * k[two]) + abs(m[two] * k[one])):
+            continue
+        a = (c[one] * k[two] - c[two] * k[one]) / determinant
+        b = (m[one] * c[two] - m[two] * c[one]) / determinant
+        size = np.abs(c) + np.abs(a * m) + np.abs(b * k)
+        same = (np.abs(c - a * m - b * k) <= 1e-8 * size) & (size > 0)
+        if np.count_nonzero(same) > agreed:
+            best, agreed = (same, size), np.count_nonzero(same)
+    if best is not None:
+        same, size = best
+        rows = np.stack([m[same], k[same]], axis=1) / size[same, None]
+        length = np.linalg.norm(rows, axis=0)
+        a, b = np.linalg.lstsq(rows / length, c[same] / size[same], rcond=1e-15)[0] / length
+        yield float(a), float(b)
+
+
+def _modal(matrix: Any, shapes: np.ndarray) -> np.ndarray:
+    """ΦᵀAΦ, the products AΦ to more than double precision where large terms cancel in them."""
+    if not (matrix.nnz if scipy.sparse.issparse(matrix) else np.any(matrix)):
+        return np.zeros((shapes.shape[1],) * 2)
+    product = matrix @ shapes
+    terms = np.sum(np.abs(shapes) * (abs(matrix) @ np.abs(shapes)), axis=0)
+    cancel = np.finfo(float).eps * terms > _CANCELLED * np.abs(np.sum(shapes * product, axis=0))
+    if np.any(cancel):
+        product[:, cancel] = _exact_product(matrix, shapes[:, cancel])
+    return shapes.T @ product
+
+
+def _exact_product(matrix: Any, columns: np.ndarray) -> np.ndarray:
+    """A matrix times columns, as sums of products that are exact.
+
+    Both are cut into slices of so few binary digits that sums of their products have no rounding.
+    Reference: Ozaki et al., Numer. Algorithms 59 (2012) 95, doi:10.1007/s11075-011-9478-1.
+    """
+    sparse = scipy.sparse.issparse(matrix)
+    terms = int((matrix != 0).sum(axis=1).max())
+    digits = (53 - int(np.ceil(np.log2(terms + 1)))) // 2
+
+    def slices(values: np.ndarray, largest: np.ndarray) -> list[np.ndarray]:
+        """The values, by slices of so many digits below the power of two above the largest."""
+        unit = 2.0 ** np.ceil(np.log2(np.where(largest > 0, largest, 1.0)))
+        parts = []
+        for number in range(1, _SLICES + 1):
+            step = unit * 2.0 ** (-digits * number)
+            parts.append(np.round(values / step) * step)
+            values = values - parts[-1]
+        return parts
+
+    if sparse:
+        rows = matrix.tocsr()
+        largest = abs(rows).max(axis=1).toarray().ravel()
+        of_entry = np.repeat(largest, np.diff(rows.indptr))
+        left = [
+            scipy.sparse.csr_array((data, rows.indices, rows.indptr), rows.shape)
+            for data in slices(rows.data, of_entry)
+        ]
+    else:
+        left = slices(matrix, np.abs(matrix).max(axis=1, keepdims=True))
+    right = slices(columns, np.abs(columns).max(axis=0))
+    pairs = [(i, j) for i in range(_SLICES) for j in range(_SLICES - i)]
+    return sum(left[i] @ right[j] for i, j in sorted(pairs, key=sum, reverse=True))
 
 
 def chain(
@@ -388,6 +541,6 @@ def beam(
     points = tuple(names[k] for k in keep)
     damping = mass_damping * mass + stiffness_damping * stiffness
     for point, value in (springs or {}).items():
-        place = _place(points, point, "`springs`")
+        (place,) = _places(points, [point], "`springs`")
         stiffness[place, place] += value
     return Matrices(mass, damping, stiffness, points)

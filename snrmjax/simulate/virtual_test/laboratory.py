@@ -134,7 +134,7 @@ class Laboratory(eqx.Module):
             )
         if self.structure.modes.unbalance is not None:
             raise ValueError(
-                "the virtual laboratory drives by a shaker, but the model is driven by an unbalance."
+                "the virtual laboratory drives by a shaker, but an unbalance drives the model."
             )
         if self.structure.hysteretic and not self.largest_displacement > 0:
             kinds = ", ".join(effect.kind for effect in self.structure.hysteretic)
