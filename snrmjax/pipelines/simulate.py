@@ -29,6 +29,7 @@ from snrmjax.simulate.solutions.quasi_periodic import (
 )
 
 _TRUNCATED = 0.02  # share of the velocity that harmonics left out may have, without a note
+_KNOWN_DAMPING = 1e-5  # relative 1σ of a damping ratio, above which it is said
 _SAME_EVENT = 1e-6  # of the frequency, between an event of a response and a curve of events
 _ENDS = (CurveStatus.UPPER_END, CurveStatus.LOWER_END)
 
@@ -90,7 +91,7 @@ def simulate_responses(
     model = dataclasses.replace(model, modes=model.modes.with_first_sensor(sensor))
     hold = friction_hold(model, *ends)
     curves: list[ResponseCurve] = []
-    notes = list(_notes_on_equilibria(model))
+    notes = [*_notes_on_equilibria(model), *_notes_on_damping(model, ends)]
     for force in forces:
         progress(force)
         main = forced_response(model, [force], *ends, harmonic_order=harmonics)
@@ -266,6 +267,16 @@ def _notes_on_curve(curve: ResponseCurve, hold: Hold | None) -> Iterator[Fact]:
     unknown = int(np.sum(curve.stability == int(Stability.NOT_COMPUTED)))
     if unknown:
         yield Fact("stability_not_computed", **at, n=unknown)
+
+
+def _notes_on_damping(model: Structure, ends: tuple[float, float]) -> Iterator[Fact]:
+    """Modes in a range whose damping the model does not know well."""
+    modes = model.modes
+    for k in range(modes.n_modes):
+        std, ratio = modes.damping_ratio_std.item(k), modes.damping_ratio.item(k)
+        inside = ends[0] <= modes.natural_frequency.item(k) <= ends[1]
+        if inside and std > _KNOWN_DAMPING * ratio and not np.any(modes.natural_frequency_std):
+            yield Fact("damping_not_known", mode=k + 1, relative_std=std / ratio if ratio else 1.0)
 
 
 def _notes_on_equilibria(model: Structure) -> tuple[Fact, ...]:

@@ -27,10 +27,10 @@ _DEPENDENT = 1e-10  # of its length: what is left of a vector that others alread
 _DENSE = 2000  # unknowns, above which only the wanted modes are computed
 _OVERDAMPED = 0.99  # damping ratio, beyond which the rest counts as coupling
 _NO_COUPLING = 1e-12  # of the damping of both modes
-_ROUNDED = 2e-15  # of its parts: rounding of a damping made from mass and stiffness
+_ROUNDED = (4e-16, 2e-15)  # of its parts, for one and for two: what rounding makes of a damping
 _ENTRIES, _TRIALS = 100_000, 200  # looked at, and pairs of them that are tried, for that
-_LOST, _NOTED = 1e-3, 1e-6  # of a modal damping, to rounding of the entries: refused, stated
-_LOWEST, _CAUTION = 10, 5.0  # modes that lose most; the error over what two ways differ by
+_NOTED = 1e-6  # of a modal damping, the rounding of entries that is stated as its 1σ
+_LOWEST, _CAUTION = 10, 0.5  # modes that lose most; the error over the sum of all roundings
 _CANCELLED = 1e-8  # of a modal damping: what rounding may do to it
 _SLICES = 3  # of the digits of numbers that are multiplied without rounding
 
@@ -334,35 +334,29 @@ def _damping(
     modal = np.diag(by_mass + by_stiffness * omega**2) + _modal(rest, shapes)
     own = np.diag(modal)
     ratio = np.minimum(own / (2 * omega), _OVERDAMPED)
-    std = np.zeros(len(own))
-    if by_mass and by_stiffness:
-        some = slice(_LOWEST)
-        std[some] = ratio[some] * _rounding(_modal(whole, shapes[:, some]), own[some])
+    std, some = np.zeros(len(own)), slice(_LOWEST)
+    miss = _rounding(whole if by_mass and by_stiffness else rest, shapes[:, some]) / (
+        2 * omega[some]
+    )
+    std[some] = np.where(miss > _NOTED * ratio[some], miss, 0.0)
     rest = modal - np.diag(2 * ratio * omega)
     least = _NO_COUPLING * np.sqrt(np.abs(np.outer(own, own)))
     return ratio, rest if np.any(np.abs(rest) > least) else None, std
 
 
-def _rounding(product: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """1σ of modal dampings, relative, of a damping matrix whose entries have lost digits of them.
+def _rounding(matrix: Any, shapes: np.ndarray) -> np.ndarray:
+    """1σ of modal dampings, 1/s, by the rounding of a matrix's entries.
 
-    That of a sum of mass and stiffness of a fine mesh has: its product with the shapes then differs
-    from the damping by what of it is proportional. Refused where little is left.
+    A sum of mass and stiffness of a fine mesh keeps few digits of them, whatever computes them.
     """
-    miss = np.abs(np.diag(product) / own - 1)
-    if np.max(miss) > _LOST:
-        raise ValueError(
-            f"the damping of mode {int(np.argmax(miss)) + 1} is lost to rounding in `damping`: the "
-            "mesh is too fine for a sum of mass and stiffness. Give a damping ratio instead, or a "
-            "multiple of the stiffness alone, which is exact."
-        )
-    return np.where(miss > _NOTED, _CAUTION * miss, 0.0)
+    terms = np.sum(np.abs(shapes) * (abs(matrix) @ np.abs(shapes)), axis=0)
+    return _CAUTION * np.finfo(float).eps * terms
 
 
 def _proportional(damping: Any, mass: Any, stiffness: Any) -> tuple[float, float, Any]:
     """a and b of the part a M + b K of a damping matrix, and the rest without what is rounding.
 
-    The simplest pair that most entries agree with to rounding: b alone, a alone, both. Where none
+    The simplest pair that nine entries of ten have, to rounding: b alone, a alone, both. Where none
     is, both are zero.
     """
     row, column = (abs(damping) + abs(mass) + abs(stiffness)).nonzero()
@@ -375,9 +369,9 @@ def _proportional(damping: Any, mass: Any, stiffness: Any) -> tuple[float, float
     for a, b in _candidates(c, m, k, draw):
         rest = damping - a * mass - b * stiffness
         size = abs(damping.diagonal()) + abs(a * mass.diagonal()) + abs(b * stiffness.diagonal())
-        rounding = _ROUNDED * np.sqrt(size)
+        rounding = _ROUNDED[bool(a and b)] * np.sqrt(size)
         left = np.asarray(rest[row, column]).ravel()
-        if np.count_nonzero(np.abs(left) > rounding[row] * np.sqrt(size[column])) < 0.5 * len(c):
+        if np.count_nonzero(np.abs(left) > rounding[row] * np.sqrt(size[column])) < 0.1 * len(c):
             if scipy.sparse.issparse(rest):
                 rest = rest.tocoo()
                 kept = np.abs(rest.data) > rounding[rest.row] * np.sqrt(size[rest.col])

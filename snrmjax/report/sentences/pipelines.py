@@ -157,6 +157,11 @@ SENTENCES: dict[str, Wording] = {
     "hidden_branch": _hidden_branch,
     "element_idle": _element_idle,
     "held_by_friction": _held,
+    "damping_not_known": (
+        "the damping ratio of mode {mode} is known to ± {relative_std:%.1g} (1σ) only, and so is a "
+        "peak there: stated in the model, or entries of its damping matrix are rounded (of a fine "
+        "mesh give `damping_ratio`, or a multiple of the stiffness)."
+    ),
     "curve_ended": _ended,
     "curve_events_not_located": _not_located,
     "stability_not_computed": (
