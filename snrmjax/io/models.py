@@ -321,6 +321,8 @@ def _row(table: TomlTable, side: str = "") -> Row | None:
         two = table.entries[pair]
         if not isinstance(two, list) or len(two) != 2 or not all(isinstance(p, str) for p in two):
             raise table.refusal(pair, "two points", two)
+        if two[0] == two[1]:
+            raise table.refusal(pair, "two different points", two)
         return between(*two)
     at = table.entries.get(one)
     if at is None or isinstance(at, str):

@@ -98,7 +98,7 @@ def from_matrices(
     if k.shape != m.shape:
         raise ValueError(f"`mass` has shape {m.shape}, but `stiffness` has {k.shape}.")
     names = tuple(points) if points is not None else tuple(f"x{i + 1}" for i in range(size))
-    _check_names(names, size)
+    check_names(names, size)
     made = checked_effects(effects)
     forces = [effect for effect in made if isinstance(effect, AbstractForce)]
     places = dict.fromkeys(row for e in forces for row in e.rows if row is not None)
@@ -110,7 +110,7 @@ def from_matrices(
         squared, shapes = _with_residuals(k, m, squared, shapes, rigid, parts)
     if not squared.size or not np.any(load @ shapes):
         raise ValueError(
-            "`force` acts where no mode of the structure moves."
+            "the force acts where no mode of the structure moves."
             if base is None
             else "the base moves no mode of the structure."
         )
@@ -171,7 +171,8 @@ def _checked(name: str, matrix: Any) -> Any:
     return values.toarray() if sparse and values.shape[0] <= _DENSE else values
 
 
-def _check_names(names: tuple[str, ...], size: int) -> None:
+def check_names(names: Sequence[str], size: int) -> None:
+    """Refuse names of points that are not as many as unknowns, or not different."""
     if len(names) != size:
         raise ValueError(f"`points` names {len(names)} points, but there are {size} unknowns.")
     name, count = Counter(names).most_common(1)[0]
