@@ -1,9 +1,11 @@
 """Models: a structure in and out, as TOML."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import jax
 import numpy as np
+import scipy.linalg
 import tomli_w
 
 from snrmjax.io.files import FilePath, file_name, read_text, shown, write_atomically
@@ -13,6 +15,7 @@ from snrmjax.io.units import DEGREE, HERTZ, in_unit
 from snrmjax.model.effect_base import AbstractEffect, AbstractForce
 from snrmjax.model.effect_metadata import Entries
 from snrmjax.model.effects import SURFACES, effect_class, known_effects, make_effect
+from snrmjax.model.free_coordinates import felt_first
 from snrmjax.model.modes import (
     UNSTATED_MODAL_MASS_STD,
     Beside,
@@ -106,7 +109,7 @@ def _read(text: str, file: str, path: Path) -> Structure:
         made = structure_of_matrices(top, file, path.parent, effects)
         modes, potential = made.modes, made.potential
     else:
-        modes = _modes(top, file)
+        modes = _modes(top, file, effects)
         potential = _potential(top.table("potential", f"[potential] of {file}"), modes.n_modes)
         for k, effect in enumerate(effects, 1):
             rows = effect.rows if isinstance(effect, AbstractForce) else ()
@@ -138,7 +141,7 @@ def _numbers(table: TomlTable, required: _Rules, optional: _Rules) -> dict[str, 
     return {key: table.number(key, *rules[key]) for key in rules if key in table.entries}
 
 
-def _modes(top: TomlTable, file: str) -> LinearModes:
+def _modes(top: TomlTable, file: str, effects: Sequence[AbstractEffect]) -> LinearModes:
     tables, rigid_tables = top.tables("mode", file), top.tables("rigid_body_mode", file)
     flexible = [_numbers(table, _MODE, _MODE_STD | _MODE_FURTHER) for table in tables]
     rigid = [_numbers(table, _RIGID_BODY_MODE, {}) for table in rigid_tables]
@@ -178,6 +181,17 @@ def _modes(top: TomlTable, file: str) -> LinearModes:
     base = moving_base(top, file)
     if base is not None and rigid_tables:
         raise ValueError(f"{file} has both [base] and [[rigid_body_mode]]: a base holds it.")
+    n, participation = len(flexible), np.array([m["participation"] for m in (*flexible, *rigid)])
+    # Rigid-body modes that elements hold are modes too, of zero frequency.
+    felt = _felt(effects, sensors, mode_shape[:, n:])
+    turn, n_free = felt_first(felt, np.abs(mode_shape[:, n:]).max(axis=0, initial=0.0))
+    mode_shape[:, n:] = mode_shape[:, n:] @ turn
+    participation[n:] = participation[n:] @ turn
+    coupling = _coupling(top, n, len(rigid))
+    if coupling is not None:
+        whole = scipy.linalg.block_diag(np.eye(n), turn)
+        coupling = (whole.T @ coupling @ whole)[: n + n_free, : n + n_free]
+    n_modes = n + n_free
     names, watched = sensors, listed_sensors(top, file)
     if watched is not None:
         for sensor in watched:
@@ -192,27 +206,25 @@ def _modes(top: TomlTable, file: str) -> LinearModes:
     mode_shape = mode_shape[seen]
 
     def stds(key: str, default: float = 0.0) -> list[float]:
-        return [mode.get(key, default) for mode in flexible]
+        return [mode.get(key, default) for mode in flexible] + [default] * n_free
 
     known_mass = any("modal_mass_std" in mode for mode in flexible)
     return linear_modes(
-        [mode["frequency_hz"] * HERTZ for mode in flexible],
-        [mode["damping_ratio"] for mode in flexible],
-        mode_shape[:, : len(flexible)],
-        [mode["participation"] for mode in flexible],
+        [*(mode["frequency_hz"] * HERTZ for mode in flexible), *[0.0] * n_free],
+        [*(mode["damping_ratio"] for mode in flexible), *[0.0] * n_free],
+        mode_shape[:, :n_modes],
+        participation[:n_modes],
         sensors=sensors,
         mode_of_interest=of_interest - 1,
-        rigid_body=RigidBodyModes(
-            mode_shape[:, len(flexible) :], np.array([mode["participation"] for mode in rigid])
-        ),
+        rigid_body=RigidBodyModes(mode_shape[:, n_modes:], participation[n_modes:]),
         std=LinearModesStd(
             [std * HERTZ for std in stds("frequency_std_hz")],
             stds("damping_ratio_std"),
             stds("modal_mass_std", UNSTATED_MODAL_MASS_STD) if known_mass else None,
         ),
         beside=Beside(
-            {name: row[: len(flexible)].tolist() for name, row in others.items()},
-            _coupling(top, len(flexible)),
+            {name: row[:n_modes].tolist() for name, row in others.items()},
+            coupling,
             lag if any(lag := stds("participation_lag")) else None,
             base,
             _unbalance(top, file),
@@ -235,21 +247,28 @@ def _unbalance(top: TomlTable, file: str) -> float | None:
     return table.number("unbalance_kg_m", POSITIVE)
 
 
-def _coupling(top: TomlTable, n_modes: int) -> np.ndarray | None:
-    """Damping between modes, 1/s."""
+def _felt(effects: Sequence[AbstractEffect], names: Sequence[str], rigid: np.ndarray) -> np.ndarray:
+    """What every element feels of rigid-body modes with shapes at named points."""
+    forces = [effect for effect in effects if isinstance(effect, AbstractForce)]
+    rows = [dict(row) for force in forces for row in force.rows if row is not None]
+    weights = np.array([[row.get(name, 0.0) for name in names] for row in rows])
+    return weights.reshape(-1, len(names)) @ rigid
+
+
+def _coupling(top: TomlTable, n_modes: int, n_rigid: int) -> np.ndarray | None:
+    """Damping between modes, 1/s; of rigid-body modes behind the others, zero where not stated."""
     if "damping_coupling" not in top.entries:
         return None
-    rows = top.entries["damping_coupling"]
-    if not isinstance(rows, list) or len(rows) != n_modes:
+    rows, whole = top.entries["damping_coupling"], n_modes + n_rigid
+    if not isinstance(rows, list) or len(rows) not in (n_modes, whole):
         raise top.refusal("damping_coupling", f"{n_modes} rows of numbers, one a mode", rows)
-    return np.array(
-        [
-            TomlTable({"damping_coupling": row}, f"{top.place}, row {k},").numbers(
-                "damping_coupling", each="mode", count=n_modes
-            )
-            for k, row in enumerate(rows, 1)
-        ]
-    )
+    coupling = [
+        TomlTable({"damping_coupling": row}, f"{top.place}, row {k},").numbers(
+            "damping_coupling", each="mode", count=len(rows)
+        )
+        for k, row in enumerate(rows, 1)
+    ]
+    return np.pad(np.array(coupling), (0, whole - len(rows)))
 
 
 def _shape(mode: TomlTable) -> TomlTable:
@@ -358,7 +377,9 @@ def _entries(model: Structure) -> dict[str, object]:
         return dict(zip(names, np.asarray(of).tolist(), strict=False))
 
     flexible: list[dict[str, object]] = []
-    for k in range(modes.n_modes):
+    own = np.flatnonzero(modes.natural_frequency).tolist()
+    free = np.flatnonzero(np.asarray(modes.natural_frequency) == 0).tolist()
+    for k in own:
         stds = {
             "frequency_std_hz": in_unit(modes.natural_frequency_std.item(k), HERTZ),
             "damping_ratio_std": modes.damping_ratio_std.item(k),
@@ -375,6 +396,8 @@ def _entries(model: Structure) -> dict[str, object]:
             entry["participation_lag"] = modes.participation_lag.item(k)
         flexible.append({**entry, "shape": shape(shapes[:, k])})
     rigid = [
+        {"participation": modes.participation.item(k), "shape": shape(shapes[:, k])} for k in free
+    ] + [
         {"participation": float(participation), "shape": shape(modes.rigid_body_shape[:, k])}
         for k, participation in enumerate(modes.rigid_body_participation)
     ]
@@ -411,7 +434,7 @@ def _entries(model: Structure) -> dict[str, object]:
         else {"unbalance_kg_m": _one("unbalance", modes.unbalance)},
         "damping_coupling": []
         if modes.damping_coupling is None
-        else np.asarray(modes.damping_coupling).tolist(),
+        else np.pad(modes.damping_coupling, (0, len(rigid) - len(free))).tolist(),
     }
     return {name: value for name, value in parts.items() if value not in ([], {})}
 

@@ -13,7 +13,7 @@ from snrmjax.model.moving_base import BaseMotion
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.names import suggestion
 from snrmjax.numerics.result import AbstractShown
-from snrmjax.numerics.rules import BELOW_ONE, POSITIVE, require
+from snrmjax.numerics.rules import BELOW_ONE, NOT_NEGATIVE, POSITIVE, require
 from snrmjax.numerics.units import HERTZ
 
 _SHOWN = 12  # modes, in a text
@@ -32,7 +32,7 @@ class LinearModes(AbstractShown):
     `mode_of_interest` counts from zero; files count from one.
     """
 
-    natural_frequency: Float[Array, " mode"]  # rad/s
+    natural_frequency: Float[Array, " mode"]  # rad/s; 0 of what elements alone hold, as the last
     damping_ratio: Float[Array, " mode"]  # fraction of critical
     mode_shape: Float[Array, "sensor mode"]  # kg^-1/2
     participation: Float[Array, " mode"]  # Φᵀb per newton of the recorded force, kg^-1/2
@@ -67,6 +67,9 @@ class LinearModes(AbstractShown):
         count = f"{self.n_modes} mode{'s' if self.n_modes > 1 else ''}"
         lines = [f"LinearModes: {count}{beside} at {', '.join(self.sensors)}"]
         for k in range(min(self.n_modes, _SHOWN)):
+            if not self.natural_frequency[k]:
+                lines.append(f"mode {k + 1}: no linear stiffness, held by elements alone")
+                continue
             hertz, ratio = self.natural_frequency.item(k) / HERTZ, self.damping_ratio[k]
             chosen = ", of interest" if k == self.mode_of_interest else ""
             std = float(self.damping_ratio_std[k])
@@ -246,7 +249,8 @@ def linear_modes(
         raise ValueError(
             f"`mode_of_interest` must lie between 0 and {n_modes - 1}, but is {mode_of_interest}."
         )
-    require("`natural_frequency`", frequency, POSITIVE)
+    require("`natural_frequency`", frequency, NOT_NEGATIVE)
+    require("`natural_frequency` of the mode of interest", frequency[mode_of_interest], POSITIVE)
     require("`damping_ratio`", damping, BELOW_ONE)
     shapes, participations = rigid_body or RigidBodyModes(np.zeros((n_sensors, 0)), [])
     rigid_shape = _numbers(shapes)

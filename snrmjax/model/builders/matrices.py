@@ -11,6 +11,7 @@ import scipy.sparse.linalg
 from jaxtyping import Float
 
 from snrmjax.model.effect_base import AbstractEffect, AbstractForce, checked_effects
+from snrmjax.model.free_coordinates import felt_first
 from snrmjax.model.modes import Beside, LinearModesStd, RigidBodyModes, linear_modes
 from snrmjax.model.moving_base import BaseMotion
 from snrmjax.model.places import Row, row_over_points
@@ -77,14 +78,15 @@ def from_matrices(
     the force one vector more: what the left out modes give way there statically, exactly, as
     further modes of high frequency; without `residuals` it does not, as many places want it.
     `sensors` are the points that are watched, by default all.
-    Damping that couples modes is kept. Modes without stiffness become rigid-body modes.
+    Damping that couples modes is kept. Modes without stiffness become rigid-body modes; those that
+    an effect acts on become modes of zero frequency, behind the others: what elements alone hold,
+    as an absorber without a linear spring.
 
     Returns a `Structure`. What `n_modes` leaves out is the dynamics of higher modes: a share of
     about (Ω/ω)² of their static part, ω being the first frequency left out, for each harmonic Ω.
     Raises `ValueError` for matrices that are not square, finite, symmetric, or of different sizes,
     a mass that is not positive definite, a stiffness that is negative, unknown or repeated points,
-    a force or base that moves no mode, both or none of them, and an effect that acts on a
-    rigid-body mode.
+    a force or base that moves no mode, and both or none of them.
     Reference: MacNeal, Comput. Struct. 1 (1971) 581, doi:10.1016/0045-7949(71)90031-9.
 
     >>> from snrmjax.model.effects import make_effect
@@ -108,18 +110,18 @@ def from_matrices(
     if n_modes is not None and residuals:
         parts = [*rows, load.real, *([load.imag] if np.any(load.imag) else [])]
         squared, shapes = _with_residuals(k, m, squared, shapes, rigid, parts)
-    if not squared.size or not np.any(load @ shapes):
+    n_flexible = len(squared)
+    if rigid.shape[1] and rows:
+        # What only elements hold moves with them, as an absorber without a linear spring does.
+        turn, n_free = felt_first(np.stack(rows) @ rigid, np.abs(rigid).max(axis=0))
+        free, rigid = np.split(rigid @ turn, [n_free], axis=1)
+        squared, shapes = np.pad(squared, (0, n_free)), np.concatenate([shapes, free], axis=1)
+    if not n_flexible or not np.any(load @ shapes):
         raise ValueError(
             "the force acts where no mode of the structure moves."
             if base is None
             else "the base moves no mode of the structure."
         )
-    for place, row in zip(places, rows, strict=True):
-        if np.any(np.abs(row @ rigid) > 1e-9 * np.linalg.norm(rigid, axis=0)):
-            raise ValueError(
-                f"an effect acts at {' and '.join(point for point, _ in place)}, which moves in a "
-                "rigid-body mode: support the structure, by soft springs where it hangs free."
-            )
     omega = np.sqrt(squared)
     ratio, coupling, ratio_std = _damping(damping, m, k, shapes, omega)
     watched = tuple(sensors) if sensors is not None else names
@@ -232,7 +234,8 @@ def _lowest_modes(m: Any, k: Any, wanted: int) -> tuple[np.ndarray, np.ndarray]:
     A shift as large as the lowest natural frequency squared loses no digits of it; one that is far
     larger, as entries of a fine mesh suggest, loses all.
     """
-    entries = abs(k.diagonal()).min() / abs(m.diagonal()).max()
+    springs = abs(k.diagonal())
+    entries = springs[springs > 0].min() / abs(m.diagonal()).max()
     shifts, inverse = [0.0], _Inverse(k)
     if not inverse.regular:
         shifts = [-1e-3 * entries]
@@ -322,7 +325,7 @@ def _damping(
 ) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
     """Damping ratios, what of the modal damping matrix they do not hold, and 1σ of the ratios."""
     if damping is None or (np.ndim(damping) == 0 and not scipy.sparse.issparse(damping)):
-        ratio = np.full(omega.shape, 0.0 if damping is None else float(damping))
+        ratio = np.where(omega > 0, 0.0 if damping is None else float(damping), 0.0)
         return ratio, None, np.zeros(omega.shape)
     whole = _checked("damping", damping)
     if whole.shape[0] != len(shapes):
@@ -334,11 +337,10 @@ def _damping(
     by_mass, by_stiffness, rest = _proportional(whole, mass, stiffness)
     modal = np.diag(by_mass + by_stiffness * omega**2) + _modal(rest, shapes)
     own = np.diag(modal)
-    ratio = np.minimum(own / (2 * omega), _OVERDAMPED)
+    twice = np.where(omega > 0, 2 * omega, np.inf)
+    ratio = np.minimum(own / twice, _OVERDAMPED)
     std, some = np.zeros(len(own)), slice(_LOWEST)
-    miss = _rounding(whole if by_mass and by_stiffness else rest, shapes[:, some]) / (
-        2 * omega[some]
-    )
+    miss = _rounding(whole if by_mass and by_stiffness else rest, shapes[:, some]) / twice[some]
     std[some] = np.where(miss > _NOTED * ratio[some], miss, 0.0)
     rest = modal - np.diag(2 * ratio * omega)
     least = _NO_COUPLING * np.sqrt(np.abs(np.outer(own, own)))

@@ -350,7 +350,8 @@ def _solve_batch(
     def solved(force: Array, frequency: Array, start: Array) -> tuple[Array, Array]:
         # A guess of zero is allowed: the static displacement keeps the unknowns of order one.
         static = newtons(model.modes, frequency, force) * model.modes.participation
-        static = static / model.modes.natural_frequency**2
+        squared = model.modes.natural_frequency**2
+        static = jnp.where(squared > 0, static / jnp.where(squared > 0, squared, 1.0), 0.0)
         scale = jnp.maximum(jnp.max(jnp.abs(start)), jnp.max(jnp.abs(static)))
         balance = harmonic_balance(
             model, force, scale, harmonic_order=harmonic_order, n_samples=n_samples
