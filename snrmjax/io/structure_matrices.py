@@ -48,7 +48,7 @@ def structure_of_matrices(
         parts |= _arrays(folder / table.text("file"), table)
     in_files = [key for key in _MATRICES if isinstance(parts.get(key), str)]
     for key in in_files:
-        parts[key] = _sparse_file(folder / parts[key], key, table)
+        parts[key] = _sparse_file(folder / table.text(key), key, table)
     if "damping" in parts and "damping_ratio" in parts:
         raise ValueError(f"{table.place} has both `damping` and `damping_ratio`.")
     for key in ("mass", "stiffness", *(() if in_files else ("points",))):

@@ -346,7 +346,8 @@ def equilibria(model: Structure, *, n_starts: int = 512, seed: int = 0) -> list[
         candidates, tolerance = _equilibria_by_newton(model, n_starts, seed)
     distinct: list[Equilibrium] = []
     free = bool(np.any(squared == 0))
-    if free and not np.any(np.asarray(model.memoryless_force(np.zeros((1, n)), np.zeros((1, n))))):
+    rest = jnp.zeros((1, n))
+    if free and not np.any(np.asarray(model.memoryless_force(rest, rest))):
         candidates = np.concatenate([np.zeros((1, n)), candidates])  # Newton's method creeps there
     for q in sorted(candidates, key=lambda row: float(np.linalg.norm(row))):
         if any(np.linalg.norm(q - e.displacement) <= tolerance for e in distinct):

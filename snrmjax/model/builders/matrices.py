@@ -297,14 +297,15 @@ def _with_residuals(
     kept = np.concatenate([rigid, shapes], axis=1)
     columns = np.stack(loads, axis=1)
     columns = columns - m @ (kept @ (kept.T @ columns))  # nothing that the kept modes carry
-    stiffness, loads = k, columns
+    stiffness: Any = k
+    right = columns
     if rigid.shape[1]:  # further equations fix the rigid motion, which these loads do not drive
         held = m @ rigid * (np.abs(k.diagonal()).max() / np.abs(m @ rigid).max())
         sparse = scipy.sparse.issparse(k)
         rows = [[k, held], [held.T, None if sparse else np.zeros((rigid.shape[1],) * 2)]]
         stiffness = scipy.sparse.block_array(rows, format="csc") if sparse else np.block(rows)
-        loads = np.pad(columns, ((0, rigid.shape[1]), (0, 0)))
-    ways = _Inverse(stiffness).solve(loads)[: len(shapes)]
+        right = np.pad(columns, ((0, rigid.shape[1]), (0, 0)))
+    ways = _Inverse(stiffness).solve(right)[: len(shapes)]
     vectors = np.zeros((len(shapes), 0))
     for way in ways.T:
         left = way
@@ -400,7 +401,7 @@ def _candidates(
         size = np.abs(c) + np.abs(a * m) + np.abs(b * k)
         same = (np.abs(c - a * m - b * k) <= 1e-8 * size) & (size > 0)
         if np.count_nonzero(same) > agreed:
-            best, agreed = (same, size), np.count_nonzero(same)
+            best, agreed = (same, size), int(np.count_nonzero(same))
     if best is not None:
         same, size = best
         rows = np.stack([m[same], k[same]], axis=1) / size[same, None]
