@@ -9,13 +9,19 @@ import scipy.linalg
 import tomli_w
 
 from snrmjax.io.files import FilePath, file_name, read_text, shown, write_atomically
-from snrmjax.io.structure_matrices import listed_sensors, moving_base, structure_of_matrices
+from snrmjax.io.structure_matrices import (
+    felt_by_elements,
+    listed_sensors,
+    moving_base,
+    structure_of_matrices,
+    unbalance,
+)
 from snrmjax.io.toml_table import TomlTable, parsed_toml
 from snrmjax.io.units import DEGREE, HERTZ, in_unit
+from snrmjax.model.builders.free_coordinates import felt_first
 from snrmjax.model.effect_base import AbstractEffect, AbstractForce
 from snrmjax.model.effect_metadata import Entries
 from snrmjax.model.effects import SURFACES, effect_class, known_effects, make_effect
-from snrmjax.model.free_coordinates import felt_first
 from snrmjax.model.modes import (
     UNSTATED_MODAL_MASS_STD,
     Beside,
@@ -183,7 +189,7 @@ def _modes(top: TomlTable, file: str, effects: Sequence[AbstractEffect]) -> Line
         raise ValueError(f"{file} has both [base] and [[rigid_body_mode]]: a base holds it.")
     n, participation = len(flexible), np.array([m["participation"] for m in (*flexible, *rigid)])
     # Rigid-body modes that elements hold are modes too, of zero frequency.
-    felt = _felt(effects, sensors, mode_shape[:, n:])
+    felt = felt_by_elements(effects, sensors, mode_shape[:, n:])
     turn, n_free = felt_first(felt, np.abs(mode_shape[:, n:]).max(axis=0, initial=0.0))
     mode_shape[:, n:] = mode_shape[:, n:] @ turn
     participation[n:] = participation[n:] @ turn
@@ -227,32 +233,9 @@ def _modes(top: TomlTable, file: str, effects: Sequence[AbstractEffect]) -> Line
             coupling,
             lag if any(lag := stds("participation_lag")) else None,
             base,
-            _unbalance(top, file),
+            unbalance(top, file),
         ),
     )
-
-
-def _unbalance(top: TomlTable, file: str) -> float | None:
-    """The unbalance of [force], kg m; None where a force drives the modes."""
-    if "force" not in top.entries:
-        return None
-    table = top.table("force", f"[force] of {file}")
-    if "at" in table.entries:
-        raise ValueError(
-            f"{file} has `at` of [force] without [structure]: modes have participations."
-        )
-    if "base" in top.entries:
-        raise ValueError(f"{file} has both [force] and [base]: a force or a base that moves.")
-    table.check_keys(("unbalance_kg_m",))
-    return table.number("unbalance_kg_m", POSITIVE)
-
-
-def _felt(effects: Sequence[AbstractEffect], names: Sequence[str], rigid: np.ndarray) -> np.ndarray:
-    """What every element feels of rigid-body modes with shapes at named points."""
-    forces = [effect for effect in effects if isinstance(effect, AbstractForce)]
-    rows = [dict(row) for force in forces for row in force.rows if row is not None]
-    weights = np.array([[row.get(name, 0.0) for name in names] for row in rows])
-    return weights.reshape(-1, len(names)) @ rigid
 
 
 def _coupling(top: TomlTable, n_modes: int, n_rigid: int) -> np.ndarray | None:

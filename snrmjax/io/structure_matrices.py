@@ -3,7 +3,7 @@
 import dataclasses
 import io
 import zipfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -128,6 +128,31 @@ def moving_base(top: TomlTable, file: str) -> BaseMotion | None:
     along = table.table("along", f"`along` of {table.place}") if "along" in table.entries else None
     cosines = {} if along is None else {point: along.number(point) for point in along.entries}
     return base_motion(motion, cosines)
+
+
+def unbalance(top: TomlTable, file: str) -> float | None:
+    """The unbalance of [force], kg m; None where a force drives the modes."""
+    if "force" not in top.entries:
+        return None
+    table = top.table("force", f"[force] of {file}")
+    if "at" in table.entries:
+        raise ValueError(
+            f"{file} has `at` of [force] without [structure]: modes have participations."
+        )
+    if "base" in top.entries:
+        raise ValueError(f"{file} has both [force] and [base]: a force or a base that moves.")
+    table.check_keys(("unbalance_kg_m",))
+    return table.number("unbalance_kg_m", POSITIVE)
+
+
+def felt_by_elements(
+    effects: Sequence[AbstractEffect], names: Sequence[str], rigid: np.ndarray
+) -> np.ndarray:
+    """What every element feels of rigid-body modes with shapes at named points."""
+    forces = [effect for effect in effects if isinstance(effect, AbstractForce)]
+    rows = [dict(row) for force in forces for row in force.rows if row is not None]
+    weights = np.array([[row.get(name, 0.0) for name in names] for row in rows])
+    return weights.reshape(-1, len(names)) @ rigid
 
 
 def listed_sensors(top: TomlTable, file: str) -> list[str] | None:

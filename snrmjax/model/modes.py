@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Shaped
 
-from snrmjax.model.moving_base import BaseMotion
+from snrmjax.model.moving_base import BaseMotion, drive_unit
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.names import suggestion
 from snrmjax.numerics.result import AbstractShown
@@ -397,25 +397,6 @@ def linear_response(
     return jnp.einsum("...m,sm->...s", modal, modes.mode_shape) + _rigid_body_velocity(
         modes, frequency, force
     )
-
-
-def newtons(
-    modes: LinearModes,
-    frequency: Float[Array | np.ndarray, "*batch"] | float,
-    force: Float[Array | np.ndarray, "*batch"] | float,
-) -> Any:
-    """The force (N) at a frequency Ω (rad/s): of a multiple c of an unbalance U it is c U Ω².
-
-    A force, and a base's acceleration in its place, is what it is at every frequency.
-    """
-    return force if modes.unbalance is None else force * modes.unbalance * frequency**2
-
-
-def drive_unit(base: BaseMotion | None, unbalance: Any = None) -> str:
-    """Unit of what drives a structure: newtons, m/s² of a base, or an unbalance (kg m)."""
-    if unbalance is not None:
-        return f"× {float(unbalance):.6g} kg m"
-    return "N" if base is None else "m/s²"
 
 
 def phasor_of_load(modes: LinearModes) -> Complex[Array, " mode"]:

@@ -16,7 +16,8 @@ from jaxtyping import Array, Float, Int
 from snrmjax.model.averaging import AveragedForce
 from snrmjax.model.effect_base import AbstractHysteresis, AbstractKinked
 from snrmjax.model.elements import AlikeForces, elements_of
-from snrmjax.model.modes import newtons, phasor_of_load
+from snrmjax.model.modes import phasor_of_load
+from snrmjax.model.moving_base import newtons
 from snrmjax.model.structures import Structure, linear_terms_of
 from snrmjax.numerics.compiled import as_numpy, compiled
 from snrmjax.simulate.balance.harmonics import (
@@ -85,7 +86,7 @@ class HarmonicBalance(eqx.Module):
 
     def newtons(self, omega: Float[Array, ""]) -> Any:
         """The force (N) at a scaled frequency; see `newtons` of modes."""
-        return newtons(self.model.modes, omega * self.frequency_scale, self.force)
+        return newtons(self.model.modes.unbalance, omega * self.frequency_scale, self.force)
 
     def load(self) -> Float[Array, " equation"]:
         """Scaled force of one newton: the right-hand side where `newtons` is 1."""
@@ -306,7 +307,7 @@ def linear_coefficients(
 ) -> Float[Array, "coefficient mode"]:
     """Displacement coefficients of the linear response: where a forced response starts."""
     terms = model.linear_terms()
-    load = newtons(model.modes, frequency, force) * phasor_of_load(model.modes)
+    load = newtons(model.modes.unbalance, frequency, force) * phasor_of_load(model.modes)
     stiffness = terms.stiffness - terms.mass * frequency**2 + 1j * terms.damping * frequency
     if terms.coupling is None:
         phasor = load / stiffness
@@ -329,7 +330,9 @@ def resonance_displacement(
     terms = linear_terms_of(model)
     mass, damping, stiffness = (np.asarray(part) for part in terms[:3])
     omega = np.sqrt(stiffness / mass)
-    load = np.abs(newtons(model.modes, omega, force) * np.asarray(phasor_of_load(model.modes)))
+    load = np.abs(
+        newtons(model.modes.unbalance, omega, force) * np.asarray(phasor_of_load(model.modes))
+    )
     springs = stiffness > 0
     scale = float(np.max(load[springs] / stiffness[springs], initial=0.0))
     for mode in resonant_modes(model, within):

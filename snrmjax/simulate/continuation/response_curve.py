@@ -9,8 +9,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from snrmjax.model.modes import drive_unit
-from snrmjax.model.moving_base import BaseMotion
+from snrmjax.model.moving_base import BaseMotion, drive_unit
 from snrmjax.numerics.blocks import by_member, mapped, taken
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting

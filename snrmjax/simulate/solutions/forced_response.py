@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from snrmjax.model.modes import STILL, newtons
+from snrmjax.model.modes import STILL
+from snrmjax.model.moving_base import newtons
 from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.numerics.blocks import mapped, taken
 from snrmjax.numerics.compiled import compiled
@@ -288,7 +289,7 @@ def _ends_near_rest(balances: HarmonicBalance, member: int, curve: TracedCurve) 
         np.asarray(part)[member, some] for part in (modes.natural_frequency, modes.damping_ratio)
     )
     omega = float(curve.points[-1, -1] * balances.frequency_scale[member])
-    force = newtons(taken(modes, member), omega, float(balances.force[member]))
+    force = newtons(taken(modes, member).unbalance, omega, float(balances.force[member]))
     load = force * drive[some]
     linear = load / (natural**2 - omega**2 + 2j * damping * natural * omega)
     x = curve.points[-1, :-1].reshape(balances.n_coefficients, -1)[1:3, some]
@@ -349,7 +350,7 @@ def _solve_batch(
 
     def solved(force: Array, frequency: Array, start: Array) -> tuple[Array, Array]:
         # A guess of zero is allowed: the static displacement keeps the unknowns of order one.
-        static = newtons(model.modes, frequency, force) * model.modes.participation
+        static = newtons(model.modes.unbalance, frequency, force) * model.modes.participation
         squared = model.modes.natural_frequency**2
         static = jnp.where(squared > 0, static / jnp.where(squared > 0, squared, 1.0), 0.0)
         scale = jnp.maximum(jnp.max(jnp.abs(start)), jnp.max(jnp.abs(static)))

@@ -7,8 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from snrmjax.model.modes import drive_unit
-from snrmjax.model.moving_base import BaseMotion
+from snrmjax.model.moving_base import BaseMotion, drive_unit
 from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.result import AbstractResult, quantity, setting

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from snrmjax.model.modes import newtons
+from snrmjax.model.moving_base import newtons
 from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.numerics.compiled import jitted
 from snrmjax.numerics.result import AbstractResult, Variable
@@ -240,7 +240,7 @@ def _stepped(
     def dwell(point: CyclePoint, step: tuple[Array, Array]) -> tuple[CyclePoint, IntegratedMotion]:
         frequency, order = step
         now = eqx.tree_at(lambda m: m.test_order, model, order)
-        acting = newtons(model.modes, frequency, force)
+        acting = newtons(model.modes.unbalance, frequency, force)
         settled = _settle(now, acting, frequency, point, harmonic_order, settings)
         end = settled.point
         motion = IntegratedMotion(
