@@ -348,7 +348,8 @@ def equilibria(model: Structure, *, n_starts: int = 512, seed: int = 0) -> list[
     free = bool(np.any(squared == 0))
     rest = jnp.zeros((1, n))
     if free and not np.any(np.asarray(model.memoryless_force(rest, rest))):
-        candidates = np.concatenate([np.zeros((1, n)), candidates])  # Newton's method creeps there
+        # Newton's method creeps to a rest without a slope, and ends near it.
+        candidates, tolerance = np.concatenate([np.zeros((1, n)), candidates]), 1e4 * tolerance
     for q in sorted(candidates, key=lambda row: float(np.linalg.norm(row))):
         if any(np.linalg.norm(q - e.displacement) <= tolerance for e in distinct):
             continue
