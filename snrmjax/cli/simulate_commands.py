@@ -15,15 +15,6 @@ _FOLLOWED = "Events over a parameter"
 
 def simulate(
     model: Model,
-    force: Annotated[
-        list[float],
-        typer.Option(
-            help="Peak amplitude of the harmonic force in N, or of the base's acceleration in m/s² "
-            "where the model has a base that moves; give it again for further ones.",
-            metavar="N",
-            show_default=False,
-        ),
-    ],
     from_hz: Annotated[
         float,
         typer.Option(help="Lowest frequency of the force in Hz.", metavar="HZ", show_default=False),
@@ -35,6 +26,16 @@ def simulate(
         ),
     ],
     out: Out,
+    force: Annotated[
+        list[float] | None,
+        typer.Option(
+            help="Peak amplitude of the harmonic force in N; where the model has a base that "
+            "moves, of its acceleration in m/s²; where it has an unbalance, how many times that "
+            "of the model (once, if not given). Give it again for further ones.",
+            metavar="N",
+            show_default=False,
+        ),
+    ] = None,
     harmonics: Harmonics = 9,
     isolated: Annotated[
         bool,
@@ -97,15 +98,18 @@ def simulate(
             "`--from-hz` must be above zero and below `--to-hz`, but they are "
             f"{from_hz:g} and {to_hz:g} Hz."
         )
-    require_positive("--force", force, "N")
+    structure = read_model(model)
+    if force is None and structure.modes.unbalance is None:
+        raise ValueError("`--force` must be given: the amplitude of the force in N.")
+    loads = force or [1.0]
+    require_positive("--force", loads, structure.modes.force_unit)
     if follow and to is None:
         raise ValueError("`--follow` needs `--to`, the value that the parameter goes to.")
     if follow is None and (to is not None or parameter != "force"):
         raise ValueError("`--parameter` and `--to` need `--follow`, the kind of event.")
-    structure = read_model(model)
     with staged(out) as folder:
         found = simulate_responses(
-            *(structure, force, from_hz, to_hz),
+            *(structure, loads, from_hz, to_hz),
             harmonics=harmonics,
             isolated=isolated,
             follow=[] if follow is None else [follow],

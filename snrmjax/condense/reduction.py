@@ -5,7 +5,6 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -18,8 +17,6 @@ from snrmjax.numerics.facts import Fact
 
 ASSUMED_DAMPING = 0.01
 """Damping ratio of a mode of which nobody stated one: no finite-element model has it."""
-
-_TINY = 1e-12  # of the largest participation: what a model file needs instead of zero
 
 
 class ShapeLines(NamedTuple):
@@ -52,14 +49,11 @@ class ReductionSource(NamedTuple):
 
     def structure(self, condensation: Condensation) -> Structure:
         """The reduced model as a structure that a model file can hold."""
-        traced = isinstance(self.participation, jax.core.Tracer)
-        xp: Any = jnp if traced else np
-        size = xp.abs(self.participation)
-        # A file has no zeros here; a mode that the force does not drive gets next to nothing.
-        least = _TINY * xp.where(size.max() > 0, size.max(), 1.0)
-        driven = xp.where(size > 0, self.participation, least)
         return condensation.structure(
-            self.damping_ratio, sensors=self.sensors, participation=driven, name=self.name
+            self.damping_ratio,
+            sensors=self.sensors,
+            participation=self.participation,
+            name=self.name,
         )
 
 

@@ -86,7 +86,7 @@ def is_ours(names: Iterable[str]) -> bool:
     } <= {*names}
 
 
-def read_header(cells: Cells) -> Header:
+def read_header(cells: Cells, *, force_known: bool = False) -> Header:
     """The columns of a steady-state table.
 
     Raises `ValueError` for a missing or wrongly suffixed column.
@@ -109,14 +109,14 @@ def read_header(cells: Cells) -> Header:
                 f"the column `{shortened_name(name)}` of {file} is not one of the format: "
                 f"expected `{expected}`."
             )
-    _require(used, further, file)
+    _require(used, further, file, force_known)
     for name in further:
         near = near_miss(name, sorted(_KNOWN - used), cutoff=0.8) or ""
         notes.append(Fact("column_not_used", name=shortened_name(name), file=file, near=near))
     return Header(frozenset(used), _harmonic_orders(used, file), tuple(notes))
 
 
-def _require(used: set[str], further: list[str], file: str) -> None:
+def _require(used: set[str], further: list[str], file: str, force_known: bool) -> None:
     """Refuse a header that lacks a column or has both force and drive."""
 
     def instead(name: str) -> str:
@@ -131,7 +131,7 @@ def _require(used: set[str], further: list[str], file: str) -> None:
     _require_base(used, forces, file)
     if BASE[0] in used:
         return
-    if not forces:
+    if not forces and not force_known:
         near = instead("force_n") or instead("drive_v")
         raise ValueError(f"{file} lacks the column `force_n` or `drive_v`{near}.")
     if len(forces) == 2:

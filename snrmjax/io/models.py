@@ -1,15 +1,24 @@
 """Models: a structure in and out, as TOML."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import jax
 import numpy as np
+import scipy.linalg
 import tomli_w
 
 from snrmjax.io.files import FilePath, file_name, read_text, shown, write_atomically
-from snrmjax.io.structure_matrices import listed_sensors, moving_base, structure_of_matrices
+from snrmjax.io.structure_matrices import (
+    felt_by_elements,
+    listed_sensors,
+    moving_base,
+    structure_of_matrices,
+    unbalance,
+)
 from snrmjax.io.toml_table import TomlTable, parsed_toml
 from snrmjax.io.units import DEGREE, HERTZ, in_unit
+from snrmjax.model.builders.free_coordinates import felt_first
 from snrmjax.model.effect_base import AbstractEffect, AbstractForce
 from snrmjax.model.effect_metadata import Entries
 from snrmjax.model.effects import SURFACES, effect_class, known_effects, make_effect
@@ -31,7 +40,7 @@ from snrmjax.model.potential import (
 )
 from snrmjax.model.structures import Structure, structure
 from snrmjax.numerics.names import near_miss, suggestion
-from snrmjax.numerics.rules import BELOW_ONE, IN_RANGE_HZ, NOT_NEGATIVE, NOT_ZERO, POSITIVE, Rule
+from snrmjax.numerics.rules import BELOW_ONE, IN_RANGE_HZ, NOT_NEGATIVE, POSITIVE, Rule
 
 _TOP_KEYS = (
     *("name", "mode_of_interest", "mode", "rigid_body_mode", "damping_coupling"),
@@ -46,7 +55,7 @@ _MODE: _Rules = {
     "frequency_hz": (POSITIVE, IN_RANGE_HZ),
     "damping_ratio": (BELOW_ONE,),
     "shape": (),
-    "participation": (NOT_ZERO,),
+    "participation": (),
 }
 _MODE_STD: _Rules = {
     "frequency_std_hz": (NOT_NEGATIVE, IN_RANGE_HZ),
@@ -54,7 +63,7 @@ _MODE_STD: _Rules = {
     "modal_mass_std": (NOT_NEGATIVE,),
 }
 _MODE_FURTHER: _Rules = {"participation_lag": ()}
-_RIGID_BODY_MODE: _Rules = {"shape": (), "participation": (NOT_ZERO,)}
+_RIGID_BODY_MODE: _Rules = {"shape": (), "participation": ()}
 _MEASUREMENT: _Rules = dict.fromkeys(
     (
         *("level_gain_std", "level_phase_std_deg"),
@@ -106,9 +115,7 @@ def _read(text: str, file: str, path: Path) -> Structure:
         made = structure_of_matrices(top, file, path.parent, effects)
         modes, potential = made.modes, made.potential
     else:
-        if "force" in top.entries:
-            raise ValueError(f"{file} has [force] without [structure]: modes have participations.")
-        modes = _modes(top, file)
+        modes = _modes(top, file, effects)
         potential = _potential(top.table("potential", f"[potential] of {file}"), modes.n_modes)
         for k, effect in enumerate(effects, 1):
             rows = effect.rows if isinstance(effect, AbstractForce) else ()
@@ -140,7 +147,7 @@ def _numbers(table: TomlTable, required: _Rules, optional: _Rules) -> dict[str, 
     return {key: table.number(key, *rules[key]) for key in rules if key in table.entries}
 
 
-def _modes(top: TomlTable, file: str) -> LinearModes:
+def _modes(top: TomlTable, file: str, effects: Sequence[AbstractEffect]) -> LinearModes:
     tables, rigid_tables = top.tables("mode", file), top.tables("rigid_body_mode", file)
     flexible = [_numbers(table, _MODE, _MODE_STD | _MODE_FURTHER) for table in tables]
     rigid = [_numbers(table, _RIGID_BODY_MODE, {}) for table in rigid_tables]
@@ -172,9 +179,25 @@ def _modes(top: TomlTable, file: str) -> LinearModes:
             f"({of_interest}) is zero at every sensor."
         )
 
+    if not any(m["participation"] or m.get("participation_lag") for m in (*flexible, *rigid)):
+        raise ValueError(
+            f"{file} has no mode that the force moves: expected a `participation` other than zero "
+            "of one mode at least."
+        )
     base = moving_base(top, file)
     if base is not None and rigid_tables:
         raise ValueError(f"{file} has both [base] and [[rigid_body_mode]]: a base holds it.")
+    n, participation = len(flexible), np.array([m["participation"] for m in (*flexible, *rigid)])
+    # Rigid-body modes that elements hold are modes too, of zero frequency.
+    felt = felt_by_elements(effects, sensors, mode_shape[:, n:])
+    turn, n_free = felt_first(felt, np.abs(mode_shape[:, n:]).max(axis=0, initial=0.0))
+    mode_shape[:, n:] = mode_shape[:, n:] @ turn
+    participation[n:] = participation[n:] @ turn
+    coupling = _coupling(top, n, len(rigid))
+    if coupling is not None:
+        whole = scipy.linalg.block_diag(np.eye(n), turn)
+        coupling = (whole.T @ coupling @ whole)[: n + n_free, : n + n_free]
+    n_modes = n + n_free
     names, watched = sensors, listed_sensors(top, file)
     if watched is not None:
         for sensor in watched:
@@ -189,48 +212,46 @@ def _modes(top: TomlTable, file: str) -> LinearModes:
     mode_shape = mode_shape[seen]
 
     def stds(key: str, default: float = 0.0) -> list[float]:
-        return [mode.get(key, default) for mode in flexible]
+        return [mode.get(key, default) for mode in flexible] + [default] * n_free
 
     known_mass = any("modal_mass_std" in mode for mode in flexible)
     return linear_modes(
-        [mode["frequency_hz"] * HERTZ for mode in flexible],
-        [mode["damping_ratio"] for mode in flexible],
-        mode_shape[:, : len(flexible)],
-        [mode["participation"] for mode in flexible],
+        [*(mode["frequency_hz"] * HERTZ for mode in flexible), *[0.0] * n_free],
+        [*(mode["damping_ratio"] for mode in flexible), *[0.0] * n_free],
+        mode_shape[:, :n_modes],
+        participation[:n_modes],
         sensors=sensors,
         mode_of_interest=of_interest - 1,
-        rigid_body=RigidBodyModes(
-            mode_shape[:, len(flexible) :], np.array([mode["participation"] for mode in rigid])
-        ),
+        rigid_body=RigidBodyModes(mode_shape[:, n_modes:], participation[n_modes:]),
         std=LinearModesStd(
             [std * HERTZ for std in stds("frequency_std_hz")],
             stds("damping_ratio_std"),
             stds("modal_mass_std", UNSTATED_MODAL_MASS_STD) if known_mass else None,
         ),
         beside=Beside(
-            {name: row[: len(flexible)].tolist() for name, row in others.items()},
-            _coupling(top, len(flexible)),
+            {name: row[:n_modes].tolist() for name, row in others.items()},
+            coupling,
             lag if any(lag := stds("participation_lag")) else None,
             base,
+            unbalance(top, file),
         ),
     )
 
 
-def _coupling(top: TomlTable, n_modes: int) -> np.ndarray | None:
-    """Damping between modes, 1/s."""
+def _coupling(top: TomlTable, n_modes: int, n_rigid: int) -> np.ndarray | None:
+    """Damping between modes, 1/s; of rigid-body modes behind the others, zero where not stated."""
     if "damping_coupling" not in top.entries:
         return None
-    rows = top.entries["damping_coupling"]
-    if not isinstance(rows, list) or len(rows) != n_modes:
+    rows, whole = top.entries["damping_coupling"], n_modes + n_rigid
+    if not isinstance(rows, list) or len(rows) not in (n_modes, whole):
         raise top.refusal("damping_coupling", f"{n_modes} rows of numbers, one a mode", rows)
-    return np.array(
-        [
-            TomlTable({"damping_coupling": row}, f"{top.place}, row {k},").numbers(
-                "damping_coupling", each="mode", count=n_modes
-            )
-            for k, row in enumerate(rows, 1)
-        ]
-    )
+    coupling = [
+        TomlTable({"damping_coupling": row}, f"{top.place}, row {k},").numbers(
+            "damping_coupling", each="mode", count=len(rows)
+        )
+        for k, row in enumerate(rows, 1)
+    ]
+    return np.pad(np.array(coupling), (0, whole - len(rows)))
 
 
 def _shape(mode: TomlTable) -> TomlTable:
@@ -302,6 +323,8 @@ def _row(table: TomlTable, side: str = "") -> Row | None:
         two = table.entries[pair]
         if not isinstance(two, list) or len(two) != 2 or not all(isinstance(p, str) for p in two):
             raise table.refusal(pair, "two points", two)
+        if two[0] == two[1]:
+            raise table.refusal(pair, "two different points", two)
         return between(*two)
     at = table.entries.get(one)
     if at is None or isinstance(at, str):
@@ -337,7 +360,9 @@ def _entries(model: Structure) -> dict[str, object]:
         return dict(zip(names, np.asarray(of).tolist(), strict=False))
 
     flexible: list[dict[str, object]] = []
-    for k in range(modes.n_modes):
+    own = np.flatnonzero(modes.natural_frequency).tolist()
+    free = np.flatnonzero(np.asarray(modes.natural_frequency) == 0).tolist()
+    for k in own:
         stds = {
             "frequency_std_hz": in_unit(modes.natural_frequency_std.item(k), HERTZ),
             "damping_ratio_std": modes.damping_ratio_std.item(k),
@@ -354,6 +379,8 @@ def _entries(model: Structure) -> dict[str, object]:
             entry["participation_lag"] = modes.participation_lag.item(k)
         flexible.append({**entry, "shape": shape(shapes[:, k])})
     rigid = [
+        {"participation": modes.participation.item(k), "shape": shape(shapes[:, k])} for k in free
+    ] + [
         {"participation": float(participation), "shape": shape(modes.rigid_body_shape[:, k])}
         for k, participation in enumerate(modes.rigid_body_participation)
     ]
@@ -385,9 +412,12 @@ def _entries(model: Structure) -> dict[str, object]:
         "base": {}
         if modes.base is None
         else {"motion": modes.base.motion, "along": dict(modes.base.along)},
+        "force": {}
+        if modes.unbalance is None
+        else {"unbalance_kg_m": _one("unbalance", modes.unbalance)},
         "damping_coupling": []
         if modes.damping_coupling is None
-        else np.asarray(modes.damping_coupling).tolist(),
+        else np.pad(modes.damping_coupling, (0, len(rigid) - len(free))).tolist(),
     }
     return {name: value for name, value in parts.items() if value not in ([], {})}
 

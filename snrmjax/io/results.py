@@ -71,7 +71,8 @@ def write_response(
         "event": [event for c in curves for event in _events(c)],
         **named,
     }
-    write_table(path, load_named(columns, curves[0].force_unit if curves else "N"))
+    driven = (curves[0].force_unit, curves[0].unbalance) if curves else ("N",)
+    write_table(path, load_named(columns, *driven))
 
 
 def write_event_curves(
@@ -100,7 +101,7 @@ def write_event_curves(
         "velocity_peak_m_s": velocity_peaks(velocity),
         "event": [event for c in curves for event in c.event],
     }
-    write_table(path, load_named(columns, curves[0].force_unit))
+    write_table(path, load_named(columns, curves[0].force_unit, curves[0].unbalance))
 
 
 def write_quasi_periodic(
@@ -136,7 +137,7 @@ def write_quasi_periodic(
         "velocity_peak_m_s": joined("largest_velocity")[:, r],
         "modulation": joined("modulation"),
     }
-    write_table(path, load_named(columns, branches[0].force_unit))
+    write_table(path, load_named(columns, branches[0].force_unit, branches[0].unbalance))
 
 
 def _events(curve: ResponseCurve) -> list[str]:
@@ -185,12 +186,19 @@ def write_normal_mode(
     write_table(path, columns)
 
 
-def load_named(columns: Mapping[str, Any], unit: str) -> dict[str, Any]:
+def load_named(
+    columns: Mapping[str, Any], unit: str, unbalance: float | None = None
+) -> dict[str, Any]:
     """Columns, or entries of a summary, with the force by what it is.
 
     Arguments: `unit` of what drives the structure: in m/s², of a base, `force_n` is called
-    `base_acceleration_m_s2`.
+    `base_acceleration_m_s2`. With `unbalance` U (kg m) the forces are multiples of it: `force_n` is
+    then the force at each frequency, and `unbalance_kg_m` the unbalance.
     """
+    if unbalance is not None:
+        kg_m = unbalance * columns["force_n"]
+        force = kg_m * (HERTZ * columns["frequency_hz"]) ** 2
+        return {**columns, "force_n": force, "unbalance_kg_m": kg_m}
     name = "force_n" if unit == "N" else "base_acceleration_m_s2"
     return {name if key == "force_n" else key: value for key, value in columns.items()}
 
@@ -297,7 +305,8 @@ def write_coupled_prediction(
         "velocity_im_m_s": velocity.imag,
         "stable": np.concatenate([c.is_stable for c in curves]),
     }
-    write_table(path, load_named(columns, curves[0].force_unit if curves else "N"))
+    driven = (curves[0].force_unit, curves[0].unbalance) if curves else ("N",)
+    write_table(path, load_named(columns, *driven))
 
 
 def summarise(identification: "Identification", values: "BackboneValues") -> dict:

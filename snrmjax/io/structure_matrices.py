@@ -1,6 +1,9 @@
 """Structures of a model file that are given by matrices, under [structure]."""
 
-from collections.abc import Mapping
+import dataclasses
+import io
+import zipfile
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +15,16 @@ from jaxtyping import Float
 from snrmjax.io.files import shown
 from snrmjax.io.toml_table import TomlTable
 from snrmjax.io.units import DEGREE
-from snrmjax.model.builders.matrices import from_matrices
-from snrmjax.model.effect_base import AbstractEffect
+from snrmjax.model.builders.matrices import check_names, from_matrices
+from snrmjax.model.effect_base import AbstractEffect, AbstractForce
 from snrmjax.model.moving_base import MOTIONS, BaseMotion, base_motion
 from snrmjax.model.structures import Structure
-from snrmjax.numerics.rules import BELOW_ONE, NOT_ZERO
+from snrmjax.numerics.names import suggestion
+from snrmjax.numerics.rules import BELOW_ONE, NOT_ZERO, POSITIVE
 
 _MATRICES = ("mass", "stiffness", "damping")
+_SPARSE = ("data", "indices", "indptr", "row", "col", "offsets", "shape", "format")
+_UNREADABLE = (OSError, ValueError, KeyError, NotImplementedError, zipfile.BadZipFile)
 
 
 def structure_of_matrices(
@@ -27,7 +33,10 @@ def structure_of_matrices(
     """The structure of [structure], [force] or [base], and [sensors].
 
     Matrices stand in the table or in a file beside it: NPZ or MAT with arrays `mass`, `stiffness`,
-    `points` and perhaps `damping`. Raises `ValueError` that names file, table and key.
+    `points` and perhaps `damping`. A sparse one in an NPZ file is stored by the arrays of
+    `scipy.sparse.save_npz`, here `mass_data`, `mass_indices`, …; or each in a file of its own that
+    `save_npz` wrote, by its name: `mass = "mass.npz"`; their points are x1, x2, … where not named.
+    Raises `ValueError` that names file, table and key.
     """
     table = top.table("structure", f"[structure] of {file}")
     table.check_keys((), (*_MATRICES, "points", "file", "damping_ratio", "modes"))
@@ -37,34 +46,73 @@ def structure_of_matrices(
             if key in parts:
                 raise ValueError(f"{table.place} has both `file` and `{key}`.")
         parts |= _arrays(folder / table.text("file"), table)
+    in_files = [key for key in _MATRICES if isinstance(parts.get(key), str)]
+    for key in in_files:
+        parts[key] = _sparse_file(folder / table.text(key), key, table)
     if "damping" in parts and "damping_ratio" in parts:
         raise ValueError(f"{table.place} has both `damping` and `damping_ratio`.")
-    for key in ("mass", "stiffness", "points"):
+    for key in ("mass", "stiffness", *(() if in_files else ("points",))):
         if key not in parts:
             raise ValueError(f"{table.place} lacks the key `{key}`.")
     matrices = {key: _matrix(key, parts[key], table) for key in _MATRICES if key in parts}
-    points = parts["points"]
+    points = parts.get("points", [f"x{k + 1}" for k in range(matrices["mass"].shape[0])])
     if not isinstance(points, list) or not all(isinstance(p, str) and p.strip() for p in points):
         raise table.refusal("points", "a list of names, one for each unknown", points)
+    try:
+        check_names(points, matrices["mass"].shape[0])
+    except ValueError as error:
+        raise ValueError(f"{table.place} cannot be read: {error}") from error
     damping: Any = matrices.get("damping")
     if "damping_ratio" in parts:
         damping = table.number("damping_ratio", BELOW_ONE)
     base = moving_base(top, file)
     if base is not None and "force" in top.entries:
         raise ValueError(f"{file} has both [force] and [base]: a force or a base that moves.")
+    force = None if base else top.table("force", f"[force] of {file}")
+    at = {} if force is None else _force(force)
+    watched, n_modes = listed_sensors(top, file), None
+    if "modes" in parts:
+        n_modes = table.whole("modes", 1)
+        if n_modes > len(points):
+            raise table.refusal(
+                "modes", f"between 1 and {len(points)}, the number of unknowns", n_modes
+            )
+    _check_named(points, at, f"`at` in [force] of {file}")
+    _check_named(points, watched or (), f"`points` in [sensors] of {file}")
+    _check_named(points, dict(base.along if base else ()), f"`along` in [base] of {file}")
+    for k, effect in enumerate(effects, 1):
+        rows = effect.rows if isinstance(effect, AbstractForce) else ()
+        named = [point for row in rows if row is not None for point, _ in row]
+        _check_named(points, named, f"effect {k} of {file}")
     try:
-        return from_matrices(
+        made = from_matrices(
             *(matrices["mass"], damping, matrices["stiffness"], points),
-            force=None if base else _force(top.table("force", f"[force] of {file}")),
+            force=at or None,
             base=base,
+            unbalance=force.number("unbalance_kg_m", POSITIVE)
+            if force is not None and "unbalance_kg_m" in force.entries
+            else None,
             effects=effects,
-            n_modes=table.whole("modes", 1) if "modes" in parts else None,
-            mode_of_interest=top.whole("mode_of_interest", 1, 1) - 1,
-            sensors=listed_sensors(top, file),
+            n_modes=n_modes,
+            sensors=watched,
             name=top.text("name", folder.stem),
         )
     except ValueError as error:
         raise ValueError(f"{table.place} cannot be read: {error}") from error
+    of_interest = top.whole("mode_of_interest", 1, 1)
+    if of_interest > made.n_modes:
+        raise top.refusal(
+            "mode_of_interest", f"from 1 to the number of modes ({made.n_modes})", of_interest
+        )
+    chosen = dataclasses.replace(made.modes, mode_of_interest=of_interest - 1)
+    return dataclasses.replace(made, modes=chosen)
+
+
+def _check_named(points: list[str], named: Iterable[str], place: str) -> None:
+    for point in named:
+        if point not in points:
+            near = suggestion(point, points) or f"; known are {', '.join(points[:12])}"
+            raise ValueError(f"{place} names the point {shown(point)}, which does not exist{near}.")
 
 
 def moving_base(top: TomlTable, file: str) -> BaseMotion | None:
@@ -80,6 +128,31 @@ def moving_base(top: TomlTable, file: str) -> BaseMotion | None:
     along = table.table("along", f"`along` of {table.place}") if "along" in table.entries else None
     cosines = {} if along is None else {point: along.number(point) for point in along.entries}
     return base_motion(motion, cosines)
+
+
+def unbalance(top: TomlTable, file: str) -> float | None:
+    """The unbalance of [force], kg m; None where a force drives the modes."""
+    if "force" not in top.entries:
+        return None
+    table = top.table("force", f"[force] of {file}")
+    if "at" in table.entries:
+        raise ValueError(
+            f"{file} has `at` of [force] without [structure]: modes have participations."
+        )
+    if "base" in top.entries:
+        raise ValueError(f"{file} has both [force] and [base]: a force or a base that moves.")
+    table.check_keys(("unbalance_kg_m",))
+    return table.number("unbalance_kg_m", POSITIVE)
+
+
+def felt_by_elements(
+    effects: Sequence[AbstractEffect], names: Sequence[str], rigid: np.ndarray
+) -> np.ndarray:
+    """What every element feels of rigid-body modes with shapes at named points."""
+    forces = [effect for effect in effects if isinstance(effect, AbstractForce)]
+    rows = [dict(row) for force in forces for row in force.rows if row is not None]
+    weights = np.array([[row.get(name, 0.0) for name in names] for row in rows])
+    return weights.reshape(-1, len(names)) @ rigid
 
 
 def listed_sensors(top: TomlTable, file: str) -> list[str] | None:
@@ -105,10 +178,12 @@ def _arrays(path: Path, table: TomlTable) -> dict[str, Any]:
         raise table.refusal("file", "an .npz or .mat file", path.name)
     try:
         arrays = dict(reading(path))
-    except (OSError, ValueError, NotImplementedError) as error:
+    except _UNREADABLE as error:
         kind = f"an {path.suffix[1:].upper()} file of arrays (MAT up to version 7)"
         raise ValueError(
-            f"{shown(path.name)} of {table.place} cannot be read: it is not {kind}."
+            f"{shown(path.name)} of {table.place} cannot be read: it is not {kind}; a sparse "
+            "matrix, which `numpy.savez` keeps as an object, goes into a file of its own by "
+            '`scipy.sparse.save_npz`, and here by `mass = "mass.npz"`.'
         ) from error
     found = {key: arrays[key] for key in (*_MATRICES, "points") if key in arrays}
     if "points" in found:
@@ -119,9 +194,35 @@ def _arrays(path: Path, table: TomlTable) -> dict[str, Any]:
     return found
 
 
-def _of_npz(path: Path) -> Mapping[str, np.ndarray]:
+def _of_npz(path: Path) -> Mapping[str, Any]:
+    """The arrays of a file; those of a sparse matrix, by names that begin alike, as the matrix."""
     with np.load(path) as arrays:
-        return {key: arrays[key] for key in arrays.files}
+        found: dict[str, Any] = {key: arrays[key] for key in arrays.files}
+    for key in _MATRICES:
+        parts = {name: found[f"{key}_{name}"] for name in _SPARSE if f"{key}_{name}" in found}
+        if key not in found and "data" in parts:
+            # `save_npz` has another name for each: what it reads is what it wrote.
+            parts.setdefault("format", np.array("csr" if "indptr" in parts else "coo"))
+            file = io.BytesIO()
+            np.savez(file, **parts)
+            file.seek(0)
+            found[key] = scipy.sparse.load_npz(file)
+    return found
+
+
+def _sparse_file(path: Path, key: str, table: TomlTable) -> Any:
+    """The matrix of a file that `scipy.sparse.save_npz` wrote."""
+    if not path.is_file():
+        raise table.refusal(
+            key, "rows of numbers, or the name of a file beside the model's", path.name
+        )
+    try:
+        return scipy.sparse.load_npz(path)
+    except _UNREADABLE as error:
+        raise ValueError(
+            f"`{key}` = {shown(path.name)} of {table.place} cannot be read: it is not a sparse "
+            "matrix by `scipy.sparse.save_npz`."
+        ) from error
 
 
 def _matrix(key: str, value: Any, table: TomlTable) -> Float[np.ndarray, "unknown unknown"]:
@@ -138,7 +239,7 @@ def _matrix(key: str, value: Any, table: TomlTable) -> Float[np.ndarray, "unknow
 
 def _force(table: TomlTable) -> dict[str, complex]:
     """Newtons at points per newton of the recorded force, as phasors."""
-    table.check_keys(("at",))
+    table.check_keys(("at",), ("unbalance_kg_m",))
     at = table.entries["at"]
     if isinstance(at, str):
         return {at: 1.0}

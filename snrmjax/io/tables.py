@@ -68,13 +68,21 @@ def read_steady_states(
     if model is None:
         return _read(read_text(path), file_name(path), sensors)
     modes = modes_of(model)
-    data = _read(read_text(path), file_name(path), modes.sensors, modes.base)
+    unbalance = None if modes.unbalance is None else float(modes.unbalance)
+    data = _read(read_text(path), file_name(path), modes.sensors, modes.base, unbalance)
     check_driven_alike(data, modes, file_name(path))
     return data
 
 
 def check_driven_alike(data: SteadyStates, modes: LinearModes, file: str) -> None:
-    """Refuse a force where the model has a base, and the other way round."""
+    """Refuse a force where the model has a base, the other way round, and one on other modes."""
+    one = modes.mode_of_interest
+    if not modes.driven()[one]:
+        raise ValueError(
+            f"{file} is a test of mode {one + 1}, the model's `mode_of_interest`, which its force "
+            f"does not move (`participation` {modes.participation.item(one):g}): expected another "
+            "`mode_of_interest`, or the participation of this one."
+        )
     if (data.base is None) == (modes.base is None):
         return
     if modes.base is None:
@@ -91,10 +99,14 @@ def check_driven_alike(data: SteadyStates, modes: LinearModes, file: str) -> Non
 
 
 def _read(
-    text: str, file: str, sensors: tuple[str, ...] | None, base: BaseMotion | None = None
+    text: str,
+    file: str,
+    sensors: tuple[str, ...] | None,
+    base: BaseMotion | None = None,
+    unbalance: float | None = None,
 ) -> SteadyStates:
     cells = cells_of(text, file)
-    header = read_header(cells)
+    header = read_header(cells, force_known=unbalance is not None)
     cells.require_rows()
     notes = list(header.notes)
     rules = REQUIRED | FORCES | OPTIONAL | dict.fromkeys((*header.harmonics, *BASE), ())
@@ -117,6 +129,8 @@ def _read(
             notes.append(Fact("error_of_no_phases", file=file))
         columns["phase_std_deg"] = np.full(len(size), NO_PHASE / DEGREE)
         columns |= dict(zip(PHASOR, (size, np.zeros(len(size))), strict=True))
+    if unbalance is not None and header.used.isdisjoint((*FORCES, *BASE)):
+        columns["force_n"] = unbalance * (HERTZ * columns["frequency_hz"]) ** 2
     velocity = _phasors(*(columns[name] for name in PHASOR))
     if not np.any(velocity):
         raise ValueError(f"{file} has nothing but zero velocities.")

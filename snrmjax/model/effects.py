@@ -1,6 +1,7 @@
 """All effects by their kind: the library's and those that a user registers."""
 
 from collections.abc import Mapping
+from types import MappingProxyType
 
 import jax
 import jax.numpy as jnp
@@ -56,7 +57,7 @@ from snrmjax.model.library.stiffness import (
     QuinticStiffness,
     StaticPreload,
 )
-from snrmjax.model.places import Row, row_over_points
+from snrmjax.model.places import Row, row_over_points, unit_at
 from snrmjax.numerics.kept_programs import keep_no_programs
 from snrmjax.numerics.rules import require
 from snrmjax.numerics.units import unit_in_print
@@ -65,18 +66,26 @@ from snrmjax.numerics.units import unit_in_print
 class EffectTable(dict[str, type[AbstractEffect]]):
     """Effects by their kind. It prints as a table: kind, parameters with units, description."""
 
+    further: Mapping[str, type[AbstractEffect]] = MappingProxyType({})  # printed below its own
+
     def __repr__(self) -> str:
-        """One line for each effect."""
-        width = max((len(kind) for kind in self), default=0)
-        return "\n".join(
-            f"{kind:{width}}  {_parameters_with_units(effect)}: {_description(effect)}".rstrip()
-            for kind, effect in self.items()
-        )
+        """One line for each effect, then for each element that a diagnosis does not look for."""
+        width = max((len(kind) for kind in (*self, *self.further)), default=0)
+
+        def table(effects: Mapping[str, type[AbstractEffect]], at: Row | None) -> str:
+            lines = (
+                f"{k:{width}}  {_parameters(e, at)}: {_description(e)}" for k, e in effects.items()
+            )
+            return "\n".join(line.rstrip() for line in lines)
+
+        further = f"\n\nOnly at points, by `at`:\n{table(self.further, row_over_points('x'))}"
+        return table(self, None) + (further if self.further else "")
 
 
-def _parameters_with_units(effect: type[AbstractEffect]) -> str:
+def _parameters(effect: type[AbstractEffect], at: Row | None) -> str:
+    """Names of the parameters with their units, where the effect acts."""
     return ", ".join(
-        f"{name} ({unit_in_print(of.unit) or 'no unit'})" if of.unit else name
+        f"{name} ({unit_in_print(unit_at(at, of.unit)) or 'no unit'})" if of.unit else name
         for name, of in effect.parameters().items()
     )
 
@@ -86,7 +95,7 @@ def _description(effect: type[AbstractEffect]) -> str:
     return text.strip().split("\n")[0]
 
 
-EFFECTS: dict[str, type[AbstractEffect]] = EffectTable(
+EFFECTS: EffectTable = EffectTable(
     (effect.kind, effect)
     for effect in (
         LinearFrequencyShift,
@@ -145,6 +154,8 @@ ELEMENTS: dict[str, type[AbstractEffect]] = EffectTable(
     )
 )
 """Further forces for points of a structure, by their kind; a diagnosis does not look for them."""
+
+EFFECTS.further = ELEMENTS
 
 SURFACES = (FrictionContact.kind,)
 """Kinds of elements that act across a surface, `normal_at`, and along it, `at`."""

@@ -7,17 +7,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float, Shaped
+from jaxtyping import Array, Bool, Complex, Float, Shaped
 
-from snrmjax.model.moving_base import BaseMotion
+from snrmjax.model.moving_base import BaseMotion, drive_unit
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.names import suggestion
 from snrmjax.numerics.result import AbstractShown
-from snrmjax.numerics.rules import BELOW_ONE, POSITIVE, require
+from snrmjax.numerics.rules import BELOW_ONE, NOT_NEGATIVE, POSITIVE, require
 from snrmjax.numerics.units import HERTZ
 
 _SHOWN = 12  # modes, in a text
-_STILL = 1e-9  # of the largest shape at a point, below which a mode has a node there
+STILL = 1e-9  # of the largest shape at a point, below which a mode has a node there
 
 UNSTATED_MODAL_MASS_STD = 0.05
 """1σ, relative, of a modal mass of which nobody stated one.
@@ -32,7 +32,7 @@ class LinearModes(AbstractShown):
     `mode_of_interest` counts from zero; files count from one.
     """
 
-    natural_frequency: Float[Array, " mode"]  # rad/s
+    natural_frequency: Float[Array, " mode"]  # rad/s; 0 of what elements alone hold, as the last
     damping_ratio: Float[Array, " mode"]  # fraction of critical
     mode_shape: Float[Array, "sensor mode"]  # kg^-1/2
     participation: Float[Array, " mode"]  # Φᵀb per newton of the recorded force, kg^-1/2
@@ -53,6 +53,8 @@ class LinearModes(AbstractShown):
     participation_lag: Float[Array, " mode"] | None = None  # kg^-1/2
     # Where the acceleration of a base drives it: participations are then −Γ, kg^1/2 per m/s².
     base: BaseMotion | None = eqx.field(static=True, default=None)
+    # A rotating unbalance U = m r, kg m, drives by U Ω²: a "force" is then a multiple of U.
+    unbalance: Float[Array, ""] | None = None
 
     def has_screen(self) -> bool:
         """Whether these are the modes of one structure, with values."""
@@ -65,13 +67,22 @@ class LinearModes(AbstractShown):
         count = f"{self.n_modes} mode{'s' if self.n_modes > 1 else ''}"
         lines = [f"LinearModes: {count}{beside} at {', '.join(self.sensors)}"]
         for k in range(min(self.n_modes, _SHOWN)):
+            if not self.natural_frequency[k]:
+                lines.append(f"mode {k + 1}: no linear stiffness, held by elements alone")
+                continue
             hertz, ratio = self.natural_frequency.item(k) / HERTZ, self.damping_ratio[k]
             chosen = ", of interest" if k == self.mode_of_interest else ""
-            lines.append(f"mode {k + 1}: {hertz:.6g} Hz, damping {100 * ratio:.3g} %{chosen}")
+            std = float(self.damping_ratio_std[k])
+            known = f" ± {100 * std:.1g}" if std > 0 else ""
+            lines.append(
+                f"mode {k + 1}: {hertz:.6g} Hz, damping {100 * ratio:.3g}{known} %{chosen}"
+            )
         if self.n_modes > _SHOWN:
             lines.append(f"… and {self.n_modes - _SHOWN} more")
         if self.base is not None:
             lines.append(f"driven by the acceleration of its base, {self.base.motion} motion")
+        if self.unbalance is not None:
+            lines.append(f"driven by an unbalance of {float(self.unbalance):.6g} kg m")
         return tuple(lines)
 
     @property
@@ -101,9 +112,7 @@ class LinearModes(AbstractShown):
         participation = self.shape_at(point)
         if self.base is not None:
             raise ValueError("a base drives the structure: its modes say nothing of newtons.")
-        if not np.abs(participation[self.mode_of_interest]) > _STILL * np.max(
-            np.abs(participation)
-        ):
+        if not np.abs(participation[self.mode_of_interest]) > STILL * np.max(np.abs(participation)):
             raise ValueError(f"a force at {point!r} does not move the mode of interest.")
         rigid = self.rigid_body_participation
         if rigid.size and point not in self.sensors:
@@ -138,8 +147,13 @@ class LinearModes(AbstractShown):
 
     @property
     def force_unit(self) -> str:
-        """Unit of what drives the structure: of a force, or of a base's acceleration."""
-        return "N" if self.base is None else "m/s²"
+        """Unit of what drives the structure: a force, a base's acceleration, or an unbalance."""
+        return drive_unit(self.base, self.unbalance)
+
+    def driven(self) -> Bool[np.ndarray, " mode"]:
+        """Which flexible modes the force moves by itself, not by rounding alone."""
+        drive = np.abs(np.asarray(phasor_of_load(self)))
+        return drive > STILL * np.max(drive, initial=0.0)
 
     @property
     def own_modal_mass_std(self) -> Float[Array, ""] | None:
@@ -169,6 +183,7 @@ class Beside(NamedTuple):
     damping_coupling: Shaped[np.ndarray | Array, "mode mode"] | None = None
     participation_lag: Shaped[np.ndarray | Array, " mode"] | list[float] | None = None  # kg^-1/2
     base: BaseMotion | None = None  # whose acceleration stands in the place of the force
+    unbalance: float | Float[Array, ""] | None = None  # kg m, in the place of the force
 
 
 class RigidBodyModes(NamedTuple):
@@ -234,7 +249,8 @@ def linear_modes(
         raise ValueError(
             f"`mode_of_interest` must lie between 0 and {n_modes - 1}, but is {mode_of_interest}."
         )
-    require("`natural_frequency`", frequency, POSITIVE)
+    require("`natural_frequency`", frequency, NOT_NEGATIVE)
+    require("`natural_frequency` of the mode of interest", frequency[mode_of_interest], POSITIVE)
     require("`damping_ratio`", damping, BELOW_ONE)
     shapes, participations = rigid_body or RigidBodyModes(np.zeros((n_sensors, 0)), [])
     rigid_shape = _numbers(shapes)
@@ -274,6 +290,11 @@ def linear_modes(
         numbers["participation_lag"] = lag
     if further.base is not None:
         _check_base(further.base, (*names, *points), participations)
+    if further.unbalance is not None:
+        require("`beside.unbalance`", further.unbalance, POSITIVE)
+        numbers["unbalance"] = _numbers(further.unbalance)
+    if further.base is not None and further.unbalance is not None:
+        raise ValueError("a base and an unbalance cannot both drive a structure.")
     modes = LinearModes(
         **numbers,
         sensors=tuple(names),

@@ -1,10 +1,10 @@
-"""The base of a structure, where its acceleration stands in the place of a force."""
+"""What drives a structure in the place of a force: a base that moves, or an unbalance."""
 
 from collections.abc import Mapping, Sequence
-from typing import Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Array, Complex, Float
 
 from snrmjax.numerics.names import suggestion
 
@@ -63,3 +63,22 @@ def base_motion(
     if not all(np.isfinite(value) for _, value in pairs):
         raise ValueError("`along` of a base must have finite numbers.")
     return BaseMotion(motion, pairs)
+
+
+def newtons(
+    unbalance: Float[Array, ""] | None,
+    frequency: Float[Array | np.ndarray, "*batch"] | float,
+    force: Float[Array | np.ndarray, "*batch"] | float,
+) -> Any:
+    """The force (N) at a frequency Ω (rad/s): of a multiple c of an unbalance U it is c U Ω².
+
+    A force, and a base's acceleration in its place, is what it is at every frequency.
+    """
+    return force if unbalance is None else force * unbalance * frequency**2
+
+
+def drive_unit(base: BaseMotion | None, unbalance: Any = None) -> str:
+    """Unit of what drives a structure: newtons, m/s² of a base, or an unbalance (kg m)."""
+    if unbalance is not None:
+        return f"× {float(unbalance):.6g} kg m"
+    return "N" if base is None else "m/s²"

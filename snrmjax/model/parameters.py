@@ -14,24 +14,25 @@ from snrmjax.model.effect_metadata import Entries
 from snrmjax.model.places import unit_at
 from snrmjax.model.potential import monomial_key
 from snrmjax.model.structures import Structure
-from snrmjax.numerics.rules import BELOW_ONE, NOT_ZERO, POSITIVE, Rule
+from snrmjax.numerics.rules import BELOW_ONE, POSITIVE, Rule
 
 _MODE_RULES = {
     "natural_frequency": (POSITIVE,),
     "damping_ratio": (BELOW_ONE,),
-    "participation": (NOT_ZERO,),
+    "participation": (),
 }
 _MODE_UNITS = {"natural_frequency": "rad/s", "damping_ratio": "1", "participation": "kg^-1/2"}
 _MODE_FIELDS = tuple(_MODE_RULES)
+_UNBALANCE = "unbalance_kg_m"  # the name of the one number of modes that is of no mode
 
 
 def parameter_names(model: Structure) -> tuple[str, ...]:
     """Names of the numbers of a model: of its potential, its modes and its effects.
 
     Names such as "potential.1111", "mode_1.natural_frequency" (rad/s), "mode_1.damping_ratio",
-    "mode_1.participation" (kg^-1/2) and "quadratic_damping.coefficient"; of several effects of a
-    kind the second is "quadratic_damping_2". The values of a law at its knots are
-    "stiffness_law.restoring_force_1" and so on; the knots themselves are no parameters, nor are
+    "mode_1.participation" (kg^-1/2), "unbalance_kg_m" and "quadratic_damping.coefficient"; of
+    several effects of a kind the second is "quadratic_damping_2". The values of a law at its knots
+    are "stiffness_law.restoring_force_1" and so on; the knots themselves are no parameters, nor are
     other arrays.
 
     >>> from snrmjax.model import curved_beam
@@ -68,7 +69,7 @@ def parameter_rules(model: Structure, name: str) -> tuple[Rule, ...]:
     part, entry, field, _ = _places(model)[name]
     if part == "effects":
         return model.effects[entry].parameters()[field].rules
-    return _MODE_RULES.get(field, ())
+    return (POSITIVE,) if name == _UNBALANCE else _MODE_RULES.get(field, ())
 
 
 def parameter_unit(model: Structure, name: str) -> str:
@@ -79,7 +80,7 @@ def parameter_unit(model: Structure, name: str) -> str:
         return unit_at(getattr(effect, "at", None), effect.parameters()[field].unit)
     if part == "potential":
         return f"J/(kg^1/2 m)^{len(model.potential.monomials[entry])}"
-    return _MODE_UNITS[field]
+    return "kg m" if name == _UNBALANCE else _MODE_UNITS[field]
 
 
 def parameter_value(model: Structure, name: str) -> Float[Array, ""]:
@@ -140,7 +141,8 @@ def _number_at(model: Structure, place: _Place) -> Array:
     part, entry, field, knot = place
     if part == "effects":
         return getattr(model.effects[entry], field)[knot]
-    return getattr(getattr(model, part), field)[entry]
+    value = getattr(getattr(model, part), field)
+    return value[entry] if np.ndim(value) else value
 
 
 def _places(model: Structure) -> dict[str, _Place]:
@@ -150,6 +152,8 @@ def _places(model: Structure) -> dict[str, _Place]:
     }
     for k in range(model.n_modes):
         places |= {f"mode_{k + 1}.{field}": _Place("modes", k, field) for field in _MODE_FIELDS}
+    if model.modes.unbalance is not None:
+        places[_UNBALANCE] = _Place("modes", 0, "unbalance")
     kinds: list[str] = []
     for k, effect in enumerate(model.effects):
         kinds.append(effect.kind)
@@ -182,6 +186,9 @@ def _replaced(
     changed = {part: getattr(model, part) for part, _ in entries}
     for (part, field), numbers in entries.items():
         array = jnp.asarray(getattr(changed[part], field))
+        if not array.ndim:
+            changed[part] = dataclasses.replace(changed[part], **{field: values[numbers[0]]})
+            continue
         # All at once: a program with a step for every entry is slow to compile and to run.
         source = np.arange(array.shape[0])
         source[list(numbers)] = array.shape[0] + np.array(list(numbers.values()))

@@ -29,6 +29,8 @@ from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.result import AbstractShown
 from snrmjax.numerics.units import unit_in_print
 
+_FLAT = 1e-9  # of the largest slope of a structure's force at rest, what counts as none
+
 
 def _number(value: float = 0.0) -> Array:
     return jax.device_put(np.asarray(value, dtype=float))  # by `jnp.asarray` it would compile
@@ -300,6 +302,13 @@ def simulated_structure(model: Structure) -> Structure:
     return dataclasses.replace(model, modes=modes, potential=potential, effects=rest)
 
 
+def driven_in_newtons(model: Structure) -> Structure:
+    """The structure as tests see it, whose states have forces in N: without an unbalance."""
+    if model.modes.unbalance is None:
+        return model
+    return dataclasses.replace(model, modes=dataclasses.replace(model.modes, unbalance=None))
+
+
 class Equilibrium(NamedTuple):
     """A static state: its displacement (kg^1/2 m), energy (J) and whether it is stable."""
 
@@ -336,11 +345,18 @@ def equilibria(model: Structure, *, n_starts: int = 512, seed: int = 0) -> list[
     else:
         candidates, tolerance = _equilibria_by_newton(model, n_starts, seed)
     distinct: list[Equilibrium] = []
+    free = bool(np.any(squared == 0))
+    rest = jnp.zeros((1, n))
+    if free and not np.any(np.asarray(model.memoryless_force(rest, rest))):
+        # Newton's method creeps to a rest without a slope, and ends near it.
+        candidates, tolerance = np.concatenate([np.zeros((1, n)), candidates]), 1e4 * tolerance
     for q in sorted(candidates, key=lambda row: float(np.linalg.norm(row))):
         if any(np.linalg.norm(q - e.displacement) <= tolerance for e in distinct):
             continue
         energy, tangent = _energy_and_tangent(model, q)
-        stable = bool(np.all(np.linalg.eigvalsh(np.asarray(tangent)) > 0))
+        slopes = np.linalg.eigvalsh(np.asarray(tangent))
+        # What elements without a slope at rest hold has none there, and stays.
+        stable = bool(np.all(slopes > (-_FLAT * slopes.max() if free else 0.0)))
         distinct.append(Equilibrium(q, float(energy), stable))
     return distinct
 
@@ -364,6 +380,7 @@ def _newton(
 ) -> tuple[Float[Array, "start mode"], Float[Array, " start"]]:
     """Ends of Newton's method for ω²q + f(q, 0) = 0, and what is left of the force over ω²."""
     squared = model.linear_terms().stiffness
+    springs = jnp.where(squared > 0, squared, jnp.max(squared))
 
     def balance(q: Array) -> Array:
         return squared * q + model.memoryless_force(q[None], jnp.zeros((1, q.size)))[0]
@@ -372,7 +389,7 @@ def _newton(
         return q - jnp.linalg.solve(_energy_and_tangent(model, q)[1], balance(q))
 
     ends = jax.vmap(lambda q: jax.lax.fori_loop(0, 60, step, q))(starts)
-    return ends, jax.vmap(lambda q: jnp.max(jnp.abs(balance(q)) / squared))(ends)
+    return ends, jax.vmap(lambda q: jnp.max(jnp.abs(balance(q)) / springs))(ends)
 
 
 @compiled
@@ -397,7 +414,7 @@ def displacement_scale(model: Structure) -> np.ndarray:
         model.potential.monomials, np.asarray(model.potential.coefficient), strict=True
     ):
         mode, degree = monomial[0], len(monomial)
-        if set(monomial) == {mode} and degree > 2 and value != 0.0:
+        if set(monomial) == {mode} and degree > 2 and value != 0.0 and squared[mode] > 0:
             reached_at = (squared[mode] / (degree * abs(value))) ** (1.0 / (degree - 2))
             scale[mode] = np.fmin(scale[mode], reached_at)
     if model.memoryless:

@@ -24,7 +24,7 @@ from snrmjax.io.measurement_plans import read_further_states
 from snrmjax.io.models import read_model
 from snrmjax.io.tables import read_steady_states
 from snrmjax.measure.states import SteadyStates
-from snrmjax.model.structures import Structure
+from snrmjax.model.structures import Structure, driven_in_newtons
 from snrmjax.numerics.facts import Fact
 
 
@@ -84,6 +84,7 @@ def diagnose_test(
     structure can have the parameters found, nothing is simulated.
     Raises `ValueError` as `diagnose_model` and `locate_force` do.
     """
+    model = driven_in_newtons(model)
     found = diagnose_model(model, data, former=former)
     place = _whereabouts(found, data, model, where)
     if not (simulate and found.effects and found.completed is not None):

@@ -29,7 +29,7 @@ from snrmjax.identify.pointwise.backbone import BackboneValues
 from snrmjax.identify.pointwise.prediction_result import PredictedResponse, Resonance
 from snrmjax.identify.prediction.notes import notes_on_negative_damping
 from snrmjax.measure.states import SteadyStates, check_force, check_phases
-from snrmjax.model.structures import Structure
+from snrmjax.model.structures import Structure, driven_in_newtons
 from snrmjax.numerics.facts import Fact
 from snrmjax.pipelines.options import COUPLED_MODES, IdentifyOptions, checked
 from snrmjax.pipelines.predictions import (
@@ -110,6 +110,12 @@ def identify_test(
     else the error says so.
     """
     options = checked(dataclasses.replace(options or IdentifyOptions(), **settings))
+    if model.modes.unbalance is not None and (options.predict_force or options.predict_drive):
+        raise ValueError(
+            "predictions are for a force in N that is the same at every frequency, but the model's "
+            "[force] is an unbalance: leave `unbalance_kg_m` out of it to predict for one."
+        )
+    model = driven_in_newtons(model)
     if options.predict_drive:
         require_drive(data)
     if (options.modes or 1) > COUPLED_MODES:

@@ -1,8 +1,9 @@
 """Simulation of a model: responses and nonlinear normal mode, with what they do not show."""
 
+import dataclasses
 import logging
 from collections.abc import Callable, Iterator, Sequence
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from snrmjax.io.units import HERTZ
 from snrmjax.model.parameters import checked_names, parameter_values
 from snrmjax.model.structures import Structure, equilibria, simulated_structure
 from snrmjax.numerics.facts import Fact
+from snrmjax.simulate.balance.harmonic_balance import resonant_modes
 from snrmjax.simulate.continuation.continuation import CurveStatus
 from snrmjax.simulate.continuation.event_equations import FORCE, EventKind
 from snrmjax.simulate.continuation.response_curve import (
@@ -33,6 +35,7 @@ from snrmjax.simulate.solutions.quasi_periodic import (
 _log = logging.getLogger(__name__)
 
 _TRUNCATED = 0.02  # share of the velocity that harmonics left out may have, without a note
+_KNOWN_DAMPING = 1e-5  # relative 1σ of a damping ratio, above which it is said
 _SAME_EVENT = 1e-6  # of the frequency, between an event of a response and a curve of events
 _ENDS = (CurveStatus.UPPER_END, CurveStatus.LOWER_END)
 
@@ -71,9 +74,10 @@ def simulate_responses(
 ) -> SimulatedResponses:
     """Responses to harmonic forces, around folds and with unstable parts.
 
-    Arguments: `forces` in N; `harmonics` that are balanced; `isolated` also searches for curves
-    that are not connected to the one from rest; `follow` kinds of events that are followed as the
-    `parameter` goes from its value to `to`, and back where it turns (see `follow_event`);
+    Arguments: `forces` in N, or multiples of the model's unbalance; `harmonics` that are balanced;
+    `isolated` also searches for curves that are not connected to the one from rest; `follow` kinds
+    of events that are followed as the `parameter` goes from its value to `to`, and back where it
+    turns (see `follow_event`);
     `quasi_periodic` follows the motions with two frequencies from every Neimark-Sacker point;
     `progress` is told each force when it begins.
     Raises `ValueError` as `forced_response` and `follow_event` do, where no curve has a point,
@@ -87,10 +91,13 @@ def simulate_responses(
         check_quasi_periodic(simulated_structure(model))
     if follow and parameter != FORCE:
         checked_names(model, [parameter], "parameter")
+    # Events are located where the files and figures show the response.
     ends, settings = (from_hz * HERTZ, to_hz * HERTZ), ResponseSettings(harmonic_order=harmonics)
+    sensor = _most_moved(model, ends)
+    model = dataclasses.replace(model, modes=model.modes.with_first_sensor(sensor))
     hold = friction_hold(model, *ends)
     curves: list[ResponseCurve] = []
-    notes = list(_notes_on_equilibria(model))
+    notes = [*_notes_on_equilibria(model), *_notes_on_damping(model, ends)]
     for force in forces:
         progress(force)
         main = forced_response(model, [force], *ends, harmonic_order=harmonics)
@@ -130,9 +137,7 @@ def simulate_responses(
     if quasi_periodic:
         tori, told = _tori(model, curves, ends)
         notes += told
-    return SimulatedResponses(
-        *(tuple(curves), _sensor(model), tuple(notes), tuple(events), tuple(tori))
-    )
+    return SimulatedResponses(*(tuple(curves), sensor, tuple(notes), tuple(events), tuple(tori)))
 
 
 def _tori(
@@ -213,7 +218,8 @@ def simulate_mode(
     ]
     if branch.status not in _ENDS:
         notes.append(Fact("mode_not_followed", status=branch.status))
-    return SimulatedMode(branch, _sensor(model), tuple(notes))
+    sensor = model.modes.sensors[reference_sensor(model.modes)]
+    return SimulatedMode(branch, sensor, tuple(notes))
 
 
 def _notes_on_instability(branch: NormalModeBranch) -> Iterator[Fact]:
@@ -226,8 +232,11 @@ def _notes_on_instability(branch: NormalModeBranch) -> Iterator[Fact]:
         yield Fact("mode_unstable", n=stop - first, **ends)
 
 
-def _sensor(model: Structure) -> str:
-    return model.modes.sensors[reference_sensor(model.modes)]
+def _most_moved(model: Structure, ends: tuple[float, float]) -> str:
+    """The sensor that sees most of the mode of interest, or of another that moves in a range."""
+    modes = model.modes
+    (leading, *_) = [*resonant_modes(model, ends), modes.mode_of_interest]
+    return modes.sensors[reference_sensor(dataclasses.replace(modes, mode_of_interest=leading))]
 
 
 def _notes_on_force(
@@ -246,16 +255,26 @@ def _notes_on_force(
 
 
 def _notes_on_curve(curve: ResponseCurve, hold: Hold | None) -> Iterator[Fact]:
-    no_start = curve.status == CurveStatus.NO_START
-    if hold is not None and no_start:
-        yield Fact("held_by_friction", force=curve.force, unit=curve.force_unit, **hold._asdict())
+    at: dict[str, Any] = {"force": curve.force, "unit": curve.force_unit}
+    if hold is not None and curve.status == CurveStatus.NO_START:
+        yield Fact("held_by_friction", **at, **hold._asdict())
     elif curve.branch == Branch.MAIN and curve.status != CurveStatus.UPPER_END:
-        yield Fact("curve_ended", force=curve.force, status=curve.status)
+        yield Fact("curve_ended", **at, status=curve.status)
     if curve.not_located:
-        yield Fact("curve_events_not_located", force=curve.force, kinds=curve.not_located)
+        yield Fact("curve_events_not_located", **at, kinds=curve.not_located)
     unknown = int(np.sum(curve.stability == int(Stability.NOT_COMPUTED)))
     if unknown:
-        yield Fact("stability_not_computed", force=curve.force, n=unknown)
+        yield Fact("stability_not_computed", **at, n=unknown)
+
+
+def _notes_on_damping(model: Structure, ends: tuple[float, float]) -> Iterator[Fact]:
+    """Modes in a range whose damping the model does not know well."""
+    modes = model.modes
+    for k in range(modes.n_modes):
+        std, ratio = modes.damping_ratio_std.item(k), modes.damping_ratio.item(k)
+        inside = ends[0] <= modes.natural_frequency.item(k) <= ends[1]
+        if inside and std > _KNOWN_DAMPING * ratio and not np.any(modes.natural_frequency_std):
+            yield Fact("damping_not_known", mode=k + 1, relative_std=std / ratio if ratio else 1.0)
 
 
 def _notes_on_equilibria(model: Structure) -> tuple[Fact, ...]:

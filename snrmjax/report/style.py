@@ -61,6 +61,8 @@ def unit_for(values: Any, base: str) -> Unit:
     Unit(size=0.001, name='mm/s')
     """
     largest = np.nanmax(np.abs(np.asarray(values)), initial=0.0)
+    if base.startswith("×"):  # a number of what is then named: no unit of its own
+        return Unit(1.0, base)
     for size, prefix in ((1.0, ""), (1e-3, "m")):
         if largest >= 0.1 * size or largest == 0:
             return Unit(size, prefix + base)

@@ -40,7 +40,7 @@ _KEYS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "curves": (_RANGE, ("forces_n", "harmonics", "stability", "sensor")),
     "nnm": (("to_hz",), ("harmonics", "sensor")),
     "damped_nnm": (("to_velocity_m_s",), ("harmonics", "sensor")),
-    "virtual_test": ((*_RANGE, "forces_n"), ("harmonics", "errors", "points_per_level")),
+    "virtual_test": (_RANGE, ("forces_n", "harmonics", "errors", "points_per_level")),
     "identify": (("data",), ()),
     "diagnose": (("data",), ()),
 }
@@ -183,13 +183,15 @@ def _computation(
         ends[0] * HERTZ, ends[1] * HERTZ, harmonics, _flag(top, "stability", True)
     )
     forces = _forces(top)
+    varied = any(FORCE in variation.names for variation in variations)
+    if forces is None and not varied and model.modes.unbalance is not None:
+        forces = np.ones(1)
+    if forces is None and not varied:
+        raise ValueError(f"{top.place} lacks the key `forces_n`, and {FORCE} does not vary.")
     if kind == "virtual_test":
         levels = np.zeros(0) if forces is None else forces
         per_level = top.whole("points_per_level", 1, 5)
         return VirtualTests(within, levels, _errors(top), per_level)
-    varied = any(FORCE in variation.names for variation in variations)
-    if forces is None and not varied:
-        raise ValueError(f"{top.place} lacks the key `forces_n`, and {FORCE} does not vary.")
     if kind == "curves":
         return Curves(within, OfForces(forces))
     return Peaks(within, OfForces(forces), top.whole("grid_points", 0, 0))

@@ -181,9 +181,7 @@ NO_FREQUENCIES = {
 OUT_OF_RANGE = [
     ("damping_ratio = 0.05", "damping_ratio = -0.05", "mode 1", "from 0 to below 1"),
     ("damping_ratio = 0.05", "damping_ratio = 1.0", "mode 1", "from 0 to below 1"),
-    ("participation = -108.5", "participation = 0", "mode 2", "other than zero"),
     ("participation = 247.8", "participation = -inf", "mode 1", "a finite number"),
-    ("participation = 1.5", "participation = 0.0", "rigid_body_mode 1", "other than zero"),
     ("frequency_std_hz = 0.02", "frequency_std_hz = -0.02", "mode 1", "zero or positive"),
     ("damping_ratio_std = 0.001", "damping_ratio_std = -1", "mode 1", "zero or positive"),
     ("std = 1e10", "std = -1.0", "monomial '1111' in [potential]", "zero or positive"),
@@ -573,7 +571,7 @@ BATCH = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), structure(small()))
 @pytest.mark.parametrize(
     ("model", "message"),
     [
-        (structure(small(participation=[0.0])), "`participation` must be a number other than zero"),
+        (structure(small(participation=[0.0])), "a `participation` other than zero"),
         (structure(small(mode_shape=[[0.0]])), "zero at every sensor"),
         (
             eqx.tree_at(lambda m: m.modes.mode_shape, structure(small()), jnp.array([[jnp.nan]])),

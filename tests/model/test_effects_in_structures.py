@@ -9,7 +9,7 @@ import pytest
 
 import snrmjax as sj
 from snrmjax.model.effect_base import AbstractMemoryless, Scalar
-from snrmjax.model.effects import EFFECTS, make_effect
+from snrmjax.model.effects import EFFECTS, ELEMENTS, make_effect
 
 
 class ThreeHalvesDamping(AbstractMemoryless):
@@ -60,7 +60,9 @@ def test_a_class_and_what_is_no_effect_are_refused_by_name():
 
 
 def test_effects_and_families_print_as_tables():
-    lines = repr(EFFECTS).splitlines()
+    candidates, further = repr(EFFECTS).split("\n\n")
+    assert [line.split()[0] for line in further.splitlines()[1:]] == list(ELEMENTS)
+    lines = candidates.splitlines()
     assert [line.split()[0] for line in lines] == list(EFFECTS)
     (drag,) = (line for line in lines if line.startswith("quadratic_damping "))
     assert "coefficient (1/(√kg m)): Drag of the surrounding air" in drag

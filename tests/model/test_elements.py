@@ -126,8 +126,23 @@ def test_the_energy_that_an_iwan_joint_loses_is_segalmans():
 
 
 @pytest.mark.parametrize("kind", ELEMENTS)
-def test_elements_are_no_candidates_of_a_diagnosis(kind):
+def test_elements_are_no_candidates_of_a_diagnosis_but_printed_below_them(kind):
     assert kind not in sj.model.EFFECTS
+    candidates, elements = str(sj.model.EFFECTS).split("\n\n")
+    assert f"\n{kind} " in elements
+    assert kind not in candidates
+
+
+def test_a_preload_and_a_load_push_the_same_way():
+    # As weights: x = F/k on a spring k, and a stop 0.01 m away is reached by 0.33 of its force.
+    for kind, name in (("static_load", "load"), ("static_preload", "constant_force")):
+        push = sj.model.make_effect(kind, {name: 4.0}, at="x1")
+        stop = sj.model.make_effect("one_sided_stop", {"stiffness": 300.0, "gap": 0.01}, at="x1")
+        one = sj.model.builders.matrices.from_matrices(
+            [[1.0]], 0.01, [[100.0]], force="x1", effects=[push, stop]
+        )
+        (rest,) = sj.model.equilibria(one)
+        assert rest.displacement[0] == pytest.approx((4.0 + 3.0) / 400.0)  # m, as the mass is 1 kg
 
 
 def test_a_linkage_is_a_spring_that_turns():

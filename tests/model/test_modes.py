@@ -173,7 +173,14 @@ GOOD = {
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"natural_frequency": [500.0, 0.0]}, "`natural_frequency` must be positive.*entry 1 is 0"),
+        (
+            {"natural_frequency": [500.0, -1.0]},
+            "`natural_frequency` must be zero or pos.*entry 1 is",
+        ),
+        (
+            {"natural_frequency": [0.0, 1.0]},
+            "`natural_frequency` of the mode of interest must be p",
+        ),
         ({"natural_frequency": [500.0, np.nan]}, "`natural_frequency` must be finite.*entry 1"),
         ({"natural_frequency": [[500.0, 1.0]]}, r"`natural_frequency` must be a vector.*\(1, 2\)"),
         ({"natural_frequency": []}, "`natural_frequency` must have at least one mode"),

@@ -51,7 +51,7 @@ from snrmjax.io.toml_table import TomlTable, parsed_toml
 from snrmjax.io.units import HERTZ
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.names import suggestion
-from snrmjax.numerics.rules import BELOW_ONE, IN_RANGE_HZ, NOT_ZERO, POSITIVE
+from snrmjax.numerics.rules import BELOW_ONE, IN_RANGE_HZ, POSITIVE
 
 _KEYS = ("name", "numbers", "damping_ratio", "shapes", "mass", "participation", "sensors")
 _NUMBERED = re.compile(r"([a-z]+)_([1-9][0-9]{0,5})")
@@ -96,7 +96,7 @@ def read_load_tables(folder: FilePath) -> ReductionSource:
     basis = _basis(frequency, numbers, shapes, mass)
     sensors, notes = _sensors(top, n, None if shapes is None else shapes.values)
     name, first = next(iter(sensors.items()))
-    participation = top.numbers_of_modes("participation", n, NOT_ZERO)
+    participation = top.numbers_of_modes("participation", n)
     if participation is None:
         notes.append(Fact("point_force_assumed", sensor=name))
     damping = top.numbers_of_modes("damping_ratio", n, BELOW_ONE)

@@ -1,6 +1,7 @@
 """Structures from their mass, damping and stiffness matrices."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,8 +10,10 @@ import scipy.sparse
 import scipy.sparse.linalg
 from jaxtyping import Float
 
+from snrmjax.model.builders.free_coordinates import felt_first
+from snrmjax.model.builders.modal_damping import modal_damping
 from snrmjax.model.effect_base import AbstractEffect, AbstractForce, checked_effects
-from snrmjax.model.modes import Beside, RigidBodyModes, linear_modes
+from snrmjax.model.modes import Beside, LinearModesStd, RigidBodyModes, linear_modes
 from snrmjax.model.moving_base import BaseMotion
 from snrmjax.model.places import Row, row_over_points
 from snrmjax.model.structures import Structure, structure
@@ -24,8 +27,6 @@ _SMALL = 100  # unknowns, above which a few modes are found by themselves
 _MORE, _PASSES = 6, 4  # modes beside those wanted; shifts that are tried
 _DEPENDENT = 1e-10  # of its length: what is left of a vector that others already contain
 _DENSE = 2000  # unknowns, above which only the wanted modes are computed
-_OVERDAMPED = 0.99  # damping ratio, beyond which the rest counts as coupling
-_NO_COUPLING = 1e-12  # of the damping of both modes
 
 Phasor = float | complex
 
@@ -47,6 +48,7 @@ def from_matrices(
     *,
     force: str | Mapping[str, Phasor] | None = None,
     base: BaseMotion | None = None,
+    unbalance: float | None = None,
     effects: AbstractEffect | Iterable[AbstractEffect] = (),
     n_modes: int | None = None,
     residuals: bool = True,
@@ -63,19 +65,21 @@ def from_matrices(
     `base` in its place: the structure stands on a base that moves, whose acceleration a acts as
     the force −M r a, r being how far each unknown goes with the base (`base_motion`'s `along`); all
     motion, that of the effects too, is relative to it.
+    `unbalance` (kg m) of something that turns: the force is U Ω² then, at the points of `force`.
     `effects` act at points by their `at`, in N and m; the matrices hold no part of them.
     `n_modes` keeps so many modes of lowest frequency, and for every place of an effect and for
     the force one vector more: what the left out modes give way there statically, exactly, as
     further modes of high frequency; without `residuals` it does not, as many places want it.
     `sensors` are the points that are watched, by default all.
-    Damping that couples modes is kept. Modes without stiffness become rigid-body modes.
+    Damping that couples modes is kept. Modes without stiffness become rigid-body modes; those that
+    an effect acts on become modes of zero frequency, behind the others: what elements alone hold,
+    as an absorber without a linear spring.
 
     Returns a `Structure`. What `n_modes` leaves out is the dynamics of higher modes: a share of
     about (Ω/ω)² of their static part, ω being the first frequency left out, for each harmonic Ω.
     Raises `ValueError` for matrices that are not square, finite, symmetric, or of different sizes,
     a mass that is not positive definite, a stiffness that is negative, unknown or repeated points,
-    a force or base that moves no mode, both or none of them, and an effect that acts on a
-    rigid-body mode.
+    a force or base that moves no mode, and both or none of them.
     Reference: MacNeal, Comput. Struct. 1 (1971) 581, doi:10.1016/0045-7949(71)90031-9.
 
     >>> from snrmjax.model.effects import make_effect
@@ -89,7 +93,7 @@ def from_matrices(
     if k.shape != m.shape:
         raise ValueError(f"`mass` has shape {m.shape}, but `stiffness` has {k.shape}.")
     names = tuple(points) if points is not None else tuple(f"x{i + 1}" for i in range(size))
-    _check_names(names, size)
+    check_names(names, size)
     made = checked_effects(effects)
     forces = [effect for effect in made if isinstance(effect, AbstractForce)]
     places = dict.fromkeys(row for e in forces for row in e.rows if row is not None)
@@ -99,32 +103,41 @@ def from_matrices(
     if n_modes is not None and residuals:
         parts = [*rows, load.real, *([load.imag] if np.any(load.imag) else [])]
         squared, shapes = _with_residuals(k, m, squared, shapes, rigid, parts)
-    if not squared.size or not np.any(load @ shapes):
+    n_flexible = len(squared)
+    if rigid.shape[1] and rows:
+        # What only elements hold moves with them, as an absorber without a linear spring does.
+        turn, n_free = felt_first(np.stack(rows) @ rigid, np.abs(rigid).max(axis=0))
+        free, rigid = np.split(rigid @ turn, [n_free], axis=1)
+        squared, shapes = np.pad(squared, (0, n_free)), np.concatenate([shapes, free], axis=1)
+    if not n_flexible or not np.any(load @ shapes):
         raise ValueError(
-            "`force` acts where no mode of the structure moves."
+            "the force acts where no mode of the structure moves."
             if base is None
             else "the base moves no mode of the structure."
         )
-    for place, row in zip(places, rows, strict=True):
-        if np.any(np.abs(row @ rigid) > 1e-9 * np.linalg.norm(rigid, axis=0)):
-            raise ValueError(
-                f"an effect acts at {' and '.join(point for point, _ in place)}, which moves in a "
-                "rigid-body mode: support the structure, by soft springs where it hangs free."
-            )
     omega = np.sqrt(squared)
-    ratio, coupling = _damping(damping, shapes, omega)
+    if damping is None or (np.ndim(damping) == 0 and not scipy.sparse.issparse(damping)):
+        ratio = np.where(omega > 0, 0.0 if damping is None else float(damping), 0.0)
+        coupling, ratio_std = None, np.zeros(omega.shape)
+    else:
+        c = _checked("damping", damping)
+        if c.shape != m.shape:
+            raise ValueError(f"`damping` has shape {c.shape}, but there are {size} unknowns.")
+        ratio, coupling, ratio_std = modal_damping(c, m, k, shapes, omega)
     watched = tuple(sensors) if sensors is not None else names
-    for sensor in watched:
-        _place(names, sensor, "`sensors`")
-    seen = [names.index(sensor) for sensor in watched]
-    other = {n: shapes[i] for i, n in enumerate(names) if n not in set(watched)}
+    seen = np.array(_places(names, watched, "`sensors`"))
+    unseen = np.setdiff1d(np.arange(size), seen).tolist()
+    other = {names[i]: shapes[i] for i in unseen}
     acting = load @ shapes
     modes = linear_modes(
         *(omega, ratio, shapes[seen], acting.real),
         sensors=watched,
         mode_of_interest=mode_of_interest,
         rigid_body=RigidBodyModes(rigid[seen], (load @ rigid).real),
-        beside=Beside(other, coupling, -acting.imag if np.any(acting.imag) else None, base),
+        std=LinearModesStd(damping_ratio=ratio_std),
+        beside=Beside(
+            other, coupling, -acting.imag if np.any(acting.imag) else None, base, unbalance
+        ),
     )
     return structure(modes, effects=made, name=name)
 
@@ -140,8 +153,7 @@ def _load(
         raise ValueError("a structure has either a `force` or a `base` that moves.")
     if base is None:
         return _column(names, force or {}, "`force`")
-    for point, _ in base.along:
-        _place(names, point, "the base's `along`")
+    _places(names, [point for point, _ in base.along], "the base's `along`")
     return -(mass @ base.cosines(names))
 
 
@@ -161,27 +173,30 @@ def _checked(name: str, matrix: Any) -> Any:
     return values.toarray() if sparse and values.shape[0] <= _DENSE else values
 
 
-def _check_names(names: tuple[str, ...], size: int) -> None:
+def check_names(names: Sequence[str], size: int) -> None:
+    """Refuse names of points that are not as many as unknowns, or not different."""
     if len(names) != size:
         raise ValueError(f"`points` names {len(names)} points, but there are {size} unknowns.")
-    for name in names:
-        if names.count(name) > 1:
-            raise ValueError(f"`points` names {name!r} twice.")
+    name, count = Counter(names).most_common(1)[0]
+    if count > 1:
+        raise ValueError(f"`points` names {name!r} twice.")
 
 
-def _place(names: tuple[str, ...], point: str, what: str) -> int:
-    if point not in names:
-        near = suggestion(point, names) or f"; known are {', '.join(names[:12])}"
-        raise ValueError(f"{what} names the point {point!r}, which does not exist{near}.")
-    return names.index(point)
+def _places(names: tuple[str, ...], points: Iterable[str], what: str) -> list[int]:
+    """Where points are among the unknowns."""
+    place = {name: k for k, name in enumerate(names)}
+    for point in points:
+        if point not in place:
+            near = suggestion(point, names) or f"; known are {', '.join(names[:12])}"
+            raise ValueError(f"{what} names the point {point!r}, which does not exist{near}.")
+    return [place[point] for point in points]
 
 
 def _column(names: tuple[str, ...], at: str | Mapping[str, Phasor] | Row, what: str) -> np.ndarray:
     """Weights of all unknowns; complex of a force with phases."""
-    pairs = at.items() if isinstance(at, Mapping) else row_over_points(at)
+    weights = dict(at.items() if isinstance(at, Mapping) else row_over_points(at))
     column = np.zeros(len(names), dtype=complex)
-    for point, weight in pairs:
-        column[_place(names, point, what)] += weight
+    column[_places(names, weights, what)] = list(weights.values())
     return column if np.any(column.imag) else column.real
 
 
@@ -222,12 +237,18 @@ def _lowest_modes(m: Any, k: Any, wanted: int) -> tuple[np.ndarray, np.ndarray]:
     A shift as large as the lowest natural frequency squared loses no digits of it; one that is far
     larger, as entries of a fine mesh suggest, loses all.
     """
-    mass, stiffness = scipy.sparse.csc_matrix(m), scipy.sparse.csc_matrix(k)
-    entries = abs(stiffness.diagonal()).min() / abs(mass.diagonal()).max()
-    shifts = [0.0] if _regular(stiffness) else [-1e-3 * entries]
+    springs = abs(k.diagonal())
+    entries = springs[springs > 0].min() / abs(m.diagonal()).max()
+    shifts, inverse = [0.0], _Inverse(k)
+    if not inverse.regular:
+        shifts = [-1e-3 * entries]
     for _ in range(_PASSES):
         try:
-            squared, shapes = scipy.sparse.linalg.eigsh(stiffness, wanted, mass, sigma=shifts[-1])
+            solve = inverse if not shifts[-1] else _Inverse(k - shifts[-1] * m)
+            operator = scipy.sparse.linalg.LinearOperator(k.shape, solve.solve)
+            squared, shapes = scipy.sparse.linalg.eigsh(
+                k, wanted, m, sigma=shifts[-1], OPinv=operator
+            )
         except RuntimeError as error:
             raise ValueError(
                 "the lowest modes are lost to rounding: the mesh is too fine for these matrices, "
@@ -240,13 +261,25 @@ def _lowest_modes(m: Any, k: Any, wanted: int) -> tuple[np.ndarray, np.ndarray]:
     return squared, shapes
 
 
-def _regular(stiffness: Any) -> bool:
-    """Whether a stiffness has an inverse: no motion without a force."""
-    try:
-        pivots = np.abs(scipy.sparse.linalg.splu(stiffness).U.diagonal())
-    except RuntimeError:  # exactly singular
-        return False
-    return bool(pivots.min() > _ROUNDING * pivots.max())
+class _Inverse:
+    """A factorised symmetric matrix, dense or sparse."""
+
+    def __init__(self, matrix: Any) -> None:
+        self.solve: Callable[[np.ndarray], np.ndarray] = lambda right: np.full_like(right, np.nan)
+        if scipy.sparse.issparse(matrix):
+            try:
+                factors = scipy.sparse.linalg.splu(matrix)
+            except RuntimeError:  # exactly singular
+                self.regular = False
+                return
+            self.solve, pivots = factors.solve, factors.U.diagonal()
+        else:
+            upper, order, _ = scipy.linalg.lapack.dgetrf(matrix)
+            self.solve = lambda right: scipy.linalg.lapack.dgetrs(upper, order, right)[0]
+            pivots = np.diag(upper)
+        size = np.abs(pivots)
+        # A motion without a force leaves a pivot of rounding.
+        self.regular = bool(size.min() > _ROUNDING * size.max())
 
 
 def _dense(matrix: Any) -> np.ndarray:
@@ -267,10 +300,15 @@ def _with_residuals(
     kept = np.concatenate([rigid, shapes], axis=1)
     columns = np.stack(loads, axis=1)
     columns = columns - m @ (kept @ (kept.T @ columns))  # nothing that the kept modes carry
-    if scipy.sparse.issparse(k):
-        ways = scipy.sparse.linalg.splu(k).solve(columns)
-    else:
-        ways = scipy.linalg.lstsq(k, columns)[0]  # singular where rigid-body modes exist
+    stiffness: Any = k
+    right = columns
+    if rigid.shape[1]:  # further equations fix the rigid motion, which these loads do not drive
+        held = m @ rigid * (np.abs(k.diagonal()).max() / np.abs(m @ rigid).max())
+        sparse = scipy.sparse.issparse(k)
+        rows = [[k, held], [held.T, None if sparse else np.zeros((rigid.shape[1],) * 2)]]
+        stiffness = scipy.sparse.block_array(rows, format="csc") if sparse else np.block(rows)
+        right = np.pad(columns, ((0, rigid.shape[1]), (0, 0)))
+    ways = _Inverse(stiffness).solve(right)[: len(shapes)]
     vectors = np.zeros((len(shapes), 0))
     for way in ways.T:
         left = way
@@ -284,25 +322,6 @@ def _with_residuals(
         return squared, shapes
     values, mixed = np.linalg.eigh(vectors.T @ (k @ vectors))
     return np.append(squared, values), np.column_stack([shapes, vectors @ mixed])
-
-
-def _damping(
-    damping: Any, shapes: np.ndarray, omega: np.ndarray
-) -> tuple[np.ndarray, np.ndarray | None]:
-    """Damping ratios, and what of the modal damping matrix they do not hold."""
-    if damping is None or (np.ndim(damping) == 0 and not scipy.sparse.issparse(damping)):
-        return np.full(omega.shape, 0.0 if damping is None else float(damping)), None
-    whole = _checked("damping", damping)
-    if whole.shape[0] != len(shapes):
-        raise ValueError(
-            f"`damping` has shape {whole.shape}, but there are {len(shapes)} unknowns."
-        )
-    modal = shapes.T @ (whole @ shapes)
-    own = np.diag(modal)
-    ratio = np.minimum(own / (2 * omega), _OVERDAMPED)
-    rest = modal - np.diag(2 * ratio * omega)
-    least = _NO_COUPLING * np.sqrt(np.abs(np.outer(own, own)))
-    return ratio, rest if np.any(np.abs(rest) > least) else None
 
 
 def chain(
@@ -387,6 +406,6 @@ def beam(
     points = tuple(names[k] for k in keep)
     damping = mass_damping * mass + stiffness_damping * stiffness
     for point, value in (springs or {}).items():
-        place = _place(points, point, "`springs`")
+        (place,) = _places(points, [point], "`springs`")
         stiffness[place, place] += value
     return Matrices(mass, damping, stiffness, points)

@@ -48,10 +48,15 @@ class SpringLinkage(AbstractMemoryless):
 
 
 class StaticLoad(AbstractMemoryless):
-    """A constant force that pulls a point, as a weight or a bolt does: `load` F, along +x."""
+    """A constant force F on the structure along +x, as a weight has it: f = −F; `load` is F.
+
+    The same force as `static_preload` of the same number.
+    """
 
     kind: ClassVar[str] = "static_load"
-    description: ClassVar[str] = "A constant load beside the driving force."
+    description: ClassVar[str] = (
+        "A constant force along the positive direction, in addition to the driving force."
+    )
     shape: ClassVar[Shape] = Shape(Part.STIFFNESS, Symmetry.EVEN, Argument.DISPLACEMENT)
     load: Scalar = parameter("kg^1/2 m/s²", "constant load")
 

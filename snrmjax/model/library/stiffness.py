@@ -183,15 +183,16 @@ class OneSidedStop(AbstractKinked):
 
 
 class StaticPreload(AbstractMemoryless):
-    """A constant force, which moves the position of rest; `constant_force` in kg^1/2 m/s².
+    """A constant force F on the structure along +q (at a point +x): f = −F; `constant_force` is F.
 
+    A positive number moves the rest position in the positive direction, as `static_load` does.
     With a nonlinear stiffness it shifts ω₀ and brings a second harmonic.
     """
 
     kind: ClassVar[str] = "static_preload"
     description: ClassVar[str] = (
-        "A constant force, such as weight or a clamping force, that moves the position of rest to "
-        "where a nonlinear spring is stiffer or softer."
+        "A constant force, such as weight or a clamping force, along the positive direction, that "
+        "moves the position of rest to where a nonlinear spring is stiffer or softer."
     )
     shape: ClassVar[Shape] = _EVEN
     confusions: ClassVar[tuple[Confusion, ...]] = (TOLD_BY_MEAN_OR_SECOND_HARMONIC,)
@@ -204,4 +205,4 @@ class StaticPreload(AbstractMemoryless):
         return [(size,), (-size,)]
 
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
-        return jnp.broadcast_to(self.constant_force, jnp.shape(displacement))
+        return jnp.broadcast_to(-self.constant_force, jnp.shape(displacement))

@@ -83,6 +83,7 @@ def _largest(curve: ResponseCurve, sensor: str) -> str:
     speed = np.abs(velocity[:, curve.sensors.index(sensor)])
     name = "" if curve.branch == Branch.MAIN else f" ({curve.branch})"
     load = "force" if curve.base is None else "base acceleration"
+    load = load if curve.unbalance is None else "unbalance"
     load = f"{load} {curve.force:g} {curve.force_unit}{name}"
     if not speed.size:
         return f"{load}: no response"

@@ -1,11 +1,28 @@
 """What pipelines have to tell beside what their parts tell."""
 
+from collections import Counter
+from collections.abc import Sequence
+
 from snrmjax.numerics.status import Status
 from snrmjax.report.sentences import Wording, enumerated
 
+_NOT_LOCATED = {
+    "branch": (
+        "a further response comes in from above the range, where no motion was found to start it "
+        "from: raise `--to-hz` until the resonance lies inside"
+    ),
+    "bifurcation": "a change of stability whose kind or frequency was not found",
+}
 
-def _ended(force: float, status: Status) -> str:
-    return f"force {force:g} N: {status.message}."
+
+def _not_located(force: float, unit: str, kinds: Sequence[str]) -> str:
+    counts = Counter(_NOT_LOCATED.get(kind, f"a {kind.replace('_', ' ')}") for kind in kinds)
+    each = [text if n == 1 else f"{text} ({n} times)" for text, n in counts.items()]
+    return f"force {force:g} {unit}: there is, but not in response.csv: {'; '.join(each)}."
+
+
+def _ended(force: float, unit: str, status: Status) -> str:
+    return f"force {force:g} {unit}: {status.message}."
 
 
 def _not_followed(status: Status) -> str:
@@ -133,11 +150,16 @@ SENTENCES: dict[str, Wording] = {
     "no_stable_response": _no_stable_response,
     "element_idle": _element_idle,
     "held_by_friction": _held,
+    "damping_not_known": (
+        "the damping ratio of mode {mode} is known to ± {relative_std:%.1g} (1σ) only, and so is a "
+        "peak there: stated in the model, or entries of its damping matrix are rounded (of a fine "
+        "mesh give `damping_ratio`, or a multiple of the stiffness)."
+    ),
     "curve_ended": _ended,
-    "curve_events_not_located": "force {force:g} N: not located: {kinds}.",
+    "curve_events_not_located": _not_located,
     "stability_not_computed": (
-        "force {force:g} N: the stability of {n} points could not be computed; response.csv has 0 "
-        "there and says so in `event`."
+        "force {force:g} {unit}: the stability of {n} points could not be computed; response.csv "
+        "has 0 there and says so in `event`."
     ),
     "further_equilibria": _equilibria,
     "load_scale_outside_plateau": (

@@ -4,6 +4,9 @@ Unknowns are scaled to order one: displacement coefficients by a displacement, t
 the natural frequency of the mode of interest, and the residual accordingly.
 """
 
+from collections.abc import Sequence
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -14,6 +17,7 @@ from snrmjax.model.averaging import AveragedForce
 from snrmjax.model.effect_base import AbstractHysteresis, AbstractKinked
 from snrmjax.model.elements import AlikeForces, elements_of
 from snrmjax.model.modes import phasor_of_load
+from snrmjax.model.moving_base import newtons
 from snrmjax.model.structures import Structure, linear_terms_of
 from snrmjax.numerics.compiled import as_numpy, compiled
 from snrmjax.simulate.balance.harmonics import (
@@ -35,7 +39,7 @@ class HarmonicBalance(eqx.Module):
     """
 
     model: Structure
-    force: Float[Array, ""]  # N, amplitude of a cosine
+    force: Float[Array, ""]  # N, amplitude of a cosine; or the multiple of an unbalance
     displacement_scale: Float[Array, ""]  # kg^1/2 m
     frequency_scale: Float[Array, ""]  # rad/s
     harmonic_order: int = eqx.field(static=True)
@@ -80,8 +84,12 @@ class HarmonicBalance(eqx.Module):
         shape = (len(points), self.n_coefficients, self.model.n_modes)
         return rows.reshape(shape), points[:, -1] * unit
 
+    def newtons(self, omega: Float[Array, ""]) -> Any:
+        """The force (N) at a scaled frequency; see `newtons` of modes."""
+        return newtons(self.model.modes.unbalance, omega * self.frequency_scale, self.force)
+
     def load(self) -> Float[Array, " equation"]:
-        """Scaled force of one newton: the right-hand side for `force` = 1."""
+        """Scaled force of one newton: the right-hand side where `newtons` is 1."""
         model = self.model
         if self.cosine_only:
             return jnp.zeros(self.size)
@@ -121,7 +129,7 @@ class HarmonicBalance(eqx.Module):
         internal = jnp.asarray(basis.analysis) @ (model.nonlinear_force(samples, rate) / unit)
         damped = terms.damped(slope) / fs
         balance = (stiffness - omega**2 * inertia) * x + omega * damped + internal
-        residual = balance.reshape(-1) - self.force * self.load()
+        residual = balance.reshape(-1) - self.newtons(omega) * self.load()
         if not with_jacobian:
             return residual, jnp.zeros((0,))
         # Adding zeros beside the diagonal is faster than writing to its entries one by one.
@@ -135,6 +143,8 @@ class HarmonicBalance(eqx.Module):
         blocks = blocks - of_inertia * (omega**2 * jnp.diag(terms.mass))
         blocks = blocks + of_damping * (omega * terms.damping_matrix() / fs)
         column = damped - 2 * omega * inertia * x
+        if model.modes.unbalance is not None:
+            column = column - (2 / omega * self.newtons(omega) * self.load()).reshape(size, n)
         if model.forces:
             added, by_omega = self._elements(samples, by_omega, omega)
             blocks, column = blocks + added, column + by_omega
@@ -296,7 +306,8 @@ def linear_coefficients(
     model: Structure, force: Float[Array, ""], frequency: Float[Array, ""], harmonic_order: int
 ) -> Float[Array, "coefficient mode"]:
     """Displacement coefficients of the linear response: where a forced response starts."""
-    terms, load = model.linear_terms(), force * phasor_of_load(model.modes)
+    terms = model.linear_terms()
+    load = newtons(model.modes.unbalance, frequency, force) * phasor_of_load(model.modes)
     stiffness = terms.stiffness - terms.mass * frequency**2 + 1j * terms.damping * frequency
     if terms.coupling is None:
         phasor = load / stiffness
@@ -306,39 +317,72 @@ def linear_coefficients(
     return start.at[1].set(phasor.real).at[2].set(-phasor.imag)
 
 
-def resonance_displacement(model: Structure, force: float) -> float:
-    """Rough displacement (kg^1/2 m) of the mode of interest at resonance: a scale, no result.
+def resonance_displacement(
+    model: Structure, force: float, within: Sequence[float] | np.ndarray | None = None
+) -> float:
+    """Rough displacement (kg^1/2 m) of the modes that move at resonance: a scale, no result.
 
-    Solves 2ζ̃ω̃ ω̃ Q = |P| with ω̃² = ω₀² + ¾·4c Q² from the mode's own quartic term, and with the
-    averages of the effects. The damping counts as at least that of ζ = 5e-5, and the scale is
-    at least the static displacement of every mode, so that no motion is small beside it.
+    Those are the modes of `resonant_modes`. Of each it solves 2ζ̃ω̃ ω̃ Q = |P| with
+    ω̃² = ω₀² + ¾·4c Q² from its own quartic term, and with the averages of the effects. The damping
+    counts as at least that of ζ = 5e-5, and the scale is at least the static displacement of every
+    mode, so that no motion is small beside it.
     """
-    modes, j = model.modes, model.modes.mode_of_interest
-    mass, damping, stiffness = (np.asarray(part) for part in linear_terms_of(model)[:3])
-    participation = np.asarray(modes.participation)
-    omega = np.sqrt(stiffness[j] / mass[j])
-    least_damping = 1e-4 * omega
-    load = abs(force * participation[j])
+    terms = linear_terms_of(model)
+    mass, damping, stiffness = (np.asarray(part) for part in terms[:3])
+    omega = np.sqrt(stiffness / mass)
+    load = np.abs(
+        newtons(model.modes.unbalance, omega, force) * np.asarray(phasor_of_load(model.modes))
+    )
+    springs = stiffness > 0
+    scale = float(np.max(load[springs] / stiffness[springs], initial=0.0))
+    for mode in resonant_modes(model, within):
+        least_damping = 1e-4 * omega[mode]
+        largest = load[mode] / (max(damping[mode], least_damping) * omega[mode])
+        if largest > scale:
+            amplitude = largest * np.logspace(-9, 0, 361)
+            squared, viscous = _averaged(model, mode, amplitude, omega[mode])
+            needed = np.maximum(damping[mode] + viscous, least_damping) * amplitude
+            needed = needed * np.sqrt(stiffness[mode] + squared)
+            risen = np.maximum.accumulate(needed)
+            scale = max(scale, float(np.interp(load[mode], risen, amplitude)))
+    return scale
+
+
+def _averaged(
+    model: Structure, mode: int, amplitude: Float[np.ndarray, " size"], frequency: float
+) -> tuple[Float[np.ndarray, " size"], Float[np.ndarray, " size"] | float]:
+    """What a mode's own quartic term and the effects add to its stiffness and damping."""
     values = dict(
         zip(model.potential.monomials, np.asarray(model.potential.coefficient), strict=True)
     )
-    quartic = max(3.0 * float(values.get((j,) * 4, 0.0)), 0.0)
-    static = float(np.max(np.abs(force * participation / stiffness)))
-    if load == 0:
-        return static
-    largest = load / (max(damping[j], least_damping) * omega)
-    amplitude = largest * np.logspace(-9, 0, 361)
-    needed_stiffness = stiffness[j] + quartic * amplitude**2
-    viscous = np.full(amplitude.shape, damping[j])
-    if model.forces:
-        row = np.asarray(elements_of(model.forces, modes).rows)[:, j]
-        there = np.abs(row) * amplitude[:, None]
-        each = jax.vmap(averaged_at_places, (None, 0, None))(model, there, omega)
-        stiffer, damped = (np.asarray(part) @ row**2 for part in each)
-        needed_stiffness = needed_stiffness + np.maximum(stiffer, 0.0)
-        viscous = viscous + damped
-    needed = np.maximum(viscous, least_damping) * np.sqrt(needed_stiffness) * amplitude
-    return float(np.maximum(static, np.interp(load, np.maximum.accumulate(needed), amplitude)))
+    quartic = max(3.0 * float(values.get((mode,) * 4, 0.0)), 0.0)
+    if not model.forces:
+        return quartic * amplitude**2, 0.0
+    row = np.asarray(elements_of(model.forces, model.modes).rows)[:, mode]
+    there = np.abs(row) * amplitude[:, None]
+    each = jax.vmap(averaged_at_places, (None, 0, None))(model, there, frequency)
+    stiffer, damped = (np.asarray(part) @ row**2 for part in each)
+    return quartic * amplitude**2 + np.maximum(stiffer, 0.0), damped
+
+
+def resonant_modes(
+    model: Structure, within: Sequence[float] | np.ndarray | None = None
+) -> list[int]:
+    """The modes that a force moves in resonance, the mode of interest before the others.
+
+    Those that it drives with natural frequencies `within` two frequencies (rad/s), or an octave
+    from them, as nonlinear ones come there; where none is, all that it drives. Without
+    frequencies the mode of interest, where it is driven.
+    """
+    modes, j = model.modes, model.modes.mode_of_interest
+    driven = modes.driven() & (np.asarray(modes.natural_frequency) > 0)
+    if within is None:
+        near = np.arange(len(driven)) == j
+    else:
+        natural = np.asarray(modes.natural_frequency)
+        near = (natural >= 0.5 * within[0]) & (natural <= 2 * within[-1])
+    some = driven & near if np.any(driven & near) else driven
+    return sorted(np.flatnonzero(some).tolist(), key=lambda mode: mode != j)
 
 
 @compiled

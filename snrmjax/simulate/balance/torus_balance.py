@@ -96,7 +96,7 @@ class TorusBalance(eqx.Module):
         order = fast * basis.fast + slow * basis.slow
         stiffness = terms.stiffness / fs**2
         linear = (stiffness - order[:, None] ** 2 * terms.mass) * x + terms.damped(speed) / fs
-        load = jnp.zeros(size).at[: balance.size].set(balance.force * balance.load())
+        load = jnp.zeros(size).at[: balance.size].set(balance.newtons(fast) * balance.load())
         residual = (linear + inner).reshape(-1) - load
 
         k, c = model.slopes(q, v)
@@ -119,6 +119,8 @@ class TorusBalance(eqx.Module):
             by_frequency(basis.by_slow, basis.slow),
             by_frequency(basis.by_fast, basis.fast),
         ]
+        if model.modes.unbalance is not None:
+            columns[1] = columns[1] - 2 / fast * load
         top = jnp.concatenate([by_x.reshape(size, size), jnp.stack(columns, axis=1)], axis=1)
         bottom = jnp.concatenate([self.phase, jnp.zeros(2)])
         equations = jnp.append(residual, self.phase @ point[:size])

@@ -22,7 +22,11 @@ class CurveStatus(Status):
 
     UPPER_END = 0, "traced to the upper end of the frequency range"
     LOWER_END = 1, "came back to the lower end of the frequency range"
-    POINT_LIMIT = 2, "stopped at the largest number of points; raise `max_points`"
+    POINT_LIMIT = (
+        2,
+        "stopped at the largest number of points; take a narrower range of frequencies (or, in "
+        "Python, `StepControl` with more `max_points`)",
+    )
     STEP_TOO_SMALL = (
         3,
         "stopped early: Newton's method fails at the smallest step; use more harmonics or samples",

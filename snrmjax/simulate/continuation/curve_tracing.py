@@ -18,6 +18,7 @@ from snrmjax.simulate.balance.harmonic_balance import (
     HarmonicBalance,
     linear_coefficients,
     resonance_displacement,
+    resonant_modes,
     samples_for,
 )
 from snrmjax.simulate.continuation.continuation import (
@@ -43,16 +44,21 @@ def response_balances(
     forces: Float[np.ndarray, " member"],
     harmonic_order: int,
     n_samples: int | None,
+    within: Float[np.ndarray, " end"] | None = None,
 ) -> HarmonicBalance:
-    """The balances of all members under their forces (N), stacked."""
-    together = stacked(models)
-    j = models[0].modes.mode_of_interest
-    scales = [resonance_displacement(m, float(f)) for m, f in zip(models, forces, strict=True)]
+    """The balances of all members under their forces (N), stacked.
+
+    Their scales are those of the modes that move `within` two frequencies (rad/s).
+    """
+    together, every = stacked(models), list(zip(models, forces, strict=True))
+    scales = [resonance_displacement(m, float(f), within) for m, f in every]
+    first = [resonant_modes(m, within)[:1] or [m.modes.mode_of_interest] for m in models]
+    natural = np.asarray(together.modes.natural_frequency)
     # On the host: on the device another number of members would compile anew.
     columns: dict[str, Any] = {
         "force": np.asarray(forces),
         "displacement_scale": np.asarray(scales),
-        "frequency_scale": np.asarray(together.modes.natural_frequency)[:, j],
+        "frequency_scale": np.take_along_axis(natural, np.array(first), axis=1)[:, 0],
     }
     return HarmonicBalance(
         model=together,
@@ -217,7 +223,7 @@ def _tracer(balance: HarmonicBalance, ends: Array, steps: StepControl, way: _Way
     if way not in ("rising", "past"):
         groups, closes = (balance.n_coefficients, balance.model.n_modes), way == "through"
         return CurveTracer(balance.linearised, CurveRange(lower, upper), steps, groups, closes)
-    load = balance.force * balance.load()
+    load = balance.newtons(lower) * balance.load()
 
     def linearised(point: Array) -> tuple[Array, Array]:
         """Unknowns x and the share of the force."""

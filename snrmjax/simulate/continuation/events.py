@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from snrmjax.model.modes import STILL
 from snrmjax.numerics.blocks import over_cores, taken
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.lanes import TOGETHER, StateRows, in_lanes, in_rows, iterated, lanes_for
@@ -35,7 +36,11 @@ def velocities_along(
     xp: Any = np if isinstance(points, np.ndarray) else jnp
     modes, j = balance.model.modes, balance.model.modes.mode_of_interest
     shape = modes.mode_shape[0] / xp.max(xp.abs(modes.mode_shape[0]))
-    sign = xp.sign(modes.participation[j])
+    drive = xp.abs(modes.participation)
+    drive = drive / xp.maximum(xp.max(drive), np.finfo(float).tiny)
+    # Where the force leaves the mode of interest alone, what it moves tells the phase.
+    of_interest = np.eye(balance.model.n_modes)[j]
+    weight = xp.sign(modes.participation) * xp.where(drive[j] > STILL, of_interest, drive)
     size = (*points.shape[:-1], balance.n_coefficients, balance.model.n_modes)
     pairs, turns = (rows[..., :-1].reshape(size)[..., 1:3, :] for rows in (points, tangents))
     omega, faster = points[..., -1], tangents[..., -1]
@@ -43,7 +48,7 @@ def velocities_along(
     square = xp.sum(seen**2, axis=-1)
     growth = 2 * omega * (faster * square + omega * xp.sum(seen * change, axis=-1))
     # The velocity is Ω (sine + i cosine).
-    modal, rate = sign * pairs[..., j], sign * turns[..., j]
+    modal, rate = pairs @ weight, turns @ weight
     parts = omega[..., None] * modal
     slopes = faster[..., None] * modal + omega[..., None] * rate
     return (

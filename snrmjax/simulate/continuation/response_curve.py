@@ -9,7 +9,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from snrmjax.model.moving_base import BaseMotion
+from snrmjax.model.moving_base import BaseMotion, drive_unit
 from snrmjax.numerics.blocks import by_member, mapped, taken
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
@@ -45,11 +45,13 @@ class MotionCurve(AbstractResult):
     sensors: tuple[str, ...] = quantity("sensor", "", "sensor", name="sensor", static=True)
     # Where a base drives it, "forces" are its accelerations and velocities relative to it.
     base: BaseMotion | None = eqx.field(static=True, default=None, kw_only=True)
+    # Where an unbalance U (kg m) drives it, by the force c U Ω², "forces" are the numbers c.
+    unbalance: float | None = eqx.field(static=True, default=None, kw_only=True)
 
     @property
     def force_unit(self) -> str:
-        """Unit of what drives it: newtons, or m/s² of a base."""
-        return "N" if self.base is None else "m/s²"
+        """Unit of what drives it: newtons, m/s² of a base, or a number of unbalances."""
+        return drive_unit(self.base, self.unbalance)
 
     def variables(self) -> dict[str, Variable]:
         """The quantities of the curve, and its velocities by the names of the files' columns."""
@@ -67,7 +69,8 @@ def motions_of(balance: HarmonicBalance, points: Float[np.ndarray, "point unknow
     whole = with_sines(coefficients) if balance.cosine_only else coefficients
     velocity = velocity_phasors(whole, frequency, np.asarray(modes.mode_shape))
     named = {"frequency": frequency, "coefficients": coefficients, "velocity": velocity}
-    return {**named, "sensors": modes.sensors, "base": modes.base}
+    unbalance = None if modes.unbalance is None else float(modes.unbalance)
+    return {**named, "sensors": modes.sensors, "base": modes.base, "unbalance": unbalance}
 
 
 def velocity_at_sensors(
@@ -155,7 +158,9 @@ class ResponseCurve(MotionCurve):
                 f"events: {events or 'none'}",
             ]
         if self.not_located:
-            lines.append(f"not located: {_counted(self.not_located)}")
+            names = {"branch": "branch that comes in at the upper end"}
+            missed = _counted(names.get(kind, kind) for kind in self.not_located)
+            lines.append(f"there, but not located: {missed}")
         return (*lines, f"status: {self.status.message}")
 
     def variables(self) -> dict[str, Variable]:

@@ -181,7 +181,8 @@ def phase_controlled(
 
     Arguments: `largest_force` in N; the curve starts at a hundredth of it. `phase` φ in rad.
     Returns a `ControlledCurve`; its `status` is UPPER_END when the largest force was reached.
-    Raises `ValueError` for a force that is not positive and a phase beyond ±π/2.
+    Raises `ValueError` for a force that is not positive, a phase beyond ±π/2 and a force that does
+    not move the mode of interest.
     Not differentiable: differentiate single motions: `snrmjax.simulate.periodic_motion`.
     Reference: Peeters, Kerschen & Golinval, J. Sound Vib. 330 (2011) 486,
     doi:10.1016/j.jsv.2010.08.028.
@@ -190,6 +191,8 @@ def phase_controlled(
     if not abs(phase) < np.pi / 2:
         raise ValueError(f"`phase` must lie between -π/2 and π/2, but is {phase:g} rad.")
     model = simulated_structure(model)
+    if not model.modes.driven()[model.modes.mode_of_interest]:
+        raise ValueError("the force does not move the mode of interest: it has no phase to hold.")
     balance = harmonic_balance(
         model,
         largest_force,
@@ -328,5 +331,5 @@ def _with_force(
     """Residual and Jacobian under a share of the force, the last column for the share."""
     now = eqx.tree_at(lambda b: b.force, balance, balance.force * share)
     residual, jacobian = now.linearised(point)
-    column = -balance.force * balance.load()
+    column = -balance.newtons(point[-1]) * balance.load()
     return residual, jnp.concatenate([jacobian, column[:, None]], axis=1)

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from snrmjax.model.effect_base import AbstractForce, AbstractKinked
 from snrmjax.model.elements import elements_of
 from snrmjax.model.library.friction import CoulombFriction, JenkinsSlider
+from snrmjax.model.moving_base import newtons
 from snrmjax.model.places import row_text
 from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.simulate.balance.harmonics import harmonic_basis
@@ -70,7 +71,9 @@ def friction_hold(model: Structure, from_frequency: float, to_frequency: float) 
     dynamic = dynamic + 1j * omega * np.asarray(terms.damping)
     holds = []
     for friction, row in _forces(model, CoulombFriction):
-        free = (1 / dynamic) @ (row * np.asarray(model.modes.participation))
+        free = (newtons(model.modes.unbalance, omega, 1.0) / dynamic) @ (
+            row * np.asarray(model.modes.participation)
+        )
         held = np.abs(free / ((1 / dynamic) @ row**2))
         if held.max() > 0:
             holds.append(Hold(_name(friction), float(friction.force) / float(held.max())))

@@ -50,7 +50,7 @@ class EventCurveEnd(Status):
 
     UPPER_END = 0, "the upper end of the range"
     LOWER_END = 1, "the lower end of the range"
-    POINT_LIMIT = 2, "the largest number of points; raise `max_points`"
+    POINT_LIMIT = 2, "the largest number of points (in Python: raise `max_points`)"
     STEP_TOO_SMALL = 3, "where Newton's method fails at the smallest step; use more harmonics"
     NO_START = 4, "its start, where there is no such event; start at a point with this event"
     CLOSED = 6, "where it started: a closed curve"

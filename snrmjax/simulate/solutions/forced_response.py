@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
+from snrmjax.model.moving_base import newtons
 from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.numerics.blocks import mapped, on_one_core, taken
 from snrmjax.numerics.compiled import compiled, on_numbers, without_derivative
@@ -248,7 +249,9 @@ def _chunk_of_curves(
     if not good:
         return [tuple(curves) for curves in results]
     some = [models[k] for k in good]
-    balances = response_balances(some, forces[good], settings.harmonic_order, settings.n_samples)
+    balances = response_balances(
+        some, forces[good], settings.harmonic_order, settings.n_samples, ends
+    )
     lanes = 1 if alone else lanes_for(balances.size + 1)
     found = curves_from_rest(some, balances, ends, settings.steps, lanes)
     owner = [k for k, one in enumerate(found) for _ in one.curves]
@@ -295,6 +298,7 @@ def _no_curve(model: Structure, force: float, harmonic_order: int) -> ResponseCu
         status=CurveStatus.INVALID,
         sensors=sensors,
         base=model.modes.base,
+        unbalance=None if model.modes.unbalance is None else float(model.modes.unbalance),
         force=force,
         event=(),
     )
@@ -335,7 +339,9 @@ def _solve_batch(
 
     def solved(force: Array, frequency: Array, start: Array) -> tuple[Array, Array]:
         # A guess of zero is allowed: the static displacement keeps the unknowns of order one.
-        static = force * model.modes.participation / model.modes.natural_frequency**2
+        static = newtons(model.modes.unbalance, frequency, force) * model.modes.participation
+        squared = model.modes.natural_frequency**2
+        static = jnp.where(squared > 0, static / jnp.where(squared > 0, squared, 1.0), 0.0)
         scale = jnp.maximum(jnp.max(jnp.abs(start)), jnp.max(jnp.abs(static)))
         balance = harmonic_balance(
             model, force, scale, harmonic_order=harmonic_order, n_samples=n_samples

@@ -10,6 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from snrmjax.model.modes import STILL
+from snrmjax.model.moving_base import newtons
 from snrmjax.model.structures import Structure, equilibria
 from snrmjax.numerics.blocks import taken
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance
@@ -197,7 +199,10 @@ def _add_from_beyond(
     """Curves that enter at the lower (upper) end from below (above) a resonance outside."""
     end = float(ends[int(downward)])
     natural = np.asarray(balances.model.modes.natural_frequency)  # of every member
-    ratio = natural / end if downward else end / natural
+    # What elements alone hold has no frequency.
+    ratio = (
+        natural if downward else np.where(natural > 0, end**2 / np.maximum(natural, 1e-300), 0.0)
+    ) / end
     reach = _REACH_OF_MODE_ABOVE if downward else _REACH_OF_MODE_BELOW
     near = (ratio > 1) & (ratio < reach)
     owners = np.flatnonzero(near.any(axis=1)).tolist()
@@ -268,12 +273,16 @@ def _is_near_rest(
     balances: HarmonicBalance, member: int, point: Float[np.ndarray, " unknown"]
 ) -> bool:
     """Whether a point is about the linear response there."""
-    model, j = balances.model, balances.model.modes.mode_of_interest
-    omega = float(point[-1])  # over the natural frequency
-    damping = model.modes.damping_ratio.item(member, j)
-    natural = model.modes.natural_frequency.item(member, j)
-    load = float(balances.force[member]) * model.modes.participation.item(member, j)
-    linear = load / (natural**2 * (1 - omega**2 + 2j * damping * omega))
-    x = point[:-1].reshape(balances.n_coefficients, -1)[1:3, j]
-    fundamental = complex(x[0], -x[1]) * float(balances.displacement_scale[member])
-    return abs(fundamental - linear) < _NEAR_LINEAR * abs(linear)
+    modes, j = balances.model.modes, balances.model.modes.mode_of_interest
+    drive = np.asarray(modes.participation)[member]
+    own = np.abs(drive[j]) > STILL * np.max(np.abs(drive))
+    some = [j] if own else np.flatnonzero(drive)
+    natural, damping = (
+        np.asarray(part)[member, some] for part in (modes.natural_frequency, modes.damping_ratio)
+    )
+    omega = float(point[-1] * balances.frequency_scale[member])
+    force = newtons(taken(modes, member).unbalance, omega, float(balances.force[member]))
+    linear = force * drive[some] / (natural**2 - omega**2 + 2j * damping * natural * omega)
+    x = point[:-1].reshape(balances.n_coefficients, -1)[1:3, some]
+    fundamental = (x[0] - 1j * x[1]) * float(balances.displacement_scale[member])
+    return bool(np.linalg.norm(fundamental - linear) < _NEAR_LINEAR * np.linalg.norm(linear))

@@ -48,7 +48,9 @@ def integrated_cycle(
     # What the linear modes would do: the scale before the first cycle, and against rest.
     receptance = terms.stiffness - terms.mass * frequency**2 + 1j * terms.damping * frequency
     linear = jnp.max(jnp.abs(load) / jnp.maximum(jnp.abs(receptance), 1e-3 * terms.stiffness))
-    static = jnp.max(jnp.abs(load) / terms.stiffness)
+    sprung = terms.stiffness > 0
+    springs = jnp.where(sprung, terms.stiffness, 1.0)
+    static = jnp.max(jnp.where(sprung, jnp.abs(load) / springs, 0.0))
     fresh = point.size == 0
     start = jnp.maximum(jnp.max(jnp.abs(point.q)), jnp.max(jnp.abs(point.v)) / frequency)
     first = jnp.maximum(linear, start)

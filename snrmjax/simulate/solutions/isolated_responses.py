@@ -139,7 +139,7 @@ def isolated_responses(
         plain = dataclasses.replace(settings, stability=False)
         (known,) = forced_response_batch(model, load, *ends, settings=plain).curves
     balances = response_balances(
-        [model], np.array([load]), settings.harmonic_order, settings.n_samples
+        [model], np.array([load]), settings.harmonic_order, settings.n_samples, ends
     )
     balance = as_arrays(taken(balances, 0))
     resonances, backbone_status = _phase_resonances(balance)
@@ -212,6 +212,8 @@ def _starts(
 
 def _phase_resonances(balance: HarmonicBalance) -> tuple[list[Start], CurveStatus]:
     """Where the force-appropriated backbone passes this force, and how the backbone ended."""
+    if not balance.model.modes.driven()[balance.model.modes.mode_of_interest]:
+        return [], CurveStatus.NO_START
     force = float(balance.force)
     backbone = phase_controlled(
         balance.model,

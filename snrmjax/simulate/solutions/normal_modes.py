@@ -180,7 +180,8 @@ def conservative(model: Structure) -> Structure:
     ones = as_numpy(np.ones(model.n_modes))
     # Damping ratios that cancel what linear changes add, which depends linearly on them.
     none, whole = (as_numpy(linear_terms_of(with_ratio(k * ones)).damping) for k in (0.0, 1.0))
-    return with_ratio(jnp.asarray(none / (none - whole)))
+    changes = none != whole  # not of a mode of zero frequency, whose damping is no ratio
+    return with_ratio(jnp.asarray(none / np.where(changes, none - whole, 1.0)))
 
 
 @compiled

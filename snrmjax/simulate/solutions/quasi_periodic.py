@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from snrmjax.model.moving_base import BaseMotion
+from snrmjax.model.moving_base import BaseMotion, drive_unit
 from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.numerics.blocks import on_one_core
 from snrmjax.numerics.compiled import compiled, on_numbers
@@ -41,7 +41,7 @@ class TorusEnd(Status):
 
     UPPER_END = 0, "the upper end of the frequency range"
     LOWER_END = 1, "the lower end of the frequency range"
-    POINT_LIMIT = 2, "the largest number of points; raise `max_points`"
+    POINT_LIMIT = 2, "the largest number of points (in Python: raise `max_points`)"
     STEP_TOO_SMALL = 3, "where Newton's method fails at the smallest step; raise `slow_order`"
     NO_START = 4, "at its start: there is no quasi-periodic motion near it with these harmonics"
     CLOSED = 6, "where it started: a closed branch"
@@ -82,11 +82,12 @@ class QuasiPeriodicBranch(AbstractResult):
     status: TorusEnd = setting()
     sensors: tuple[str, ...] = quantity("sensor", "", "sensor", name="sensor", static=True)
     base: BaseMotion | None = eqx.field(static=True, default=None)
+    unbalance: float | None = eqx.field(static=True, default=None)  # kg m
 
     @property
     def force_unit(self) -> str:
-        """Unit of what drives it: newtons, or m/s² of a base."""
-        return "N" if self.base is None else "m/s²"
+        """Unit of what drives it: newtons, m/s² of a base, or a number of unbalances."""
+        return drive_unit(self.base, self.unbalance)
 
     @property
     def slow_period(self) -> Float[np.ndarray, " point"]:
@@ -301,6 +302,7 @@ def _as_result(torus: TorusBalance, points: np.ndarray, status: TorusEnd) -> Qua
         status=status,
         sensors=modes.sensors,
         base=modes.base,
+        unbalance=None if modes.unbalance is None else float(modes.unbalance),
     )
 
 

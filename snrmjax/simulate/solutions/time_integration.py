@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
+from snrmjax.model.moving_base import newtons
 from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.numerics.compiled import jitted
 from snrmjax.numerics.result import AbstractResult, Variable
@@ -240,7 +241,8 @@ def _stepped(
     def dwell(point: CyclePoint, step: tuple[Array, Array]) -> tuple[CyclePoint, IntegratedMotion]:
         frequency, order = step
         now = eqx.tree_at(lambda m: m.test_order, model, order)
-        settled = _settle(now, force, frequency, point, harmonic_order, settings)
+        acting = newtons(model.modes.unbalance, frequency, force)
+        settled = _settle(now, acting, frequency, point, harmonic_order, settings)
         end = settled.point
         motion = IntegratedMotion(
             force=force,

@@ -133,6 +133,10 @@ class Laboratory(eqx.Module):
                 f"the virtual laboratory has its own shaker and instruments, but the model has "
                 f"{kinds}: state them in `shaker` and `instruments`."
             )
+        if self.structure.modes.unbalance is not None:
+            raise ValueError(
+                "the virtual laboratory drives by a shaker, but an unbalance drives the model."
+            )
         if self.structure.hysteretic and not self.largest_displacement > 0:
             kinds = ", ".join(effect.kind for effect in self.structure.hysteretic)
             raise ValueError(

@@ -11,6 +11,7 @@ from jaxtyping import Array, Complex, Float, Int
 
 from snrmjax.measure.states import SteadyStates, steady_states
 from snrmjax.model.modes import LinearModes
+from snrmjax.model.moving_base import newtons
 from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.simulate.balance.harmonics import displacement_phasors, velocity_phasors
 from snrmjax.simulate.continuation.response_curve import ResponseCurve
@@ -82,7 +83,8 @@ def recorded_states(
     measurement effects in their order; random errors come last.
     """
     modes = simulated_structure(model).modes
-    frequency, force = jnp.asarray(states.frequency), jnp.asarray(states.force)
+    frequency = jnp.asarray(states.frequency)
+    force = newtons(modes.unbalance, frequency, jnp.asarray(states.force))
     coefficients = jnp.asarray(states.coefficients)
     velocity = velocity_phasors(coefficients, frequency, modes.mode_shape)
     velocity = velocity + _rigid_body_velocity(model, frequency, force, velocity.shape[1])
