@@ -298,14 +298,14 @@ def _found(
     if few is not None and not is_linear(values, time, few, noise):
         parts = parts_of_decay(values, rate, candidates, noise, progress)
     if parts and any(part.bent for part in parts):
-        return _moving(small_motion(parts, values, rate), values, rate)
+        return _moving(parts, values, rate)
     found = few if poles is not None else with_modes(values, time, start, few)
     if found is None:
         raise ValueError(_NOTHING)
     if poles is not None:
         return FoundModes(found, np.ones(found.form.n_modes, dtype=bool))
     if parts and left_by_linear_modes(parts, found, noise):
-        return _moving(small_motion(parts, values, rate), values, rate)
+        return _moving(parts, values, rate)
     kept = significant(found)
     while not kept.all() and found.form.n_modes > 1:
         found = without_mode(values, time, found, int(np.flatnonzero(~kept)[0]))
@@ -316,7 +316,8 @@ def _found(
     return FoundModes(found, kept)
 
 
-def _moving(chosen: PartFit, values: np.ndarray, rate: float) -> FoundModes:
+def _moving(parts: list[PartFit], values: np.ndarray, rate: float) -> FoundModes:
+    chosen, kept = small_motion(parts, values, rate)
     found = chosen.found
     omega = found.natural_frequency[found.form.leading]
     note = Fact(
@@ -326,8 +327,6 @@ def _moving(chosen: PartFit, values: np.ndarray, rate: float) -> FoundModes:
         from_hz=frequency_at(values, chosen.first, rate, float(omega)),
         powers=found.form.powers,
     )
-    kept = significant(found) & (found.damping_ratio > 0)
-    kept[found.form.leading] = True
     return FoundModes(found, kept, chosen.first, chosen.spread, (note,))
 
 

@@ -11,11 +11,12 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from snrmjax.identify.modal.decay_fit import (
     DecayFit,
     fit_waves,
+    significant,
     with_harmonics,
     with_modes,
     without_mode,
@@ -40,10 +41,11 @@ _FRICTION: tuple[tuple[int, ...], ...] = ((-1,), (-1, 2))
 _BETTER = 6.0  # of Schwarz' criterion
 _MOST_GROWN = 2.0  # of an amplitude's logarithm, from one beginning to an earlier one
 _MOVES = 30.0  # χ² of all that moves with the amplitude, from which on it is not chance
-_LEFT = 1.2  # residuals of what a beginning adds, over the noise
+_LEFT = 1.05  # residuals over the noise, that few samples exceed by three of its standard errors
 _LEFT_OF_MOTION = 1e-5  # of the motion: no less noise is looked for
 _CYCLES_OF_LINE = 10
 _NOT_KNOWN = (0.01, 0.5)  # 1σ over ω and ζ
+_SAME = 0.02  # of a frequency, between a mode of two parts
 _FURTHEST = (0.02, 0.25)  # relative change of ω and of ζ from the last motion recorded to none
 
 
@@ -53,7 +55,7 @@ class PartFit(NamedTuple):
     first: int  # sample
     seconds: float  # from there to the end
     found: DecayFit
-    left: float  # rms residual over noise, of the samples that the next later part does not have
+    settled: bool  # noise alone is left in what the next later part does not have
     moves: float  # χ² of what moves with the amplitude
     spread: Float[np.ndarray, "2"]  # 1σ of ω and ζ of the leading mode by the choice of powers
 
@@ -112,7 +114,7 @@ def left_by_linear_modes(
     parts: list[PartFit], found: DecayFit, noise: Float[np.ndarray, " channel"]
 ) -> bool:
     """Whether linear modes leave noise alone of a later part, but not of the whole record."""
-    return parts[0].left > _LEFT >= parts[-1].left and not _settled(found, noise)
+    return parts[-1].settled and not parts[0].settled and not _settled(found, noise)
 
 
 def parts_of_decay(
@@ -141,9 +143,9 @@ def parts_of_decay(
             continue
         found, spread = fitted
         added = found.residuals[:, : None if later is None else later.first - first]
-        left = float(np.sqrt(np.mean((added / noise[:, None]) ** 2)))
-        parts.append(PartFit(first, float(time[-1]), found, left, _moves(found), spread))
-        if left > _LEFT and later is not None and later.left < _LEFT:
+        settled = _of_noise(added, noise)
+        parts.append(PartFit(first, float(time[-1]), found, settled, _moves(found), spread))
+        if later is not None and later.settled and not settled:
             break
     return parts[::-1]
 
@@ -222,7 +224,12 @@ def _without_needless(found: DecayFit, part: np.ndarray, time: np.ndarray) -> De
 
 def _settled(found: DecayFit, noise: np.ndarray) -> bool:
     """Whether noise alone is left."""
-    return bool(np.mean((found.residuals / noise[:, None]) ** 2) < _LEFT**2)
+    return _of_noise(found.residuals, noise)
+
+
+def _of_noise(residuals: np.ndarray, noise: np.ndarray) -> bool:
+    allowed = _LEFT + 3 / np.sqrt(2 * residuals.size)
+    return bool(np.mean((residuals / noise[:, None]) ** 2) < allowed**2)
 
 
 def _with_better_powers(base: DecayFit, part: np.ndarray, time: np.ndarray) -> list[DecayFit]:
@@ -280,23 +287,27 @@ def _with_powers(
 
 def small_motion(
     parts: list[PartFit], values: Float[np.ndarray, "channel sample"], rate: float
-) -> PartFit:
-    """The part and fit whose limit of small motion counts.
+) -> tuple[PartFit, Bool[np.ndarray, " mode"]]:
+    """The part and fit whose limit of small motion counts, and which of its modes are modes.
+
+    Beside the leading one those that the next later part has too: what a mode that moves leaves
+    unexplained is no mode.
 
     Its 1σ holds the choice of powers and what the next later part says.
     Raises `ValueError` where rates move with the amplitude and the limit is not in the record.
     """
     moving = [part for part in parts if part.bent]
     chosen: PartFit | None = None
+    before: PartFit | None = None
     for part in reversed(parts):
-        if part.left > _LEFT:
+        if not part.settled:
             break
         if chosen is not None:
             (here, std), (there, there_std) = part.limit(), chosen.limit()
             off = np.abs(here - there)
             beyond = np.sqrt(np.maximum(off**2 - np.maximum(there_std**2 - std**2, 0.0), 0.0))
             part = part._replace(spread=np.hypot(part.spread, beyond))
-        chosen = part
+        chosen, before = part, chosen
     if chosen is None:
         raise ValueError(_refusal(parts, values, rate, "no part of it is explained"))
     here = values[:, chosen.first :]
@@ -315,7 +326,12 @@ def small_motion(
     if value[1] <= 0 or np.any(change > _FURTHEST) or np.any(std / value > _NOT_KNOWN):
         why = "they are still changing where it ends or drowns in noise"
         raise ValueError(_refusal(parts, values, rate, why))
-    return chosen
+    kept = significant(found) & (found.damping_ratio > 0)
+    if before is not None:
+        later = before.found.natural_frequency
+        kept &= np.abs(found.natural_frequency[:, None] / later - 1).min(axis=1) < _SAME
+    kept[found.form.leading] = True
+    return chosen, kept
 
 
 def _refusal(
@@ -324,7 +340,7 @@ def _refusal(
     """That the decay is not linear, why its limit is not known, and what part is linear."""
     omega = parts[-1].limit()[0][0]
     first, last = (frequency_at(values, at, rate, omega) for at in (0, parts[-1].first))
-    linear = [part for part in parts if not part.bent and part.left <= _LEFT]
+    linear = [part for part in parts if not part.bent and part.settled]
     words = "no part of the record is linear within noise"
     if linear:
         (natural, ratio), (std, ratio_std) = linear[0].limit()
