@@ -47,6 +47,7 @@ _SAMPLES_PER_CYCLE = 5  # kept of the highest frequency asked for
 _LONG = 12_000  # samples of a channel, from which on a record is cut and thinned to what it holds
 _SAMPLES_OF_LINE = 3  # kept of a cycle of the highest line: the filter passes 0.8 of half the rate
 _ABOVE = 30.0  # of the median power of a spectrum, which noise exceeds once in 1e9 lines
+_FILTER_ENDS = 20  # samples that a thinning filter spoils
 _BEYOND = 1.3  # of the time in which the motion is larger than the noise
 _NOTHING = "no mode of positive damping stands out of the noise of the decay."
 _FEW_MODES = 6  # with which a record is tried for being linear
@@ -127,6 +128,8 @@ def fit_free_decay(
         for factor in _factors(step):
             values = decimate(values, factor, axis=1, zero_phase=True)
             rate /= factor
+            # At the ends the filter sees one side of the record.
+            values = values[:, _FILTER_ENDS:-_FILTER_ENDS]
     values = values[:, :_MOST_SAMPLES]
     if values.shape[1] < _FEWEST_SAMPLES:
         raise ValueError(

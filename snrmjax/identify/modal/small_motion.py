@@ -28,6 +28,7 @@ Candidates = Callable[[Float[np.ndarray, "channel sample"]], list[complex]]
 """Poles of a part of the record."""
 
 _MEDIAN_OF_POWER = float(np.log(2))  # over the mean, of a spectrum's bins
+_NOISE_BANDS = 16
 _HALVINGS = 10  # of the amplitude, from the first beginning to the last
 _FEWEST_SAMPLES, _FEWEST_CYCLES = 60, 8
 _MOST_MODES, _MORE_MODES = 6, 2  # of linear modes, and with a mode that moves
@@ -73,13 +74,20 @@ class PartFit(NamedTuple):
 
 
 def noise_of_channels(values: Float[np.ndarray, "channel sample"]) -> Float[np.ndarray, " channel"]:
-    """1σ of white noise by the median of the spectrum."""
+    """1σ of noise that is white but for what a filter took out of it, by medians of the spectrum.
+
+    In bands far below the others a filter has taken it; bands above them hold modes.
+    """
     window = np.hanning(values.shape[1])
     spectrum = np.fft.rfft((values - values.mean(axis=1, keepdims=True)) * window, axis=1)
-    power = np.median(np.abs(spectrum) ** 2, axis=1) / np.sum(window**2)
-    return np.hypot(
-        np.sqrt(power / _MEDIAN_OF_POWER), _LEFT_OF_MOTION * np.sqrt(np.mean(values**2, axis=1))
+    power = np.abs(spectrum) ** 2 / np.sum(window**2) / _MEDIAN_OF_POWER
+    density = np.stack(
+        [np.median(band, axis=1) for band in np.array_split(power, _NOISE_BANDS, axis=1)]
     )
+    level = np.median(density, axis=0)
+    density = np.where(density < level / 2, density, level)
+    motion = np.mean(values**2, axis=1)
+    return np.sqrt(density.mean(axis=0) + _LEFT_OF_MOTION**2 * motion)
 
 
 def envelope(

@@ -31,10 +31,16 @@ def decay(seconds, *, noise=1e-3, **forces):
     return time_recording(velocity[None], [Channel("v", "velocity")], RATE)
 
 
-@pytest.mark.parametrize("force", [{"cubic": 0.3}, {"cubic": -0.2}, {"drag": 0.04}])
-def test_the_limit_of_small_motion_lies_in_its_band(force):
+@pytest.mark.parametrize(
+    ("force", "to_hz"), [({"cubic": 0.3}, None), ({"cubic": -0.2}, 100.0), ({"drag": 0.04}, None)]
+)
+def test_the_limit_of_small_motion_lies_in_its_band(force, to_hz):
     done = []
-    found = fit_free_decay(decay(1.5, **force), progress=lambda *part: done.append(part))
+    found = fit_free_decay(
+        decay(1.5, **force),
+        to_frequency=to_hz and to_hz * HERTZ,
+        progress=lambda *part: done.append(part),
+    )
     assert found.n_modes == 1
     assert [note.kind for note in found.notes] == ["decay_moves_with_amplitude"]
     off = (found.natural_frequency[0] - HERTZ * HZ) / found.natural_frequency_std[0]
