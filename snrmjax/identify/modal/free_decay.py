@@ -14,12 +14,12 @@ from scipy.signal import decimate
 
 from snrmjax.identify.modal.decay_fit import (
     DecayFit,
+    WaveForm,
     fit_waves,
     significant,
     with_modes,
     without_mode,
 )
-from snrmjax.identify.modal.decay_waves import WaveForm
 from snrmjax.identify.modal.modal_fit import REAL, AbstractModalFit, phase_collinearity
 from snrmjax.identify.modal.pole_orders import PoleOrders, clusters, gathered
 from snrmjax.identify.modal.small_motion import (

@@ -85,18 +85,22 @@ def fit_separable(
     bounds: tuple[Float[np.ndarray, " unknown"], Float[np.ndarray, " unknown"]],
     *,
     settled: float = _RULE.settled,
+    steps: int = _RULE.steps,
 ) -> SeparableFit:
     """The weighted least-squares fit and its covariance for errors of unit variance.
 
     Residuals of neighbouring rows may be correlated (windows, smooth misfits): their correlation,
     as long as it is significant, widens the covariance. The fit ends when a step lowers the sum of
-    squares by less than `settled`.
+    squares by less than `settled`, or after `steps`.
     """
 
     def linearised(points: np.ndarray) -> list["_Compressed"]:
         return [_compressed(basis_at(point), measured) for point in points]
 
-    begin, rule = np.clip(start, *bounds)[None], dataclasses.replace(_RULE, settled=settled)
+    begin, rule = (
+        np.clip(start, *bounds)[None],
+        dataclasses.replace(_RULE, settled=settled, steps=steps),
+    )
     end = minimise(linearised, begin, linearised(begin), bounds, rule)[0]
     return _with_covariance(basis_at(end.point), measured, end.point, end.status)
 

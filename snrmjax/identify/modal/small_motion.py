@@ -15,13 +15,14 @@ from jaxtyping import Bool, Float
 
 from snrmjax.identify.modal.decay_fit import (
     DecayFit,
+    WaveForm,
+    decaying_columns,
     fit_waves,
     significant,
     with_harmonics,
     with_modes,
     without_mode,
 )
-from snrmjax.identify.modal.decay_waves import WaveForm, decaying_columns
 from snrmjax.numerics.units import HERTZ
 
 Candidates = Callable[[Float[np.ndarray, "channel sample"]], list[complex]]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from snrmjax.identify.modal.decay_waves import WaveForm, decaying_columns
+from snrmjax.identify.modal.decay_fit import WaveForm, decaying_columns
 from snrmjax.identify.modal.free_decay import fit_free_decay
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.time_recording import time_recording
@@ -53,7 +53,10 @@ def test_the_limit_of_small_motion_lies_in_its_band(force, to_hz):
     assert done[-1][0] <= done[-1][1]
 
 
-@pytest.mark.parametrize(("seconds", "force"), [(0.25, {"cubic": 0.6}), (1.0, {"friction": 0.02})])
+@pytest.mark.parametrize(
+    ("seconds", "force"),
+    [(0.25, {"cubic": 0.6}), pytest.param(1.0, {"friction": 0.02}, marks=pytest.mark.long)],
+)
 def test_a_decay_that_never_is_linear_is_refused(seconds, force):
     with pytest.raises(ValueError, match=r"the decay is not that of linear modes: .* linear"):
         fit_free_decay(decay(seconds, **force))
