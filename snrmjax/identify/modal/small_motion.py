@@ -30,6 +30,8 @@ Candidates = Callable[[Float[np.ndarray, "channel sample"]], list[complex]]
 
 _MEDIAN_OF_POWER = float(np.log(2))  # over the mean, of a spectrum's bins
 _NOISE_BANDS = 16
+# Halvings of the amplitude of which each takes less time than the one before: of friction.
+_FALLS, _SHORTER, _MUCH_LONGER = 3, 0.93, 1.5
 _HALVINGS = 10  # of the amplitude, from the first beginning to the last
 _FEWEST_SAMPLES, _FEWEST_CYCLES = 60, 8
 _MOST_MODES, _MORE_MODES = 6, 2  # of linear modes, and with a mode that moves
@@ -140,6 +142,10 @@ def parts_of_decay(
     """
     size, omega = envelope(values, noise, rate)
     begins = _begins(size, omega, rate)
+    if _halves_faster_and_faster(begins):
+        last = begins[-_FALLS], omega  # the motion may have stopped since
+        why = "its damping grows as the motion falls, as dry friction has it"
+        raise ValueError(_refusal([], last, values, rate, why))
     parts: list[PartFit] = []
     for number, first in enumerate(reversed(begins), 1):
         part = values[:, first:]
@@ -157,6 +163,17 @@ def parts_of_decay(
         if later is not None and later.settled and not settled:
             break
     return parts[::-1]
+
+
+def _halves_faster_and_faster(begins: list[int]) -> bool:
+    """Whether the last halvings take less and less time, which small motion does not."""
+    times = np.diff(begins)
+    if len(times) < _FALLS:
+        return False
+    return bool(
+        np.all(times[1 - _FALLS :] < _SHORTER * times[-_FALLS:-1])
+        and times.max() > _MUCH_LONGER * times[-1]
+    )
 
 
 def _begins(size: np.ndarray, omega: float, rate: float) -> list[int]:
@@ -306,6 +323,7 @@ def small_motion(
     Raises `ValueError` where rates move with the amplitude and the limit is not in the record.
     """
     moving = [part for part in parts if part.bent]
+    last = parts[-1].first, float(parts[-1].limit()[0][0])
     chosen: PartFit | None = None
     before: PartFit | None = None
     for part in reversed(parts):
@@ -318,7 +336,7 @@ def small_motion(
             part = part._replace(spread=np.hypot(part.spread, beyond))
         chosen, before = part, chosen
     if chosen is None:
-        raise ValueError(_refusal(parts, values, rate, "no part of it is explained"))
+        raise ValueError(_refusal(parts, last, values, rate, "no part of it is explained"))
     here = values[:, chosen.first :]
     time = np.arange(here.shape[1]) / rate
     if moving and not chosen.found.form.powers:
@@ -329,12 +347,12 @@ def small_motion(
     rubbing = [_with_powers(found, powers, here, time) for powers in _FRICTION]
     if max(one.information for one in rubbing) > found.information + _BETTER:
         why = "its damping grows as the motion falls, as dry friction has it"
-        raise ValueError(_refusal(parts, values, rate, why))
+        raise ValueError(_refusal(parts, last, values, rate, why))
     value, std = chosen.limit()
     change = np.abs(_at_the_end(found, time) / value - 1)
     if value[1] <= 0 or np.any(change > _FURTHEST) or np.any(std / value > _NOT_KNOWN):
         why = "they are still changing where it ends or drowns in noise"
-        raise ValueError(_refusal(parts, values, rate, why))
+        raise ValueError(_refusal(parts, last, values, rate, why))
     kept = significant(found) & (found.damping_ratio > 0)
     if before is not None:
         later = before.found.natural_frequency
@@ -344,11 +362,18 @@ def small_motion(
 
 
 def _refusal(
-    parts: list[PartFit], values: Float[np.ndarray, "channel sample"], rate: float, why: str
+    parts: list[PartFit],
+    last_begin: tuple[int, float],
+    values: Float[np.ndarray, "channel sample"],
+    rate: float,
+    why: str,
 ) -> str:
-    """That the decay is not linear, why its limit is not known, and what part is linear."""
-    omega = parts[-1].limit()[0][0]
-    first, last = (frequency_at(values, at, rate, omega) for at in (0, parts[-1].first))
+    """That the decay is not linear, why its limit is not known, and what part is linear.
+
+    `last_begin` is the sample of the last beginning and a frequency in rad/s near the mode's.
+    """
+    begin, omega = last_begin
+    first, last = (frequency_at(values, at, rate, omega) for at in (0, begin))
     linear = [part for part in parts if not part.bent and part.settled]
     words = "no part of the record is linear within noise"
     if linear:
@@ -362,9 +387,9 @@ def _refusal(
     return (
         "the decay is not that of linear modes: frequency or damping change as the motion falls "
         f"({first:.5g} Hz at the largest value, {last:.5g} Hz "
-        f"{parts[-1].first / rate:.4g} s later), and {why}, so that their values at no amplitude "
-        f"are not known. {words[0].upper()}{words[1:]}; or record it to smaller motion and with "
-        "less noise; `snrmjax compare` gives frequency and damping over the amplitude."
+        f"{begin / rate:.4g} s later), and {why}, so that their values at no amplitude "
+        f"are not known. {words[0].upper()}{words[1:]}. A longer record with less noise reaches "
+        "smaller motion; `snrmjax compare` gives frequency and damping over the amplitude."
     )
 
 
