@@ -132,19 +132,17 @@ def supervised() -> Iterator[None]:
 
 def _supervise(hears: socket.socket, latest: _Latest) -> None:
     hears.settimeout(_QUIET)
-    began, said = time.monotonic(), ""
-    while True:
-        try:
-            received = hears.recv(1)
-        except TimeoutError:
-            if latest.message and latest.message != said:
-                said = latest.message
-                say(f"{time.monotonic() - began:.0f} s: {said} …")
-            continue
-        if not received:
-            return
-        if received[0] == signal.SIGINT:
-            break
+    began, said, received = time.monotonic(), "", b"\0"
+    with hears:
+        while received and received[0] != signal.SIGINT:
+            try:
+                received = hears.recv(1)
+            except TimeoutError:
+                if latest.message != said:
+                    said = latest.message
+                    say(f"{time.monotonic() - began:.0f} s: {said} …")
+    if not received:  # the command has ended
+        return
     time.sleep(_PATIENCE)
     try:
         discard_unfinished()

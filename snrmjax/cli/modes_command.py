@@ -58,10 +58,15 @@ def modes(
             with_mass=second,
             interest=interest - 1,
             name=out.stem.replace("_", " "),
+            progress=_say_part,
         )
         page.write(folder, found, file=out.name)
     tell(found)
     say(f"written to {out}: open {out.parent / 'report.html'}")
+
+
+def _say_part(done: int, parts: int) -> None:
+    say(f"the decay is not linear throughout: part {done} of {parts} fitted")
 
 
 with_options(modes, ModesOptions)

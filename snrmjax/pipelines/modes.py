@@ -1,7 +1,7 @@
 """Linear modes from a laboratory's files: what they are found from, by content, and their scale."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -61,12 +61,14 @@ def find_linear_modes(
     with_mass: ModalSources | None = None,
     interest: int = 0,
     name: str = "model",
+    progress: Callable[[int, int], None] | None = None,
     **settings: Any,
 ) -> LinearModesFound:
     """Linear modes with errors, their shapes mass-normalised as asked for.
 
     Arguments: `sources` as `read_modal_sources` gives them; `options`, or its fields by keyword;
-    `with_mass` the same of a second test with the added mass; `interest` counts from zero.
+    `with_mass` the same of a second test with the added mass; `interest` counts from zero;
+    `progress` is called with how many parts of how many of a decay are fitted.
     Raises `ValueError` as `find_modes` and `scale_modes` do, and for two ways to scale.
     """
     options = checked(dataclasses.replace(options or ModesOptions(), **settings))
@@ -86,7 +88,7 @@ def find_linear_modes(
         "poles": _poles(options.poles),
     }
     try:
-        fitted, notes = find_modes(sources, **fit)
+        fitted, notes = find_modes(sources, **fit, progress=progress)
     except GrowingModes as error:
         way = "leave `--conjugated` out" if options.conjugated else "state `--conjugated`"
         raise ValueError(f"{str(error).rstrip('.')}: {way}.") from error

@@ -5,20 +5,32 @@ and ratios of shapes follow, no scale.
 Reference: Juang & Pappa, J. Guid. Control Dyn. 8 (1985) 620, doi:10.2514/3.20031.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float
 from scipy.signal import decimate
 
+from snrmjax.identify.modal.decay_fit import (
+    DecayFit,
+    WaveForm,
+    fit_waves,
+    significant,
+    with_modes,
+    without_mode,
+)
 from snrmjax.identify.modal.modal_fit import REAL, AbstractModalFit, phase_collinearity
 from snrmjax.identify.modal.pole_orders import PoleOrders, clusters, gathered
-from snrmjax.identify.modal.separable_fit import (
-    ChannelRows,
-    SeparableFit,
-    TermColumns,
-    fit_separable,
+from snrmjax.identify.modal.small_motion import (
+    PartFit,
+    envelope,
+    frequency_at,
+    is_linear,
+    left_by_linear_modes,
+    noise_of_channels,
+    parts_of_decay,
+    small_motion,
 )
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.time_recording import TimeRecording
@@ -33,10 +45,14 @@ _MOST_ROWS, _MOST_COLUMNS = 240, 3000  # of a Hankel matrix
 _MOST_SAMPLES = 40_000  # of a channel, in the fit
 _FEWEST_SAMPLES = 40
 _SAMPLES_PER_CYCLE = 5  # kept of the highest frequency asked for
-_SIGNIFICANT = 4.0  # standard errors of a mode's largest amplitude, without which it is none
-_MOST_DAMPED = 0.5
+_LONG = 12_000  # samples of a channel, from which on a record is cut and thinned to what it holds
+_SAMPLES_OF_LINE = 3  # kept of a cycle of the highest line: the filter passes 0.8 of half the rate
+_ABOVE = 30.0  # of the median power of a spectrum, which noise exceeds once in 1e9 lines
+_FILTER_ENDS = 20  # samples that a thinning filter spoils
+_BEYOND = 1.3  # of the time in which the motion is larger than the noise
+_NOTHING = "no mode of positive damping stands out of the noise of the decay."
+_FEW_MODES = 6  # with which a record is tried for being linear
 _CORRELATED = 2.0  # sum of the correlations of residuals, from which on it is worth a note
-_MOST_GROWTH = 3.0  # of a mode's logarithm over the record
 
 
 class DecayCurves(NamedTuple):
@@ -77,20 +93,25 @@ def fit_free_decay(
     to_frequency: float | None = None,
     poles: Sequence[float] | None = None,
     highest_order: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> DecayModes:
     """Frequencies, damping ratios and relative shapes from free decays, with covariance.
 
     Poles of all orders of an eigensystem realisation start a least-squares fit of decaying
-    oscillations to all channels and decays together; the size of each channel's residuals and the
-    correlation of neighbouring ones give the errors.
+    oscillations to all channels and decays together, the strongest first; the size of each
+    channel's residuals and the correlation of neighbouring ones give the errors. Where frequency
+    or damping of the strongest mode change with its amplitude, the modes are those at no
+    amplitude, by a fit of that change (see `small_motion`).
 
     Arguments: one recording or several of the same channels and rate; `channels` by name, all that
     are a motion by default; `start_time`, `end_time` s of the part to use (from the largest
     value, to the end); `to_frequency` rad/s the highest of interest, to which long records are
-    low-passed and thinned; `poles` natural frequencies in rad/s in place of clusters.
+    low-passed and thinned; `poles` natural frequencies in rad/s in place of clusters; `progress`
+    is called with how many parts of how many are fitted where a record takes long.
     Raises `ValueError` for recordings that differ in channels or rate, no motion, fewer than 40
-    samples, signals of zeros, and where no pole is stable over the order.
-    Validity: nothing acts on the structure in that part; linear and time-invariant.
+    samples, signals of zeros, where no pole is stable over the order, and for a mode that
+    changes with its amplitude down to where the record ends or drowns in noise.
+    Validity: nothing acts on the structure in that part.
     Not differentiable: differentiate `snrmjax.model.linear_response`.
     """
     recordings = [decays] if isinstance(decays, TimeRecording) else list(decays)
@@ -101,11 +122,17 @@ def fit_free_decay(
     ]
     length = min(part.shape[1] for part in parts)
     values = np.concatenate([part[:, :length] for part in parts])
-    if to_frequency is not None:
-        step = max(1, int(rate / (_SAMPLES_PER_CYCLE * to_frequency / HERTZ)))
+    samples, highest_line = _SAMPLES_PER_CYCLE, to_frequency
+    if highest_line is None and values.shape[1] > _LONG:
+        values = _while_it_rings(values, rate)
+        samples, highest_line = _SAMPLES_OF_LINE, _highest_line(values, rate)
+    if highest_line is not None:
+        step = max(1, int(rate / (samples * highest_line / HERTZ)))
         for factor in _factors(step):
             values = decimate(values, factor, axis=1, zero_phase=True)
             rate /= factor
+            # At the ends the filter sees one side of the record.
+            values = values[:, _FILTER_ENDS:-_FILTER_ENDS]
     values = values[:, :_MOST_SAMPLES]
     if values.shape[1] < _FEWEST_SAMPLES:
         raise ValueError(
@@ -114,8 +141,8 @@ def fit_free_decay(
     highest = min(highest_order or _HIGHEST, values.shape[1] // 8)
     orders = _realised(values, rate, highest)
     top = np.pi * rate if to_frequency is None else to_frequency
-    start = _start(orders, poles, top)
-    return _fitted(values, rate, start, orders, tuple(used), poles is not None)
+    found = _found(values, rate, orders, top, poles, progress)
+    return _result(values, rate, found, orders, tuple(used))
 
 
 def _channels(recordings: Sequence[TimeRecording], names: Sequence[str] | None) -> list[Channel]:
@@ -171,6 +198,23 @@ def _part(
     return values[:, keep]
 
 
+def _while_it_rings(values: np.ndarray, rate: float) -> np.ndarray:
+    """The record to somewhat beyond where the motion is smaller than the noise of a sample."""
+    size, _ = envelope(values, noise_of_channels(values), rate)
+    end = int(_BEYOND * np.count_nonzero(size > 1.0))
+    return values[:, : max(end, _FEWEST_SAMPLES)]
+
+
+def _highest_line(values: np.ndarray, rate: float) -> float:
+    """The highest frequency in rad/s that stands out of the noise."""
+    window = np.hanning(values.shape[1])
+    away = values - values.mean(axis=1, keepdims=True)
+    power = np.abs(np.fft.rfft(away * window, axis=1)) ** 2
+    above = power > _ABOVE * np.median(power, axis=1, keepdims=True)
+    last = np.flatnonzero(above.any(axis=0))
+    return float(HERTZ * rate * (last[-1] if last.size else power.shape[1]) / values.shape[1])
+
+
 def _factors(step: int) -> list[int]:
     """A thinning by steps of at most eight, as the filter wants."""
     factors = []
@@ -224,94 +268,102 @@ def _start(
     return stable
 
 
-def _columns(time: np.ndarray, unknowns: np.ndarray) -> list[TermColumns]:
-    n = len(unknowns) // 2
-    omega, ratio = unknowns[:n], unknowns[n:]
-    root = np.sqrt(1 - ratio**2)
-    pole = -ratio * omega + 1j * omega * root
-    wave = np.exp(time[:, None] * pole)
-    by_omega = time[:, None] * wave * (pole / omega)
-    by_ratio = time[:, None] * wave * (-omega - 1j * omega * ratio / root)
-    columns = np.column_stack([wave.real, -wave.imag, np.ones_like(time)])
-    slopes = np.zeros((2 * n, *columns.shape))
-    at = np.arange(n)
-    for first, slope in ((0, by_omega), (n, by_ratio)):
-        slopes[first + at, :, at] = slope.real.T
-        slopes[first + at, :, n + at] = -slope.imag.T
-    return [TermColumns(columns, slopes)]
+class FoundModes(NamedTuple):
+    """The fit, which of its modes are modes, and from which sample on."""
+
+    decay: DecayFit
+    kept: np.ndarray
+    first: int = 0
+    spread: np.ndarray = np.zeros(2)  # 1σ of ω and ζ of the leading mode beyond its fit's
+    notes: tuple[Fact, ...] = ()
 
 
-def _fitted(
+def _found(
     values: np.ndarray,
     rate: float,
-    start: np.ndarray,
     orders: PoleOrders,
-    channels: tuple[Channel, ...],
-    keep_all: bool,
-) -> DecayModes:
-    time = np.arange(values.shape[1]) / rate
-    unknowns = np.concatenate([np.abs(start), -start.real / np.abs(start)])
-    scale = np.sqrt(np.mean(values**2, axis=1)) * 0.1
-    while True:
-        n = len(unknowns) // 2
-        # A mode may grow a little over the record: it is then left out for that.
-        growth = -np.minimum(_MOST_GROWTH / (unknowns[:n] * time[-1]), _MOST_DAMPED)
-        low = np.concatenate([0.8 * unknowns[:n], growth])
-        high = np.concatenate([1.25 * unknowns[:n], np.full(n, _MOST_DAMPED)])
-        for _ in range(3):
-            weights = np.broadcast_to(1 / scale[:, None], values.shape)
-            rows = ChannelRows(values, weights, np.zeros(len(values), dtype=int), 1)
-            fit = fit_separable(lambda x: _columns(time, x), rows, unknowns, (low, high))
-            unknowns = fit.unknowns
-            free = values.shape[1] - 2 * n - 1 - 2 * n / len(values)
-            rms = np.sqrt(np.sum(fit.residuals**2, axis=1) / max(free, 1.0))
-            scale = scale * np.maximum(rms, 1e-9 * max(float(rms.max()), 1e-300))
-        fit = fit.with_variance(float(np.mean(rms**2)))
-        amplitude = fit.coefficients[:, :n] + 1j * fit.coefficients[:, n : 2 * n]
-        variance = np.stack(
-            [
-                np.diag(fit.term_covariance(k)) + np.diag(fit.term_covariance(n + k))
-                for k in range(n)
-            ]
-        ).T
-        certain = np.max(np.abs(amplitude) / np.sqrt(np.maximum(variance, 1e-300) / 2), axis=0)
-        certain = np.where(unknowns[n:] > 0, certain, 0.0)
-        worst = int(np.argmin(certain))
-        if keep_all or certain[worst] >= _SIGNIFICANT:
-            break
-        if n == 1:
-            raise ValueError("no mode of positive damping stands out of the noise of the decay.")
-        unknowns = np.delete(unknowns, [worst, n + worst])
-    return _result(values, time, fit, unknowns, variance / 2, orders, channels)
+    top: float,
+    poles: Sequence[float] | None,
+    progress: Callable[[int, int], None] | None,
+) -> FoundModes:
+    """The modes of the whole record, or where they move with the amplitude those at none."""
+    start = _start(orders, poles, top)
+    time, noise = np.arange(values.shape[1]) / rate, noise_of_channels(values)
+
+    def candidates(part: np.ndarray) -> list[complex]:
+        highest = min(orders.highest, part.shape[1] // 8)
+        found = clusters(_realised(part, rate, highest), (0.0, top))
+        return [complex(pole) for pole in found if pole.real < 0]
+
+    if poles is None:
+        few = with_modes(values, time, start, most=_FEW_MODES)
+    else:
+        unknowns = np.concatenate([np.abs(start), -start.real / np.abs(start)])
+        few = fit_waves(values, time, unknowns, WaveForm(len(start)))
+    parts: list[PartFit] = []
+    if few is not None and not is_linear(values, time, few, noise):
+        parts = parts_of_decay(values, rate, candidates, noise, progress)
+    if parts and any(part.bent for part in parts):
+        return _moving(parts, values, rate)
+    found = few if poles is not None else with_modes(values, time, start, few)
+    if found is None:
+        raise ValueError(_NOTHING)
+    if poles is not None:
+        return FoundModes(found, np.ones(found.form.n_modes, dtype=bool))
+    if parts and left_by_linear_modes(parts, found, noise):
+        return _moving(parts, values, rate)
+    kept = significant(found)
+    while not kept.all() and found.form.n_modes > 1:
+        found = without_mode(values, time, found, int(np.flatnonzero(~kept)[0]))
+        kept = significant(found)
+    kept &= found.damping_ratio > 0
+    if not kept.any():
+        raise ValueError(_NOTHING)
+    return FoundModes(found, kept)
+
+
+def _moving(parts: list[PartFit], values: np.ndarray, rate: float) -> FoundModes:
+    chosen, kept = small_motion(parts, values, rate)
+    found = chosen.found
+    omega = found.natural_frequency[found.form.leading]
+    note = Fact(
+        "decay_moves_with_amplitude",
+        frequency_hz=float(omega) / HERTZ,
+        begin=chosen.first / rate,
+        from_hz=frequency_at(values, chosen.first, rate, float(omega)),
+        powers=found.form.powers,
+    )
+    return FoundModes(found, kept, chosen.first, chosen.spread, (note,))
 
 
 def _result(
     values: np.ndarray,
-    time: np.ndarray,
-    fit: SeparableFit,
-    unknowns: np.ndarray,
-    variance: np.ndarray,
+    rate: float,
+    found: FoundModes,
     orders: PoleOrders,
     channels: tuple[Channel, ...],
 ) -> DecayModes:
-    n = len(unknowns) // 2
-    rank = np.argsort(unknowns[:n])
+    fit, unknowns, n = found.decay.fit, found.decay.unknowns, found.decay.form.n_modes
+    kept = np.flatnonzero(found.kept)
+    rank = kept[np.argsort(unknowns[kept])]
     covariance = np.stack([fit.covariance[np.ix_([k, n + k], [k, n + k])] for k in rank])
+    covariance[rank == found.decay.form.leading, (0, 1), (0, 1)] += found.spread**2
     n_channels = len(channels)
-    amplitudes = fit.coefficients[:, :n] + 1j * fit.coefficients[:, n : 2 * n]
-    fitted = fit.coefficients @ _columns(time, unknowns)[0].columns.T
-    amplitude, spread = amplitudes[:n_channels, rank], np.sqrt(variance[:n_channels, rank])
+    values = values[:, found.first :]
+    time = np.arange(values.shape[1]) / rate
+    fitted = values - found.decay.residuals
+    amplitude = found.decay.amplitude[:n_channels, rank]
+    spread = found.decay.amplitude_std[:n_channels, rank]
     top = np.argmax(np.abs(amplitude), axis=0)
+    n = len(rank)
     largest = amplitude[top, np.arange(n)]
     ratio = amplitude / largest
     shape_std = np.hypot(spread, np.abs(ratio) * spread[top, np.arange(n)]) / np.abs(largest)
     shape_std[top, np.arange(n)] = 0.0
     collinearity, _ = phase_collinearity(ratio)
-    notes = [
+    notes = list(found.notes) + [
         Fact("complex_mode", mode=k + 1, frequency_hz=float(omega) / HERTZ, collinearity=value)
-        for k, (omega, value) in enumerate(
-            zip(unknowns[:n][rank], collinearity.tolist(), strict=True)
-        )
+        for k, (omega, value) in enumerate(zip(unknowns[rank], collinearity.tolist(), strict=True))
         if value < REAL
     ]
     if not fit.status.found_minimum:
@@ -319,8 +371,8 @@ def _result(
     if fit.correlation.sum() > _CORRELATED:
         notes.append(Fact("decay_residuals_correlated"))
     return DecayModes(
-        natural_frequency=unknowns[:n][rank],
-        damping_ratio=unknowns[n:][rank],
+        natural_frequency=unknowns[rank],
+        damping_ratio=found.decay.damping_ratio[rank],
         mode_covariance=covariance,
         collinearity=collinearity,
         orders=orders,

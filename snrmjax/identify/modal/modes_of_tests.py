@@ -1,7 +1,7 @@
 """Linear modes of what was measured: frequency responses, low-level states or free decays."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, get_args
 
 import numpy as np
@@ -36,6 +36,7 @@ def find_modes(
     *,
     level: int | None = None,
     base: SensorMotion | None = None,
+    progress: Callable[[int, int], None] | None = None,
     **settings: Any,
 ) -> tuple[LinearModalFit | DecayModes, tuple[Fact, ...]]:
     """Modes of what was measured, and notes on it.
@@ -45,8 +46,9 @@ def find_modes(
     are those at no amplitude (see `amplitude_dependent_modes`).
 
     Arguments: `level` of steady states in place of the lowest; `base` what the responses are where
-    the reference is the motion of a base; `settings` those of `fit_linear_modes`, of which free
-    decays take the poles, the highest order and the upper end of the band.
+    the reference is the motion of a base; `progress` as for `fit_free_decay`; `settings` those
+    of `fit_linear_modes`, of which free decays take the poles, the highest order and the upper end
+    of the band.
     Raises `ValueError` as the fits do.
     Not differentiable: differentiate `snrmjax.model.linear_response`.
     """
@@ -54,7 +56,7 @@ def find_modes(
         return _of_responses(source, base, settings), ()
     if not isinstance(source, SteadyStates):
         of_decays = {name: settings[name] for name in _OF_DECAYS if name in settings}
-        return fit_free_decay(source, **of_decays), ()
+        return fit_free_decay(source, **of_decays, progress=progress), ()
     if source.base is not None and source.base.motion == "absolute":
         base = "relative"  # the base's motion is taken away already
     elif source.base is not None and base is None:

@@ -6,6 +6,7 @@ Reference: Golub & Pereyra, SIAM J. Numer. Anal. 10 (1973) 413, doi:10.1137/0710
 residuals that neighbours share: Newey & West, Econometrica 55 (1987) 703, doi:10.2307/1913610.
 """
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -82,18 +83,25 @@ def fit_separable(
     measured: ChannelRows,
     start: Float[np.ndarray, " unknown"],
     bounds: tuple[Float[np.ndarray, " unknown"], Float[np.ndarray, " unknown"]],
+    *,
+    settled: float = _RULE.settled,
+    steps: int = _RULE.steps,
 ) -> SeparableFit:
     """The weighted least-squares fit and its covariance for errors of unit variance.
 
     Residuals of neighbouring rows may be correlated (windows, smooth misfits): their correlation,
-    as long as it is significant, widens the covariance.
+    as long as it is significant, widens the covariance. The fit ends when a step lowers the sum of
+    squares by less than `settled`, or after `steps`.
     """
 
     def linearised(points: np.ndarray) -> list["_Compressed"]:
         return [_compressed(basis_at(point), measured) for point in points]
 
-    begin = np.clip(start, *bounds)[None]
-    end = minimise(linearised, begin, linearised(begin), bounds, _RULE)[0]
+    begin, rule = (
+        np.clip(start, *bounds)[None],
+        dataclasses.replace(_RULE, settled=settled, steps=steps),
+    )
+    end = minimise(linearised, begin, linearised(begin), bounds, rule)[0]
     return _with_covariance(basis_at(end.point), measured, end.point, end.status)
 
 

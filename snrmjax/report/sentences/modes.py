@@ -90,6 +90,12 @@ SENTENCES: dict[str, Wording] = {
         "residuals of neighbouring samples are correlated (a mode that was missed, or a decay that "
         "is not linear): errors are widened for it"
     ),
+    "decay_moves_with_amplitude": lambda frequency_hz, begin, from_hz, powers: (
+        f"frequency and damping of the mode at {frequency_hz:.6g} Hz change with its amplitude "
+        f"({from_hz:.5g} Hz {begin:.4g} s after the largest value): stated are the limits of small "
+        "motion, by a fit of the decay from there on whose rates depend on "
+        f"{', '.join('A' if power == 1 else f'A^{power}' for power in powers)}"
+    ),
     "coherence_in_part": "the coherence is stated in part and not used",
     "coherence_is_one": "the coherence is 1 at most lines: it says nothing of errors",
     "one_level_for_modes": ("one level alone: nothing says whether it was low enough to be linear"),
