@@ -3,7 +3,6 @@
 import inspect
 
 import jax
-import numpy as np
 import pytest
 
 import snrmjax as sj
@@ -39,15 +38,3 @@ def test_what_is_not_differentiable_says_what_to_use_instead():
         for transformed in (jax.grad, jax.jit):
             with pytest.raises(ValueError, match="works on numbers, and cannot be called inside"):
                 transformed(called)(1.0)
-
-
-def test_a_solver_for_batches_refuses_derivatives_alone():
-    beam = sj.model.flat_beam()
-
-    def solved(force):
-        rest = np.zeros((1, 3, beam.n_modes))
-        return sj.simulate.solve_at_frequency(beam, force, 480.0, rest)[0][0, 2, 0]
-
-    assert float(jax.jit(solved)(1e-5)) == pytest.approx(float(solved(1e-5)), rel=1e-12)
-    with pytest.raises(ValueError, match=r"use `sj\.simulate\.periodic_motion`"):
-        jax.jit(jax.grad(solved))(1e-5)

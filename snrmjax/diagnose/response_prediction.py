@@ -208,9 +208,10 @@ def _in_phase(curve: ResponseCurve, sensor: int) -> list[tuple[float, float]]:
 
 
 def _complete(curves: Sequence[ResponseCurve]) -> bool:
-    """Whether a response was traced to the upper end of the range of frequencies."""
-    main = [curve for curve in curves if curve.branch == Branch.MAIN]
-    return bool(main) and all(curve.status == CurveStatus.UPPER_END for curve in main)
+    """Whether a curve of a response goes through the whole range of frequencies."""
+    return any(
+        curve.branch == Branch.MAIN and curve.status == CurveStatus.UPPER_END for curve in curves
+    )
 
 
 def responses(

@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Callable
-from functools import cache, partial, wraps
+from functools import cache, wraps
 from threading import Lock
 from typing import Any, ParamSpec, TypeVar
 
@@ -146,17 +146,6 @@ def on_numbers(instead: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
         return call
 
     return of
-
-
-@partial(jax.custom_jvp, nondiff_argnums=(1,))
-def without_derivative(tree: T, instead: str) -> T:
-    """A tree as it is: what differentiates by it is refused with the sentence `instead`."""
-    return tree
-
-
-@without_derivative.defjvp
-def _refused(instead: str, *_: Any) -> Any:
-    raise ValueError(instead)
 
 
 def as_numpy(array: Any) -> Any:

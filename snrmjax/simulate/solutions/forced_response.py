@@ -12,7 +12,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from snrmjax.model.moving_base import newtons
 from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.numerics.blocks import mapped, on_one_core, taken
-from snrmjax.numerics.compiled import compiled, on_numbers, without_derivative
+from snrmjax.numerics.compiled import compiled, on_numbers
 from snrmjax.numerics.lanes import lanes_for
 from snrmjax.numerics.result import AbstractResult, quantity
 from snrmjax.simulate.balance.given_numbers import frequency_range, positive
@@ -318,16 +318,17 @@ def solve_at_frequency(
     Arguments: `force` and `frequency` of each state, or one of all states; `start` the Fourier
     coefficients of the guesses in kg^1/2 m.
     Returns the Fourier coefficients (kg^1/2 m), NaN where Newton's method did not converge, and
-    whether it did. For `jax.jit` and `jax.vmap`, but not differentiable: use `periodic_motion`.
+    whether it did. For `jax.jit` and `jax.vmap`; differentiable forward (`jax.jvp`), not by
+    `jax.grad`: that goes through `periodic_motion`.
     """
     guesses = jnp.asarray(start, dtype=jnp.float64)
     loads, speeds = (
         jnp.broadcast_to(jnp.asarray(part, dtype=jnp.float64), guesses.shape[:1])
         for part in (force, frequency)
     )
-    instead = "`solve_at_frequency` is not differentiable: use `sj.simulate.periodic_motion`."
-    given = without_derivative((simulated_structure(model), loads, speeds, guesses), instead)
-    coefficients, converged = _solve_batch(*given, n_samples)
+    coefficients, converged = _solve_batch(
+        simulated_structure(model), loads, speeds, guesses, n_samples
+    )
     return jnp.where(converged[:, None, None], coefficients, jnp.nan), converged
 
 

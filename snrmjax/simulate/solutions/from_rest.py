@@ -35,7 +35,7 @@ _SAME = 1e-5  # distance of scaled points that are one
 
 
 class CurvesFromRest(NamedTuple):
-    """The curves of one member, each once, the one from rest at the lower end first."""
+    """The curves of one member, each once; first one through the whole range, where there is."""
 
     curves: list[TracedCurve]
     branches: list[Branch]
@@ -143,6 +143,8 @@ def _joined(curve: TracedCurve, back: TracedCurve) -> list[TracedCurve]:
         return [back.reversed()]
     if _passes(curve, back.points[0]):
         return [curve]
+    if back.status == CurveStatus.LOWER_END:
+        return [back.reversed(), curve]
     return [curve, back if _is_whole(curve) else back.reversed()]
 
 

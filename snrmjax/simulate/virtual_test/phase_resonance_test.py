@@ -163,7 +163,8 @@ def _along_curves(
     rows: list[tuple] = []
     jumps: list[tuple[int, float]] = []
     for level, parts in enumerate(batch.curves, start=1):
-        for curve in parts:
+        resonant = [curve for curve in parts if curve.at_events("phase_resonance").size]
+        for curve in resonant or parts:
             reached, left = _swept(curve)
             jumps += [(level, f) for f in left]
             phase = mode_phase(model, curve.coefficients)
