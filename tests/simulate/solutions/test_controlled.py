@@ -134,7 +134,8 @@ def test_phase_control_goes_through_the_phase_resonances_of_the_open_loop():
     phase = np.angle(curve.velocity[:, 1, 0])
     np.testing.assert_allclose(phase, 0.0, atol=1e-7)
     responses = forced_response(model, CURVED_BEAM_FORCES, 20 * HZ, 150 * HZ, stability=False)
-    for response in (one for one in responses if one.status == CurveStatus.UPPER_END):
+    responses = [one for one in responses if one.status == CurveStatus.UPPER_END]
+    for response in responses:
         (k,) = response.at_events("phase_resonance")
         # Where the force is the response's, by the cubic through four neighbours.
         m = int(np.clip(np.searchsorted(curve.force, response.force), 2, len(curve.force) - 2))

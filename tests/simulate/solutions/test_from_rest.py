@@ -80,7 +80,7 @@ def escaping():
 def test_an_escaping_oscillator_keeps_its_response_from_rest():
     """Time integration of the equation escapes at 0.1268 Hz as the frequency rises slowly."""
     found = simulate_responses(escaping(), [0.1], 0.05, 0.2, harmonics=9)
-    (first, *_) = found.curves
+    (first,) = [curve for curve in found.curves if curve.at_events("fold").size]
     (fold,) = first.at_events("fold")
     assert first.frequency[fold] / HERTZ == pytest.approx(0.1268, abs=1e-4)
     assert np.all(first.stability[:fold] == 1)
