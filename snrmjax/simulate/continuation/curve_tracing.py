@@ -1,5 +1,6 @@
 """Many response curves of one kind: stacked balances, starts, and their walks side by side."""
 
+import dataclasses
 from collections.abc import Sequence
 from functools import partial
 from typing import Any, Literal
@@ -34,6 +35,7 @@ from snrmjax.simulate.continuation.continuation import (
 # From an end of the range, over a force that rises from zero to its value or past it, or through
 # a point.
 _Way = Literal["from_end", "rising", "past", "through"]
+_RISING_POINTS = 300  # over the force: what is longer winds around and comes to no other motion
 _PAST = 4.0  # times the force: motions that begin at a larger one come back to it
 _NEAR = 5e-3  # distance in scaled unknowns below which a motion lies on a known curve
 _ALONE = 512  # points of a single curve before the host sees them
@@ -108,13 +110,37 @@ def under_rising_force(
     begins = np.zeros_like(starts)
     if rest is not None:  # the mean comes first among the coefficients
         begins[:, : rest.shape[1]] = rest / np.asarray(mine.displacement_scale)[:, None]
-    at = np.array([end, end])
+    at, steps = np.array([end, end]), _over_force(steps)
     risen = _walked(mine, at, steps, begins, lanes, downward=False, way="rising")
     for start, curve in zip(starts, risen, strict=True):
         if curve.status == CurveStatus.UPPER_END:
             start[:-1] = curve.points[-1, :-1]
     starts[:, -1] = end / np.asarray(mine.frequency_scale)
     return starts
+
+
+def motions_at(
+    balances: HarmonicBalance,
+    index: np.ndarray,
+    end: float,
+    steps: StepControl,
+    lanes: int,
+) -> Float[np.ndarray, "member unknown"]:
+    """What Newton's method finds at a frequency (rad/s) from rest, scaled; NaN where nothing."""
+    starts = np.zeros((len(index), balances.size + 1))
+    starts[:, -1] = end / np.asarray(balances.frequency_scale)[index]
+    one = dataclasses.replace(steps, max_points=2)
+    found = trace_from_rest(
+        *(balances, index, np.array([end, end]), one, lanes), downward=False, starts=starts
+    )
+    nothing = np.full(balances.size + 1, np.nan)
+    return np.array([one.points[0] if len(one.points) else nothing for one in found]).reshape(
+        starts.shape
+    )
+
+
+def _over_force(steps: StepControl) -> StepControl:
+    return dataclasses.replace(steps, max_points=min(steps.max_points, _RISING_POINTS))
 
 
 def at_force(
@@ -127,7 +153,7 @@ def at_force(
     """
     mine = taken(balances, np.array([member]))
     at, begin = np.array([frequency, frequency]), np.zeros((1, balances.size + 1))
-    (curve,) = _walked(mine, at, steps, begin, lanes, downward=False, way="past")
+    (curve,) = _walked(mine, at, _over_force(steps), begin, lanes, downward=False, way="past")
     beyond = curve.points[:, -1] > 1
     k = np.flatnonzero(beyond[1:] != beyond[:-1])
     here, there = curve.points[k], curve.points[k + 1]

@@ -8,17 +8,18 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from snrmjax.model.modes import STILL
 from snrmjax.model.moving_base import newtons
-from snrmjax.model.structures import Structure, equilibria
+from snrmjax.model.structures import Structure, equilibria, linear_terms_of
 from snrmjax.numerics.blocks import taken
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance
 from snrmjax.simulate.continuation.continuation import CurveStatus, StepControl, TracedCurve
 from snrmjax.simulate.continuation.curve_tracing import (
     at_force,
     lies_on,
+    motions_at,
     trace_both_ways,
     trace_from_rest,
     under_rising_force,
@@ -26,6 +27,7 @@ from snrmjax.simulate.continuation.curve_tracing import (
 from snrmjax.simulate.continuation.response_curve import Branch
 
 _N_STARTS = 24  # of the search for further equilibria: each response of a study pays for it
+_MARGIN = 0.5  # of what rules a further equilibrium out in a direction
 _NEAR_LINEAR = 0.5  # of the linear response: the motion that differs by less is the one from rest
 # A resonance outside the range is passed where its hysteresis may reach into it: a mode of which
 # little is left softens by a third; hardening has no such limit.
@@ -118,7 +120,11 @@ def _from_end(
         for i, k in enumerate(index)
         if not len(curves[i].points) or not _is_near_rest(balances, k, curves[i].points[0])
     ]
-    starts = under_rising_force(balances, index[far], float(ends[int(downward)]), steps, lanes)
+    end = float(ends[int(downward)])
+    # Newton's method from rest and from the linear response: where both agree there is one motion.
+    small = motions_at(balances, index[far], end, steps, lanes)
+    far = [i for i, start in zip(far, small, strict=True) if not _passes(curves[i], start)]
+    starts = under_rising_force(balances, index[far], end, steps, lanes)
     new = [
         j
         for j, i in enumerate(far)
@@ -175,8 +181,8 @@ def _add_other_rests(
 ) -> None:
     """Curves from further stable equilibria, from both ends, that are not among those found."""
     owners, rests = [], []
-    for k, model in enumerate(models):
-        for other in equilibria(model, n_starts=_N_STARTS):
+    for k in np.flatnonzero(_may_rest_elsewhere(models)).tolist():
+        for other in equilibria(models[k], n_starts=_N_STARTS):
             if other.stable and np.any(other.displacement):
                 owners.append(k)
                 rests.append(other.displacement)
@@ -187,6 +193,37 @@ def _add_other_rests(
         end = float(ends[int(downward)])
         starts = under_rising_force(balances, index, end, steps, lanes, rest=rest)
         _add(found, owners, starts, Branch.EQUILIBRIUM, *walk, downward=downward)
+
+
+def _may_rest_elsewhere(models: Sequence[Structure]) -> Bool[np.ndarray, " member"]:
+    """Whether members may have further equilibria: quick, where forces are polynomials.
+
+    On the line s d through an equilibrium ½ω²s² + V₃(d)s³ + V₄(d)s⁴ is stationary there, which
+    asks for 9 V₃² ≥ 16 ω² V₄. That is looked at in many directions d, and with a margin.
+    """
+    potential = models[0].potential
+    degrees = [len(monomial) for monomial in potential.monomials]
+    if models[0].effects or max(degrees, default=0) > 4:
+        return np.ones(len(models), dtype=bool)
+    n = models[0].n_modes
+    drawn = np.random.default_rng(0).normal(size=(64 if n > 1 else 0, n))
+    directions = np.concatenate([np.eye(n), drawn])
+    terms = [np.prod(directions[:, list(monomial)], axis=1) for monomial in potential.monomials]
+    coefficients = np.array([np.asarray(model.potential.coefficient) for model in models])
+    cubic, quartic = (
+        sum(
+            (
+                coefficients[:, k, None] * term
+                for k, term in enumerate(terms)
+                if degrees[k] == degree
+            ),
+            np.zeros((len(models), len(directions))),
+        )
+        for degree in (3, 4)
+    )
+    stiffness = np.array([np.asarray(linear_terms_of(model).stiffness) for model in models])
+    squared = stiffness @ (directions**2).T
+    return np.any(9 * cubic**2 > _MARGIN * 16 * squared * quartic, axis=1)
 
 
 def _add_from_beyond(
