@@ -63,7 +63,7 @@ MEMORYLESS: dict[str, Callable[[Array, Array, Parameters], Array]] = {
     "quadratic_damping": lambda y, u, p: p["quadratic_damping.coefficient"] * jnp.abs(u) * u,
     "cubic_damping": lambda y, u, p: p["cubic_damping.coefficient"] * u**3,
     "van_der_pol_damping": lambda y, u, p: p["van_der_pol_damping.coefficient"] * y**2 * u,
-    "static_preload": lambda y, u, p: -p["static_preload.constant_force"] + 0.0 * y,
+    "static_preload": lambda y, u, p: p["static_preload.constant_force"] + 0.0 * y,
     "hertz_clearance": lambda y, u, p: _hertz(y, p),
     "magnet_stiffness": lambda y, u, p: _magnet(y, p),
     "square_root_damping": lambda y, u, p: _root(u, p),

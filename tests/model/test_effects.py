@@ -39,7 +39,7 @@ FAMILY = {
     "quadratic_damping": ({"coefficient": 0.6}, lambda q, v: 0.6 * v * abs(v), "odd"),
     "cubic_damping": ({"coefficient": 0.6}, lambda q, v: 0.6 * v**3, "odd"),
     "van_der_pol_damping": ({"coefficient": 0.9}, lambda q, v: 0.9 * q * q * v, "odd"),
-    "static_preload": ({"constant_force": -1.1}, lambda q, v: 1.1, "even"),
+    "static_preload": ({"constant_force": -1.1}, lambda q, v: -1.1, "even"),
 }
 DISSIPATIVE = {"quadratic_damping", "cubic_damping", "van_der_pol_damping"}
 STATES = [(q, v) for q in (-1.5, -0.41, -0.1, 0.0, 0.39, 0.7) for v in (-2.0, -0.3, 0.0, 1.1)]

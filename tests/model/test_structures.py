@@ -247,9 +247,9 @@ def test_flat_beam_has_one_equilibrium():
 
 
 def test_equilibria_with_effects():
-    # A constant force on a linear spring: q = F/ω², energy −F²/2ω² with the work of the force.
+    # A constant force on a linear spring: q = −f/ω², energy −f²/2ω² with the work of the force.
     (only,) = equilibria(single(static_preload={"constant_force": 0.6}))
-    assert only.displacement[0] == pytest.approx(0.15, rel=1e-9)
+    assert only.displacement[0] == pytest.approx(-0.15, rel=1e-9)
     assert only.energy == pytest.approx(-0.5 * 0.6**2 / 4, rel=1e-9)
     # ω²q + aq² = 0: q = −ω²/a is a saddle, with energy ω²q²/2 + aq³/3 = ω⁶/6a².
     rest, saddle = equilibria(single(quadratic_stiffness={"coefficient": 2.0}))

@@ -183,16 +183,18 @@ class OneSidedStop(AbstractKinked):
 
 
 class StaticPreload(AbstractMemoryless):
-    """A constant force F on the structure along +q (at a point +x): f = −F; `constant_force` is F.
+    """A constant force; with a nonlinear stiffness it shifts ω₀ and brings a second harmonic.
 
-    A positive number moves the rest position in the positive direction, as `static_load` does.
-    With a nonlinear stiffness it shifts ω₀ and brings a second harmonic.
+    At points it acts on the structure as `static_load` does: a positive `constant_force` F moves
+    the rest position in the positive direction, f = −F. On the mode of interest it is, as all
+    forces there are, a restoring force on the left of the equation of motion, f = F, and moves it
+    in the negative direction.
     """
 
     kind: ClassVar[str] = "static_preload"
     description: ClassVar[str] = (
-        "A constant force, such as weight or a clamping force, along the positive direction, that "
-        "moves the position of rest to where a nonlinear spring is stiffer or softer."
+        "A constant force, such as weight or a clamping force, that moves the position of rest to "
+        "where a nonlinear spring is stiffer or softer; at points along the positive direction."
     )
     shape: ClassVar[Shape] = _EVEN
     confusions: ClassVar[tuple[Confusion, ...]] = (TOLD_BY_MEAN_OR_SECOND_HARMONIC,)
@@ -205,4 +207,5 @@ class StaticPreload(AbstractMemoryless):
         return [(size,), (-size,)]
 
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
-        return jnp.broadcast_to(-self.constant_force, jnp.shape(displacement))
+        force = self.constant_force if self.at is None else -self.constant_force
+        return jnp.broadcast_to(force, jnp.shape(displacement))

@@ -196,7 +196,7 @@ KNOWN = {
     "preload": (
         {},
         (make_effect("static_preload", {"constant_force": 0.6}),),
-        -0.6 * np.array([1, 0, 0, 0, 0, 0, 0]),
+        0.6 * np.array([1, 0, 0, 0, 0, 0, 0]),
     ),
 }
 

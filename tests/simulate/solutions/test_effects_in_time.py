@@ -242,7 +242,7 @@ def law_of(kind, p):
         "quadratic_damping": lambda q, v: p["coefficient"] * np.abs(v) * v,
         "cubic_damping": lambda q, v: p["coefficient"] * v**3,
         "van_der_pol_damping": lambda q, v: p["coefficient"] * q**2 * v,
-        "static_preload": lambda q, v: 0.0 * q - p["constant_force"],
+        "static_preload": lambda q, v: p["constant_force"] + 0.0 * q,
     }
     return laws.get(kind, lambda q, v: 0.0 * q)
 

@@ -278,7 +278,7 @@ SETTLED = {
     "quadratic_damping": ({"coefficient": 0.3}, lambda q, v: 0.3 * v * np.abs(v)),
     "cubic_damping": ({"coefficient": 0.2}, lambda q, v: 0.2 * v**3),
     "van_der_pol_damping": ({"coefficient": 0.8}, lambda q, v: 0.8 * q**2 * v),
-    "static_preload": ({"constant_force": 0.9}, lambda q, v: -0.9 + 0.0 * q),
+    "static_preload": ({"constant_force": 0.9}, lambda q, v: 0.9 + 0.0 * q),
 }
 
 
