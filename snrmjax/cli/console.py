@@ -45,6 +45,7 @@ PAGES = {
 
 INTERRUPTED = 130  # the exit code of a process that ended on Ctrl-C, as shells have it
 _PATIENCE = 0.5  # s after Ctrl-C in which a command may end by itself
+_STILL = 30.0  # s after which the same stage is reported again
 _QUIET = 5.0  # s of work before the first line, and at least between two lines
 
 console = Console(stderr=True, highlight=False, soft_wrap=True)
@@ -132,15 +133,17 @@ def supervised() -> Iterator[None]:
 
 def _supervise(hears: socket.socket, latest: _Latest) -> None:
     hears.settimeout(_QUIET)
-    began, said, received = time.monotonic(), "", b"\0"
+    began = last = time.monotonic()
+    said, received = "", b"\0"
     with hears:
         while received and received[0] != signal.SIGINT:
             try:
                 received = hears.recv(1)
             except TimeoutError:
-                if latest.message != said:
-                    said = latest.message
-                    say(f"{time.monotonic() - began:.0f} s: {said} …")
+                now = time.monotonic()
+                if latest.message != said or now - last > _STILL:
+                    last, said = now, latest.message
+                    say(f"{now - began:.0f} s: {said or 'at work'} …")
     if not received:  # the command has ended
         return
     time.sleep(_PATIENCE)

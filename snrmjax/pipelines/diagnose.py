@@ -1,6 +1,7 @@
 """Diagnosis: what a model lacks, and the responses with and without it."""
 
 import dataclasses
+import logging
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -26,6 +27,8 @@ from snrmjax.io.tables import read_steady_states
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.structures import Structure, driven_in_newtons
 from snrmjax.numerics.facts import Fact
+
+_log = logging.getLogger(__name__)
 
 
 class SimulatedLevels(NamedTuple):
@@ -85,10 +88,13 @@ def diagnose_test(
     Raises `ValueError` as `diagnose_model` and `locate_force` do.
     """
     model = driven_in_newtons(model)
+    _log.info("compares %d states with the model", len(data.frequency))
     found = diagnose_model(model, data, former=former)
+    _log.info("looks for the point where the missing force acts")
     place = _whereabouts(found, data, model, where)
     if not (simulate and found.effects and found.completed is not None):
         return DiagnosedTest(found, model, where=place)
+    _log.info("simulates the responses of all levels")
     simulated = simulated_levels(found, model)
     levels = tuple(each.level for each in simulated.predicted.levels if not each.complete)
     if levels:
