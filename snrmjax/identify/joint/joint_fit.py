@@ -334,7 +334,8 @@ def fit_jointly(
         level_numbers=numbers,
     )
     notes = notes_on_instruments(fit, LEVEL_ERRORS)
-    notes += _notes(fit, 0.5 * view.stiffness_jitter_std, level_std)
+    named = any(choice.kind != SmoothingSpline.kind for choice in choices)
+    notes += _notes(fit, 0.5 * view.stiffness_jitter_std, level_std, named)
     return dataclasses.replace(fit, notes=tuple(notes))
 
 
@@ -360,16 +361,16 @@ def corrected_states(data: SteadyStates, fit: JointFit) -> SteadyStates:
 
 
 def _notes(
-    fit: JointFit, frequency_jitter_std: float, stated: Float[np.ndarray, " error"]
+    fit: JointFit, frequency_jitter_std: float, stated: Float[np.ndarray, " error"], named: bool
 ) -> list[Fact]:
     """All that a reader of a joint fit should know.
 
     Arguments: `frequency_jitter_std` 1σ of the natural frequency from state to state, relative;
-    `stated` 1σ of levels' errors.
+    `stated` 1σ of levels' errors; `named` whether a family was chosen for a curve.
     """
     notes = []
     if not fit.converged:
-        notes.append(Fact("fit_not_converged", reason=fit.status.message))
+        notes.append(Fact("fit_not_converged", reason=fit.status.message, named=named))
     level, n_levels = np.asarray(fit.data.level), fit.data.n_levels
     notes += notes_on_noise(
         fit.noise, frequency_jitter_std, stated, np.asarray(fit.prior.level), n_levels

@@ -297,6 +297,16 @@ def _outlying(*, states: Sequence[tuple[int, float]], farthest: float, robust: b
     )
 
 
+def _fit_not_converged(reason: str, named: bool) -> str:
+    remedy = (
+        "try a simpler family"
+        if named
+        else "state the noise of the states (`velocity_std_m_s`, `phase_std_deg`) or the errors of "
+        "the levels ([measurement] in the model), which the fit otherwise estimates"
+    )
+    return f"the fit has {reason}; {remedy}."
+
+
 SENTENCES: dict[str, Wording] = {
     "states_outlying": _outlying,
     # Coupled modes.
@@ -305,7 +315,7 @@ SENTENCES: dict[str, Wording] = {
     "single_mode_biased": _biased,
     # Joint fits.
     "as_in_file": "{text}",
-    "fit_not_converged": "the fit has {reason}; try a simpler family.",
+    "fit_not_converged": _fit_not_converged,
     "noise_exceeded": (
         "the fit misses the data by {scale:.2g} ± {scale_std:.1g} times the stated noise: either "
         "that noise is too small or the model is wrong; the bands are {scale:.2g} times wider for "
