@@ -13,6 +13,8 @@ import scipy.sparse
 from jaxtyping import Float
 
 from snrmjax.io.files import shown
+from snrmjax.io.laboratory.arrays.matlab_elements import checked_variables
+from snrmjax.io.laboratory.libraries import damaged_if_it_fails
 from snrmjax.io.toml_table import TomlTable
 from snrmjax.io.units import DEGREE
 from snrmjax.model.builders.matrices import check_names, from_matrices
@@ -173,7 +175,7 @@ def _arrays(path: Path, table: TomlTable) -> dict[str, Any]:
     """Arrays of an NPZ or MAT file by name; points as a list of names."""
     if not path.is_file():
         raise table.refusal("file", "a file beside the model's", path.name)
-    reading = {".npz": _of_npz, ".mat": scipy.io.loadmat}.get(path.suffix.lower())
+    reading = {".npz": _of_npz, ".mat": _of_mat}.get(path.suffix.lower())
     if reading is None:
         raise table.refusal("file", "an .npz or .mat file", path.name)
     try:
@@ -181,8 +183,8 @@ def _arrays(path: Path, table: TomlTable) -> dict[str, Any]:
     except _UNREADABLE as error:
         kind = f"an {path.suffix[1:].upper()} file of arrays (MAT up to version 7)"
         raise ValueError(
-            f"{shown(path.name)} of {table.place} cannot be read: it is not {kind}; a sparse "
-            "matrix, which `numpy.savez` keeps as an object, goes into a file of its own by "
+            f"{shown(path.name)} of {table.place} cannot be read: it is damaged or not {kind}; a "
+            "sparse matrix, which `numpy.savez` keeps as an object, goes into a file of its own by "
             '`scipy.sparse.save_npz`, and here by `mass = "mass.npz"`.'
         ) from error
     found = {key: arrays[key] for key in (*_MATRICES, "points") if key in arrays}
@@ -192,6 +194,18 @@ def _arrays(path: Path, table: TomlTable) -> dict[str, Any]:
             str(np.ravel(name)[0] if np.size(name) else "").strip() for name in names
         ]
     return found
+
+
+def _of_mat(path: Path) -> Mapping[str, Any]:
+    """The arrays of a file, which is checked: a damaged one ends the process within scipy."""
+    with damaged_if_it_fails(path.name, "a MAT file"):
+        content, names = path.read_bytes(), None
+        if content.startswith(b"MATLAB 5"):
+            names = [one.name for one in checked_variables(content) if not one.object_class]
+        found: dict[str, Any] = scipy.io.loadmat(path, variable_names=names)
+        for value in filter(scipy.sparse.issparse, found.values()):
+            value.check_format()
+        return found
 
 
 def _of_npz(path: Path) -> Mapping[str, Any]:

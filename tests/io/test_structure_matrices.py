@@ -1,9 +1,12 @@
 """Model files with matrices and with effects at points: read, refused, written."""
 
+import struct
+
 import jax
 import numpy as np
 import pytest
 import scipy.io
+import scipy.sparse
 
 import snrmjax as sj
 from snrmjax.io.models import read_model, write_model
@@ -168,6 +171,34 @@ def test_files_that_hold_no_matrices_are_refused(read, tmp_path, check_message, 
         (tmp_path / name).write_text("nothing")
     with pytest.raises(ValueError, match=complaint) as error:
         read(f'[structure]\nfile = "{file}"\n[force]\nat = "a"\n')
+    check_message(error, ["two.toml"])
+
+
+@pytest.mark.parametrize("damage", ["sides", "type", "rows", "checksum"])
+def test_damaged_matlab_files_are_refused(read, tmp_path, check_message, damage):
+    """Three of them ended the process within scipy, or as soon as a matrix was used."""
+    arrays = {"mass": np.diag([1.0, 0.05]), "stiffness": scipy.sparse.csc_array(np.diag([1.0, 2]))}
+    path = tmp_path / "bad.mat"
+    is_packed = damage == "checksum"
+    scipy.io.savemat(path, {**arrays, "points": ["a", "b"]}, do_compression=is_packed)
+    content = bytearray(path.read_bytes())
+    if damage == "sides":
+        at = content.index(struct.pack("<IIII", 4, 0, 5, 8)) + 12
+        content[at : at + 4] = bytes(4)
+    elif damage == "type":
+        at = content.index(arrays["mass"].tobytes()) - 8
+        content[at] = 11
+    elif damage == "rows":
+        rows = struct.pack("<IIii", 5, 8, 0, 1)
+        at = content.index(rows) + 12
+        content[at : at + 4] = struct.pack("<i", 2**30)
+    else:
+        content[-9] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(
+        ValueError, match=r"bad\.mat.* cannot be read: it is damaged or not an MAT file"
+    ) as error:
+        read('[structure]\nfile = "bad.mat"\n[force]\nat = "a"\n')
     check_message(error, ["two.toml"])
 
 

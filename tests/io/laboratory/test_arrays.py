@@ -581,3 +581,22 @@ def test_a_heap_of_texts_without_an_end_is_refused(tmp_path):
     path.write_bytes(content)
     with pytest.raises(ValueError, match=r"heap\.h5 is damaged .*heap of texts without an end"):
         read_laboratory_file(path)
+
+
+@pytest.mark.parametrize("chunks", [None, (1,)])
+def test_a_text_longer_than_its_file_is_refused(tmp_path, chunks):
+    """The library of HDF5 takes the memory that a text of varying length states."""
+    path = tmp_path / "long.h5"
+    with h5py.File(path, "w", userblock_size=512) as file:
+        file["x"] = HERTZ
+        kind = h5py.string_dtype()
+        names = np.array(["one", "three"], dtype=object)
+        file.create_dataset("names", data=names, dtype=kind, chunks=chunks)
+    assert read_laboratory_file(path).tables[0].columns.keys() == {"x"}
+    content = bytearray(path.read_bytes())
+    heap = content.index(b"GCOL") - 512
+    at = content.index(struct.pack("<IQ", 5, heap))
+    content[at : at + 4] = struct.pack("<I", 2**26)
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=rf"long\.h5 is damaged .*names has a text of {2**26} let"):
+        read_laboratory_file(path)

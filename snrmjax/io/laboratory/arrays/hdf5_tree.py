@@ -29,6 +29,7 @@ _INFLATES = 1100  # deflate cannot shrink by more
 _LARGEST_CHUNK = 2**26  # bytes
 _HEAP = b"GCOL\x01\0\0\0"  # signature and version of a heap of texts
 _HEAP_HEADER = 16  # bytes, of a heap and of each object in it
+_LENGTHS = np.dtype([("length", "<u4"), ("heap", "<u8"), ("index", "<u4")])  # of a text elsewhere
 _LARGEST_SEARCHED = 2**28  # bytes of a file that is searched for damaged heaps
 _HIDDEN = ("#refs#", "#subsystem#")
 _UNITS = ("units", "unit", "Unit", "Units", "unit_string", "UNIT")
@@ -153,8 +154,10 @@ def _object(walk: _Walk, item: Any, name: str) -> Node | None:
     if reference:
         return _references(walk, item, name)
     if walk.h5py.check_string_dtype(item.dtype) is not None or kind == "char":
-        if item.size > _LONGEST_TEXT:
-            return walk.leave_out(name, "too_many_texts")
+        why = "too_many_texts" if item.size > _LONGEST_TEXT else _cannot_hold(walk, item)
+        if why:
+            return walk.leave_out(name, why)
+        _check_lengths(walk, item, name)
         return _text(item, is_matlab=kind == "char")
     why = _cannot_hold(walk, item)
     if why:
@@ -215,6 +218,30 @@ def _text(item: Any, *, is_matlab: bool) -> Node:
         for text in np.atleast_1d(value).reshape(-1)
     ]
     return texts[0] if np.ndim(value) == 0 else list(texts)
+
+
+def _check_lengths(walk: _Walk, item: Any, name: str) -> None:
+    """Raises `ValueError` for a text of varying length that states more than the file holds.
+
+    The library of HDF5 takes the memory that it states. A piece behind a filter is not looked at:
+    what is damaged there does not pass the filter.
+    """
+    if item.dtype.kind != "O":
+        return
+    pieces = [(item.id.get_offset(), item.size)]
+    if item.chunks:
+        infos = [item.id.get_chunk_info(k) for k in range(item.id.get_num_chunks())]
+        has_filters = item.id.get_create_plist().get_nfilters() > 0
+        pieces = [(one.byte_offset, one.size // _LENGTHS.itemsize) for one in infos]
+        pieces *= not has_filters
+    with open(walk.path, "rb") as raw:
+        for start, count in pieces:
+            if start is None or start + count * _LENGTHS.itemsize > walk.size:
+                continue  # beside its description, or refused by the library
+            raw.seek(start)
+            lengths = np.frombuffer(raw.read(count * _LENGTHS.itemsize), _LENGTHS)["length"]
+            if (lengths > walk.size).any():
+                raise ValueError(f"{name} has a text of {lengths.max()} letters")
 
 
 def _cannot_hold(walk: _Walk, item: Any) -> str:

@@ -1,28 +1,20 @@
 """MATLAB files: v4 to v7 by scipy, v7.3 by h5py."""
 
-import struct
 import warnings
-import zlib
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from snrmjax.io.laboratory.arrays.even_axis import EvenAxis
 from snrmjax.io.laboratory.arrays.hdf5_tree import open_tree
+from snrmjax.io.laboratory.arrays.matlab_elements import MatlabVariable, checked_variables
 from snrmjax.io.laboratory.arrays.structs import file_of_tree
 from snrmjax.io.laboratory.arrays.value_tree import Node, held
 from snrmjax.io.laboratory.contents import LaboratoryFile
 from snrmjax.io.laboratory.libraries import damaged_if_it_fails
 from snrmjax.numerics.facts import Fact
 
-_MATRIX, _COMPRESSED = 14, 15  # types of elements
-_OPAQUE = 17  # class of an object's array
-_NUMBERS_OF = dict.fromkeys(range(6, 16), 1) | {4: 1, 5: 3}  # elements of numbers by class
-_COMPLEX = 0x800  # flag of an array
-_OF_NUMBERS = frozenset((*range(1, 8), 9, 12, 13, 16, 17, 18))  # types of elements
-_HEADER = 4096  # bytes in which a variable's header ends
 _LARGEST = 2**29  # bytes of a file before v7.3, which is read whole, and numbers of its variables
 
 
@@ -53,17 +45,11 @@ def _tree_of_old(path: Path) -> tuple[dict[str, Node], list[Fact]]:
         )
     with damaged_if_it_fails(path.name, "a MATLAB file"), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of several objects, which all have no name
-        # Headers first: a compressed variable may state more than any memory holds.
         content = path.read_bytes()
         if content.startswith(b"MATLAB 5"):
-            order = "<" if content[126:128] == b"IM" else ">"
-            _check_elements(memoryview(content)[128:], order)
-            variables = list(_headers(memoryview(content)[128:], order))
+            variables = checked_variables(content)
         else:
-            variables = [_Header(name, sides) for name, sides, _ in scipy.io.whosmat(path)]
-        for name, sides, _ in variables:
-            if np.prod(sides, dtype=float) > _LARGEST:
-                raise ValueError(f"{name} states {' by '.join(map(str, sides))} numbers")
+            variables = _of_level_4(path)
         plain = [one.name for one in variables if not one.object_class]
         loaded: dict[str, Any] = scipy.io.loadmat(path, mat_dtype=False, variable_names=plain)
     notes = [
@@ -77,79 +63,15 @@ def _tree_of_old(path: Path) -> tuple[dict[str, Node], list[Fact]]:
     return {key: node for key, node in nodes.items() if node is not None}, notes
 
 
-class _Header(NamedTuple):
-    """Name and sides of a variable, or the class of an object (a table, a string, a datetime)."""
+def _of_level_4(path: Path) -> list[MatlabVariable]:
+    """Variables of level 4. Raises `ValueError` for more numbers than are read."""
+    import scipy.io
 
-    name: str
-    sides: tuple[int, ...] = ()
-    object_class: str = ""
-
-
-def _headers(content: memoryview, order: str) -> Iterator[_Header]:
-    """What stands before the numbers of every variable of a file of level 5.
-
-    An object has no sides: behind its name stand "MCOS" (or "java") and its class.
-    """
-    at = 0
-    while at + 8 <= len(content):
-        kind, size = struct.unpack_from(f"{order}II", content, at)
-        body = content[at + 8 : at + 8 + size]
-        if kind == _COMPRESSED:
-            body = memoryview(zlib.decompressobj().decompress(body, _HEADER))[8:]
-        parts = _parts(body, order)
-        flags = next(parts)
-        array_class = struct.unpack_from(f"{order}I", flags)[0] & 0xFF if len(flags) > 3 else 0
-        if array_class == _OPAQUE:
-            name, _, object_class = (bytes(next(parts)).decode("latin1") for _ in range(3))
-            yield _Header(name, (), object_class or "object")
-        elif array_class:
-            sides = next(parts)
-            numbers = struct.unpack(f"{order}{len(sides) // 4}i", sides[: len(sides) // 4 * 4])
-            yield _Header(bytes(next(parts)).decode("latin1"), numbers)
-        at += 8 + (size if kind == _COMPRESSED else -(-size // 8) * 8)
-
-
-def _parts(content: memoryview, order: str) -> Iterator[memoryview]:
-    """The contents of the elements that stand one behind another; empty ones at the end."""
-    at = 0
-    while at + 8 <= len(content):
-        kind, size = struct.unpack_from(f"{order}II", content, at)
-        if kind >> 16:
-            yield content[at + 4 : at + 4 + (kind >> 16)]
-            at += 8
-        else:
-            yield content[at + 8 : at + 8 + size]
-            at += 8 + -(-size // 8) * 8
-    while True:
-        yield memoryview(b"")
-
-
-def _check_elements(content: memoryview, order: str) -> list[int]:
-    """Raises `ValueError` for elements that end the process within scipy; returns their types.
-
-    They are of no known type, or stand where an array lacks its numbers (its imaginary part, where
-    a damaged flag says that there is one). What is compressed has a checksum of its own.
-    """
-    kinds: list[int] = []
-    at = 0
-    while at + 8 <= len(content):
-        kind, size = struct.unpack_from(f"{order}II", content, at)
-        if kind >> 16:  # a small one, within its tag
-            kind, size = kind & 0xFFFF, 0
-        if not 1 <= kind <= 18:
-            raise ValueError(f"it has an element of the type {kind}")
-        if kind == _MATRIX and size:
-            body = content[at + 8 : at + 8 + size]
-            within = _check_elements(body, order)
-            flags = struct.unpack_from(f"{order}I", body, 8)[0] if len(body) >= 12 else 0
-            count = _NUMBERS_OF.get(flags & 0xFF, 0)
-            count += int(count > 0 and bool(flags & _COMPLEX))
-            parts = within[3 : 3 + count]
-            if len(parts) < count or not _OF_NUMBERS.issuperset(parts):
-                raise ValueError("it has an array without its numbers")
-        kinds.append(kind)
-        at += 8 + (size if kind == _COMPRESSED else -(-size // 8) * 8)
-    return kinds
+    variables = scipy.io.whosmat(path)
+    for name, sides, _ in variables:
+        if np.prod(sides, dtype=float) > _LARGEST:
+            raise ValueError(f"{name} states {' by '.join(map(str, sides))} numbers")
+    return [MatlabVariable(name) for name, _, _ in variables]
 
 
 def _node(value: Any, name: str, notes: list[Fact]) -> Node | None:
