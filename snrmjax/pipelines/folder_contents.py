@@ -181,7 +181,7 @@ def read_test_files(
         paths, file, assumed = [folder / name for name in names], held.name, Assumptions()
         stepped = held.recordings and told.base and told.record not in STAYS_RECORD
         if held.tables or stepped or (held.responses and (told.force_amplitude or told.base)):
-            found = _imported(paths, told, folder)
+            found = _imported(paths, told, folder, maps[0].name if told.responses else "")
             assumed.update(found.assumed)
             if found.states is not None:
                 states.append(NamedStates(file, found.states))
@@ -271,10 +271,15 @@ def _is_model(path: Path) -> bool:
         return True
 
 
-def _imported(paths: Sequence[Path], told: ImportMap, folder: Path) -> Imported:
+def _imported(paths: Sequence[Path], told: ImportMap, folder: Path, map_file: str = "") -> Imported:
     try:
         return import_files(paths, told)
     except ValueError as error:
+        if map_file:
+            names = ", ".join(path.name for path in paths)
+            raise ValueError(
+                f"{names}, read as {map_file} says: {error} (Its keys have the options' names.)"
+            ) from error
         raise ValueError(f"{_asked(paths, folder)} (Without a map: {error})") from error
 
 

@@ -210,9 +210,13 @@ def _scaled(fitted: ModalFit, by: DrivePoint) -> ScaledModes:
     try:
         return scale_modes(fitted, by)
     except ValueError as error:
+        if by.sensor is None:
+            way = "Answer by `--drive-point SENSOR`, or write"
+        else:
+            way = f"Name another sensor than {by.sensor}, or write"
         raise ValueError(
-            f"how are the mode shapes scaled? {error} Answer by `--drive-point SENSOR`, or write "
-            "the model by `snrmjax modes`, which knows further ways, into this folder."
+            f"how are the mode shapes scaled? {error} {way} the model by `snrmjax "
+            "modes`, which knows further ways, into this folder."
         ) from error
 
 

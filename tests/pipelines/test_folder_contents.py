@@ -162,6 +162,18 @@ def test_a_rate_of_few_digits_is_asked_for(tmp_path):
     assert one.record.sampling_rate == 2050.0
 
 
+def test_a_map_that_does_not_fit_is_not_asked_for_once_more(tmp_path):
+    folder = tmp_path / "test"
+    folder.mkdir()
+    (folder / "log.csv").write_text("Freq [Hz],Load [N],V [mm/s]\n49,1,111.8\n50,1,150\n")
+    (tmp_path / "told.toml").write_text('force = "Load"\n[[response]]\nchannel = "V"\n')
+    with pytest.raises(ValueError, match="where is the phase of V") as error:
+        read_test_files(folder, map_file=tmp_path / "told.toml")
+    assert str(error.value).startswith("log.csv, read as told.toml says: ")
+    assert "--map" not in str(error.value)
+    assert "Without a map" not in str(error.value)
+
+
 def test_a_map_elsewhere_takes_the_place_of_the_folders(tmp_path):
     folder = tmp_path / "test"
     folder.mkdir()

@@ -65,6 +65,11 @@ def test_shapes_without_a_scale_are_a_question(tmp_path):
     assert "how are the mode shapes scaled?" in str(done.exception)
     assert "--drive-point" in str(done.exception)
     assert not (tmp_path / "out").exists()
+    given = ["test", str(tmp_path), "--drive-point", "7", "--out", str(tmp_path / "out")]
+    done = CliRunner().invoke(app, given)
+    assert isinstance(done.exception, ValueError)
+    assert "Name another sensor than 7, or write the model" in str(done.exception)
+    assert "--drive-point" not in str(done.exception)
 
 
 def test_what_the_check_finds_is_a_question(tmp_path):

@@ -154,7 +154,7 @@ def calibrate_to_backbone(
 
         (end,) = minimise(evaluate, unknown[None], evaluate(unknown[None]), limits, _RULE)
         unknown = end.point
-    return _outcome(model_of, names, points, begin * np.exp(unknown), end, sigma, freedom)
+    return _outcome(model_of, names, points, begin * np.exp(unknown), end, sigma, freedom, prior)
 
 
 @compiled
@@ -214,6 +214,12 @@ def _chosen(names: tuple[str, ...], which: np.ndarray) -> tuple[str, ...]:
     return tuple(name for name, there in zip(names, which, strict=True) if there)
 
 
+def _on_parameters(kind: str, names: tuple[str, ...], which: np.ndarray, prior: np.ndarray) -> Fact:
+    """A note on some parameters, which says whether starting values of all are known to `prior`."""
+    stated = bool(np.all(np.isfinite(prior[which])))
+    return Fact(kind, names=_chosen(names, which), prior_stated=stated)
+
+
 def _outcome(
     model_of: ModelOf,
     names: tuple[str, ...],
@@ -222,6 +228,7 @@ def _outcome(
     end: Any,
     sigma: np.ndarray,
     freedom: int,
+    prior: np.ndarray,
 ) -> BackboneCalibration:
     linear, n = end.linearised, len(sigma)
     reduced = end.sum_of_squares / freedom if freedom > 0 else np.nan
@@ -238,14 +245,14 @@ def _outcome(
             notes.append(Fact("calibration_noise", scale=float(np.sqrt(reduced))))
         vague = ~(np.diag(relative) < 1)
         if vague.any():
-            notes.append(Fact("parameters_hardly_known", names=_chosen(names, vague)))
+            notes.append(_on_parameters("parameters_hardly_known", names, vague, prior))
     if end.status == MinimisationStatus.NOT_FINITE:
         notes.append(Fact("no_mode_at_start"))
     elif not end.status.found_minimum:
         notes.append(Fact("calibration_not_converged"))
     at_limit = np.abs(np.abs(end.point) - _FURTHEST) < 1e-9
     if at_limit.any():
-        notes.append(Fact("parameters_at_limit", names=_chosen(names, at_limit)))
+        notes.append(_on_parameters("parameters_at_limit", names, at_limit, prior))
     by_value = linear.jacobian[:n] * sigma[:, None] / values
     variance = np.einsum("ki,ij,kj->k", by_value, covariance, by_value)
     return BackboneCalibration(

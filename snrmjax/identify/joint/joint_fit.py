@@ -370,7 +370,9 @@ def _notes(
     """
     notes = []
     if not fit.converged:
-        notes.append(Fact("fit_not_converged", reason=fit.status.message, named=named))
+        is_stated = {"noise_stated": fit.noise.stated, "levels_stated": bool(np.all(stated > 0))}
+        reason = fit.status.message
+        notes.append(Fact("fit_not_converged", reason=reason, named=named, **is_stated))
     level, n_levels = np.asarray(fit.data.level), fit.data.n_levels
     notes += notes_on_noise(
         fit.noise, frequency_jitter_std, stated, np.asarray(fit.prior.level), n_levels

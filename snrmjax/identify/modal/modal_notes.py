@@ -122,7 +122,7 @@ def fit_notes(
         at = {"mode": k + 1, "frequency_hz": hertz[k]}
         if abs(phase) > max(_TURNED, _PHASE_STDS * std):
             turn = {"phase_deg": float(np.degrees(phase)), "std_deg": float(np.degrees(std))}
-            notes.append(Fact("residues_turned", **at, **turn))
+            notes.append(Fact("residues_turned", **at, **turn, phase_was_free=settings.phase))
         if modes.collinearity[k] < REAL:
             notes.append(Fact("complex_mode", **at, collinearity=float(modes.collinearity[k])))
     notes += [

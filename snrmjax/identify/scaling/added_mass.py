@@ -12,6 +12,7 @@ from snrmjax.numerics.units import HERTZ
 _SHIFT_STDS = 3.0  # standard errors of a shift, without which it gives no scale
 _LARGE = 0.1  # relative shift of frequency, beyond which the shapes change too
 _STEP = 1e-7
+_BY_BAND = "narrow the band to modes that both show, or give the poles of these by hand"
 
 
 class SquaredShapes(NamedTuple):
@@ -94,7 +95,7 @@ def _partners(without: LinearModalFit, with_mass: LinearModalFit) -> tuple[np.nd
     if len(after) < len(before):
         raise ValueError(
             f"the test with the added mass must show the {len(before)} modes of the test without "
-            f"it, but shows {len(after)}: choose the same band, or the poles by hand."
+            f"it, but shows {len(after)}: {_BY_BAND}."
         )
     # A mass lowers each frequency, and not below the next lower one.
     chosen = [
@@ -102,7 +103,5 @@ def _partners(without: LinearModalFit, with_mass: LinearModalFit) -> tuple[np.nd
         for frequency in before
     ]
     if len(set(chosen)) < len(chosen):
-        raise ValueError(
-            "the modes of both tests cannot be paired: choose the same band, or the poles by hand."
-        )
+        raise ValueError(f"the modes of both tests cannot be paired: {_BY_BAND}.")
     return after[chosen], with_mass.natural_frequency_std[chosen]

@@ -56,10 +56,12 @@ class DrivePoint(NamedTuple):
         sure = np.abs(drive_residue) > _RESIDUE_STDS * std
         hertz = fit.natural_frequency / 2 / np.pi
         if np.all(drive_residue[sure] < 0) and sure.any():
+            way = "leave out" if self.turned else "say"
+            way = f"{way} that the sensor is turned"
             raise ValueError(
                 f"the residues at the drive point {fit.sensor_names[d]} are negative "
                 f"({drive_residue[sure][0]:.4g} 1/kg at {hertz[sure][0]:.6g} Hz): sensor and force "
-                "point against one another; say that the sensor is turned, or change a sign."
+                f"point against one another; {way}, or change a sign."
             )
         keep = sure & (drive_residue > 0)
         if not keep.any():

@@ -136,10 +136,10 @@ def motion_meaning(
     said = _understood_or_none(stated)
     is_per_force = said is not None and said.per_force
     if is_per_force and (over is None or over.is_voltage or over.motion is not None):
-        raise ValueError(
-            f"{channel} is over a force by its unit {stated}: say so by --over-force, with the "
-            "force's own column or amplitude in a unit of force."
-        )
+        way = "say so by --over-force, with the force's own column or amplitude in a unit of force"
+        if over is not None:
+            way = f"what --over-force has it over is in {over.unit}, no unit of force"
+        raise ValueError(f"{channel} is over a force by its unit {stated}: {way}.")
     below = 1.0 if over is None or is_per_force else over.factor
     if over is not None and not is_per_force and "/" in stated:
         numerator, _, divisor = (part.strip("() ") for part in stated.rpartition("/"))
@@ -155,8 +155,8 @@ def motion_meaning(
     if meaning.dimension not in ("displacement", "velocity", "acceleration"):
         raise ValueError(
             f"{channel} must be a displacement, velocity or acceleration, but its unit {stated} is "
-            f"of {meaning.dimension}: --unit states what one of its numbers is (a sensor of "
-            "100 mV/g: --unit '10 g' per volt)."
+            f"of {meaning.dimension}: {'give' if unit else '--unit states'} what one of its numbers "
+            "is (a sensor of 100 mV/g: --unit '10 g' per volt)."
         )
     if quantity and quantity != meaning.dimension:
         raise ValueError(
@@ -207,9 +207,10 @@ def frequency_in_rad(
     assumed.unit("frequency_unit", mapping.frequency_unit, file_unit)
     meaning = _understood(unit, "--frequency-unit")
     if meaning.dimension != "frequency":
+        way = "--frequency-unit is Hz or rad/s" if mapping.frequency_unit else ""
         raise ValueError(
             f"{mapping.frequency} must be a frequency, but its unit {unit} is of "
-            f"{meaning.dimension}: --frequency names another column."
+            f"{meaning.dimension}: {way or '--frequency names another column'}."
         )
     return values * meaning.factor
 

@@ -51,6 +51,11 @@ class _Sets(NamedTuple):
                 places.append(names.index(force))
             elif len(names) > 1:
                 listed = ", ".join(names)
+                if self.has_force:
+                    raise ValueError(
+                        f"{force} of {file} is over {len(names)} references ({listed}): export it "
+                        f"and the responses over one of them, or name a reference by {option}."
+                    )
                 raise ValueError(
                     f"which reference of {file} is the force? --force names it, of {listed} "
                     "(--base NAME:acceleration, if it is the motion of a base)."

@@ -163,7 +163,13 @@ def _force(source: _Source) -> tuple[Complex[np.ndarray, " row"], Force]:
         by_name = BY_NAME in (mapping.base.split(":")[0], *mapping.force_amplitude)
         if by_name:
             return _by_name(source)
-        if len(amplitudes) != 1 or amplitudes[0] == "z":
+        if amplitudes and (len(amplitudes) > 1 or amplitudes[0] == "z"):
+            option = "--base" if mapping.base else "--force-amplitude"
+            raise ValueError(
+                f"{option} must be one number for {file}, a table of states without sets or a z "
+                f"axis, but is {','.join(map(str, amplitudes))}."
+            )
+        if not amplitudes:
             raise ValueError(
                 f"which column of {file} is the force? --force COLUMN names it, of "
                 f"{source.listed}; --force-amplitude N states one that no column has, and --base "

@@ -227,8 +227,8 @@ SENTENCES: dict[str, Wording] = {
         f"{n_levels} of {of_levels} levels ({_rows(rows)}): the structure moves the shaker."
     ),
     "advice_force_falls": (
-        "use the measured force of every state (`force_n`), never the nominal one; or control the "
-        "force."
+        "keep the measured force of every state (`force_n`), as here, never a nominal one; or "
+        "control the force."
     ),
     "response_harmonics_of_force": lambda *, harmonics: (
         "the force has harmonics, "
@@ -270,7 +270,7 @@ SENTENCES: dict[str, Wording] = {
     "record_force_falls": lambda *, force, fall: (
         f"the force falls from {force:.4g} N by {_percent(fall)} where the response is strongest."
     ),
-    "advice_record_force": "use the measured force of every step, or control the force.",
+    "advice_record_force": "keep the measured force of every step, as here, or control the force.",
     "line_folded": lambda *, frequency_hz, ratio, rate_hz, order: (
         f"a line at {frequency_hz:.5g} Hz, {100 * ratio:.2g} % of the fundamental, is "
         + (

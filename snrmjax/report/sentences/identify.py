@@ -234,7 +234,7 @@ def _resonance_range(
     if not sure:
         words = [
             f"it lies within {ratio:g} times the largest measured amplitude with probability "
-            f"{probability:.2g}, else beyond (`--extrapolate` looks farther)"
+            f"{probability:.2g}, else beyond (a larger `--extrapolate` looks farther)"
         ]
     (low, high), (slow, fast) = frequency_hz, velocity
     if np.isfinite(low) and np.isfinite(high):
@@ -297,13 +297,16 @@ def _outlying(*, states: Sequence[tuple[int, float]], farthest: float, robust: b
     )
 
 
-def _fit_not_converged(reason: str, named: bool) -> str:
-    remedy = (
-        "try a simpler family"
-        if named
-        else "state the noise of the states (`velocity_std_m_s`, `phase_std_deg`) or the errors of "
-        "the levels ([measurement] in the model), which the fit otherwise estimates"
+def _fit_not_converged(reason: str, named: bool, noise_stated: bool, levels_stated: bool) -> str:
+    unstated = (
+        [] if noise_stated else ["the noise of the states (`velocity_std_m_s`, `phase_std_deg`)"]
     )
+    unstated += [] if levels_stated else ["the errors of the levels ([measurement] in the model)"]
+    remedy = f"state {' or '.join(unstated)}, which the fit otherwise estimates"
+    if named:
+        remedy = "try a simpler family"
+    elif not unstated:
+        remedy = "name a family in place of smooth curves, such as `polynomial:2`"
     return f"the fit has {reason}; {remedy}."
 
 

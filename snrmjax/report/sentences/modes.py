@@ -68,10 +68,11 @@ SENTENCES: dict[str, Wording] = {
         f"some {100 * bias:.2g} % too high, which is not in the error; model it (window hann), or "
         "measure with finer lines"
     ),
-    "residues_turned": lambda mode, frequency_hz, phase_deg, std_deg: (
+    "residues_turned": lambda mode, frequency_hz, phase_deg, std_deg, phase_was_free: (
         f"the residues of mode {mode} ({frequency_hz:.6g} Hz) are turned by {phase_deg:.2g}° ± "
-        f"{1.96 * std_deg:.2g}° from real ones: an instrument's phase (free it), a neighbouring "
-        "mode that was missed, or complex modes"
+        f"{1.96 * std_deg:.2g}° from real ones: "
+        + ("" if phase_was_free else "an instrument's phase (free it), ")
+        + "a neighbouring mode that was missed, or complex modes"
     ),
     "complex_mode": (
         "mode {mode} ({frequency_hz:.6g} Hz) is complex: modal phase collinearity "
@@ -180,10 +181,12 @@ SENTENCES: dict[str, Wording] = {
         else f"residuals are only {scale:.2g} times the stated noise: it is overstated."
     ),
     "parameters_without_data": "the data say nothing about {names}.",
-    "parameters_hardly_known": (
-        "the backbone says next to nothing about {names}: state `prior_std`."
+    "parameters_hardly_known": lambda names, prior_stated: (
+        f"the backbone says next to nothing about {enumerated(names)}: "
+        f"{'fit fewer parameters' if prior_stated else 'state `prior_std`'}."
     ),
-    "parameters_at_limit": (
-        "{names} ended ten times off the start: begin nearer, or state `prior_std`."
+    "parameters_at_limit": lambda names, prior_stated: (
+        f"{enumerated(names)} ended ten times off the start: begin nearer"
+        f"{'' if prior_stated else ', or state `prior_std`'}."
     ),
 }

@@ -80,6 +80,20 @@ def test_a_prior_takes_the_place_of_what_the_backbone_leaves_open():
     assert found.std[1] == pytest.approx(0.1, rel=1e-2)
 
 
+def test_a_prior_that_is_stated_is_not_asked_for():
+    velocity = np.full(9, 3.0)
+    one = sj.identify.MeasuredBackbone(
+        velocity, closed_form(velocity, OMEGA, CUBIC), 1e-3 * np.ones(9)
+    )
+    for prior_std, advice in (
+        ({}, "state `prior_std`"),
+        ({"omega": 1e3, "cubic": 1e3}, "fit fewer"),
+    ):
+        found = calibrated(one, start={"omega": 2.9, "cubic": CUBIC}, prior_std=prior_std)
+        notes = [str(note) for note in found.notes if note.kind == "parameters_hardly_known"]
+        assert any(advice in note for note in notes), found.notes
+
+
 BAD = [
     ({"start": {"omega": 0.0}}, points(), "`start` of omega must be positive, but is 0"),
     ({"prior_std": {"mass": 1.0}}, points(), "`prior_std` names 'mass'"),

@@ -13,6 +13,7 @@ from snrmjax.identify.inference import located_points
 from snrmjax.identify.joint import family_fit, joint_fit
 from snrmjax.identify.joint.family_fit import FitStatus
 from snrmjax.io.joint_results import summarise_fit
+from snrmjax.numerics.facts import Fact
 
 
 def test_a_fit_that_used_up_its_steps_says_so(monkeypatch):
@@ -26,6 +27,13 @@ def test_a_fit_that_used_up_its_steps_says_so(monkeypatch):
     assert fit.status == FitStatus.STEP_LIMIT
     assert not fit.converged
     assert fit.notes[0].kind == "fit_not_converged"
+    stated = {"reason": "not converged", "named": False, "noise_stated": True}
+    for levels_stated, advice in ((False, "state the errors of the levels"), (True, "name a fami")):
+        note = str(Fact("fit_not_converged", **stated, levels_stated=levels_stated))
+        assert advice in note
+        assert "noise of the states" not in note
+    assert fit.notes[0]["levels_stated"] is False
+    assert fit.notes[0]["noise_stated"] == fit.noise.stated
     assert "not converged" in repr(fit)
 
 

@@ -144,7 +144,20 @@ def test_the_phase_of_an_instrument_is_found():
     held = fit_linear_modes(responses(turned))
     # In part: the fitted poles follow some of it.
     assert np.all((held.mean_phase > 0.03) & (held.mean_phase < 0.12))
-    assert "residues_turned" in {note.kind for note in held.notes}
+    (note, *_) = [note for note in held.notes if note.kind == "residues_turned"]
+    assert "(free it)" in str(note)
+
+
+def test_a_phase_that_is_free_is_not_to_be_freed():
+    """One mode alone is turned, as a neighbour that was missed does."""
+    omega, damping = STRUCTURE.natural_frequency[1], STRUCTURE.damping_ratio[1]
+    part = (STRUCTURE.shapes[:, 1] * STRUCTURE.shapes[0, 1])[:, None] * -(LINES**2)
+    part = part / (omega**2 - LINES**2 + 2j * damping * omega * LINES)
+    turned = exact() + (np.exp(0.3j) - 1) * part
+    found = fit_linear_modes(responses(turned), instrument_phase=True)
+    (note, *_) = [note for note in found.notes if note.kind == "residues_turned"]
+    assert "free it" not in str(note)
+    assert "a neighbouring mode that was missed" in str(note)
 
 
 def test_derivatives_of_the_bases():

@@ -128,6 +128,61 @@ def test_what_is_wrong_or_unclear_is_asked_for(tmp_path, folder, words, question
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    ("words", "answer", "repeated"),
+    [
+        (
+            "t.csv --force F --force-unit V --over-force --response v:velocity:m/s/N",
+            "what --over-force has it over is in V, no unit of force",
+            "say so by",
+        ),
+        (
+            "t.csv --force F --force-unit N --response v --unit N",
+            "unit N is of force: give what one of its numbers is",
+            "--unit states",
+        ),
+        (
+            "t.csv --frequency-unit deg " + TOLD,
+            "--frequency-unit is Hz or rad/s",
+            "--frequency names",
+        ),
+        (
+            "t.csv --force-amplitude z --response v:velocity:m/s",
+            "--force-amplitude must be one number for t.csv, .*, but is z",
+            "which column",
+        ),
+        (
+            "t.csv --force-amplitude 1 --force-amplitude 2 --response v:velocity:m/s",
+            "--force-amplitude must be one number for t.csv, .*, but is 1.*,2",
+            "which column",
+        ),
+        (
+            "t.csv --base 1,2:acceleration:g --response v:velocity:m/s",
+            "--base must be one number for t.csv, .*, but is 1.*,2",
+            "which column",
+        ),
+        (
+            "spectra.uff --force a --force-unit N --response b:velocity:m/s",
+            r"a of spectra.uff is over 2 references \(c, d\): .* or name a reference by --force",
+            "which reference",
+        ),
+    ],
+)
+def test_advice_does_not_repeat_an_option_that_is_given(folder, words, answer, repeated, tmp_path):
+    spectra = frequency_responses(
+        np.array([500.0, 510.0]),
+        np.ones((2, 2, 2)) + 0j,
+        [Channel("a"), Channel("b")],
+        [Channel("c"), Channel("d")],
+    )
+    write_uff(folder / "spectra.uff", responses=[spectra])
+    name, *options = words.split()
+    code, said = run(folder / name, *options, "--out", tmp_path / "out")
+    assert code == 2
+    assert re.search(answer, said), said
+    assert repeated not in said
+
+
 def test_channels_without_a_folder_are_asked_for_one(folder):
     code, said = run(folder / "t.csv", *TOLD.split())
     assert code == 2
