@@ -129,7 +129,8 @@ def identify_test(
     if not coupled and (options.modes is not None or not other_mode_moves(data, model)):
         return found
     forces = options.predict_force if coupled else ()
-    details = coupled_details(data, model, found.identification, forces)
+    # With the gain and the phase that a joint fit found for the instruments.
+    details = coupled_details(found.data, model, found.identification, forces)
     notes = _each_once((*found.notes, *details.notes()))
     return found._replace(options=options, coupled=details, notes=notes)
 

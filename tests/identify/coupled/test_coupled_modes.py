@@ -1,5 +1,7 @@
 """Coupled modes recognised and fitted; truth from a harmonic balance of its own."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from truths.two_modes import OMEGA, steady_states, structure
@@ -112,3 +114,13 @@ def test_identify_says_it_and_does_better(tmp_path):
     assert identify_test(data, model, modes=1).coupled is None
     with pytest.raises(ValueError, match="`--modes` must be 1 or 2"):
         identify_test(data, model, modes=3)
+
+
+def test_a_drive_voltage_has_the_gain_of_the_joint_fit():
+    """Not asked for the gain once more: coupled modes are of the force that the fit found."""
+    data, model = steady_states(ONE, noise=2e-3, seed=3, modes=CLOSE), structure(modes=CLOSE)
+    of_volts = dataclasses.replace(data, force=data.force * np.nan, drive=data.force / 0.4)
+    found = identify_test(of_volts, model, modes=2, fit="auto", free=("force_gain",))
+    (gain,) = [note for note in found.notes if getattr(note, "kind", "") == "force_from_drive"]
+    assert gain["newtons_per_volt"] == pytest.approx(0.4, rel=0.1)
+    assert found.coupled.modes.coupled
