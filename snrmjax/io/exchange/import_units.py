@@ -155,8 +155,8 @@ def motion_meaning(
     if meaning.dimension not in ("displacement", "velocity", "acceleration"):
         raise ValueError(
             f"{channel} must be a displacement, velocity or acceleration, but its unit {stated} is "
-            f"of {meaning.dimension}: {'give' if unit else '--unit states'} what one of its numbers "
-            "is (a sensor of 100 mV/g: --unit '10 g' per volt)."
+            f"of {meaning.dimension}: {'give' if unit else '--unit states'} what one of its "
+            "numbers is (a sensor of 100 mV/g: --unit '10 g' per volt)."
         )
     if quantity and quantity != meaning.dimension:
         raise ValueError(

@@ -66,9 +66,9 @@ def test_a_turned_drive_point():
     scaled = scale_modes(fit, DrivePoint())
     assert np.allclose(scaled.shape[1:], SHAPES[1:], rtol=1e-5)
     assert np.allclose(scaled.shape[0], -SHAPES[0], rtol=1e-5)
-    with pytest.raises(ValueError, match="negative.*; say that the sensor is turned, or"):
+    with pytest.raises(ValueError, match=r"negative.*; say that the sensor is turned, or"):
         scale_modes(fit, DrivePoint("s1"))
-    with pytest.raises(ValueError, match="negative.*; leave out that the sensor is turned, or"):
+    with pytest.raises(ValueError, match=r"negative.*; leave out that the sensor is turned, or"):
         scale_modes(FIT, DrivePoint("s1", turned=True))
 
 
