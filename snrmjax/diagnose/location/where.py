@@ -113,7 +113,7 @@ class Whereabouts(AbstractResult):
     def summary(self) -> tuple[str, ...]:
         """See `AbstractResult`."""
         head = self.name[0] if self.told else "cannot be told"
-        head = head if self.fits else "no candidate fits"
+        head = head if self.fits else "at none of these places"
         lines = [f"Whereabouts: {head}"]
         for place in self.places:
             law = "" if place.law is None else f", as {place.law.kind}"
