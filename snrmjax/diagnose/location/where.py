@@ -38,6 +38,7 @@ _FAR = 40.0  # of χ² over its scale, beyond the best: places that no law can b
 _SURE = 0.5  # probability from which on a place is named
 _MOST = 16  # candidates that are made unasked
 _HOPELESS = 30.0  # times the best misfit of rough fits, beyond which a law is not fitted
+_AGAIN = 8  # of the best fits, that are tried from further starts if they do not fit
 _FEWEST = 3.0  # numbers that count where no law fits
 _NOT_THERE = 1.5  # times the noise, from which on no place reproduces the response
 _STILL = 0.02  # of the largest motion, below which a row says nothing
@@ -272,15 +273,12 @@ def _from_further_starts(
     once: Sequence[PlacedLaw],
     fitted: Callable[..., PlacedLaw],
 ) -> list[PlacedLaw]:
-    """Fits at places, those that may have ended too early again: none that others leave behind."""
+    """Fits at places, those of the best that may have ended too early from further starts."""
     every = list(once)
     least = min(every, key=lambda fit: fit.chi_square)
-    again = [
-        k
-        for k, fit in enumerate(every)
-        if not (fit.determined and fit.fits)
-        and (not least.fits or fit.chi_square < _HOPELESS * least.chi_square)
-    ]
+    near = [k for k, fit in enumerate(every) if fit.chi_square < _HOPELESS * least.chi_square]
+    near.sort(key=lambda k: every[k].chi_square)
+    again = [k for k in near[:_AGAIN] if not (every[k].determined and every[k].fits)]
     further = over_cores(lambda k: fitted(pairs[k], every[k]), again)
     for k, fit in zip(again, further, strict=True):
         every[k] = fit
