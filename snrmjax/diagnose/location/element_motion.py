@@ -45,7 +45,9 @@ class SurroundedElement(NamedTuple):
 
     def of(self, states: Bool[np.ndarray, " state"]) -> "SurroundedElement":
         """What belongs to some of the states."""
-        return SurroundedElement(*(None if part is None else part[states] for part in self))
+        slopes = None if self.slopes is None else self.slopes[states]
+        given = self.frequency[states], self.receptance[states], self.motion[states]
+        return SurroundedElement(*given, slopes)
 
 
 class ElementForces(NamedTuple):
