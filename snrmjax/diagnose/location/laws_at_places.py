@@ -221,25 +221,21 @@ def law_fit(
     if rough:
         flat = min(starts, key=lambda at: law.chi_square(at, None))
         return _fitted(law, flat, None, 1)
-    best = before
-    if best is not None and len(starts) == 1:
-        return best
+    if before is not None and len(starts) == 1:
+        return before
     # By errors of the motion too: without them a start near a contact that barely closes looks bad.
     each = []
     for at in starts:
         law.begin_anew()
         roots = law.roots(at)
         each.append((law.chi_square(at, roots), at, roots))
-    some = slice(0, 1) if before is None else slice(1, _STARTS)
+    tried, some = ([], slice(0, 1)) if before is None else ([before], slice(1, _STARTS))
     for _, at, roots in sorted(each, key=lambda one: one[0])[some]:
         law.begin_anew()
-        found = _fitted(law, at, roots, _ROUNDS)
-        if best is None or found.chi_square < best.chi_square:
-            best = found
-        if best.determined and best.fits:
+        tried.append(_fitted(law, at, roots, _ROUNDS))
+        if tried[-1].determined and tried[-1].fits:
             break
-    assert best is not None  # every law has a start
-    return best
+    return min(tried, key=lambda fit: fit.chi_square)
 
 
 def _fitted(
