@@ -32,7 +32,7 @@ class LinearModes(AbstractShown):
     `mode_of_interest` counts from zero; files count from one.
     """
 
-    natural_frequency: Float[Array, " mode"]  # rad/s; 0 of what elements alone hold, as the last
+    natural_frequency: Float[Array, " mode"]  # rad/s; 0 without a linear spring, as the last
     damping_ratio: Float[Array, " mode"]  # fraction of critical
     mode_shape: Float[Array, "sensor mode"]  # kg^-1/2
     participation: Float[Array, " mode"]  # Φᵀb per newton of the recorded force, kg^-1/2
@@ -68,7 +68,7 @@ class LinearModes(AbstractShown):
         lines = [f"LinearModes: {count}{beside} at {', '.join(self.sensors)}"]
         for k in range(min(self.n_modes, _SHOWN)):
             if not self.natural_frequency[k]:
-                lines.append(f"mode {k + 1}: no linear stiffness, held by elements alone")
+                lines.append(f"mode {k + 1}: no linear stiffness, only nonlinear elements")
                 continue
             hertz, ratio = self.natural_frequency.item(k) / HERTZ, self.damping_ratio[k]
             chosen = ", of interest" if k == self.mode_of_interest else ""

@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Complex, Float
 
 from snrmjax.model.effect_base import AbstractForce, AbstractKinked, AbstractMemoryless
 from snrmjax.model.library.friction import CoulombFriction
+from snrmjax.numerics.blocks import by_blocks
 from snrmjax.numerics.compiled import compiled
 from snrmjax.simulate.balance.harmonics import HarmonicBasis, harmonic_basis, tangent_blocks
 
@@ -29,6 +30,7 @@ _WIDTHS = (0.2, 0.1, 0.05, 0.02)  # of a jump, over the rms velocity, from far o
 _ROUNDS = 16  # of Newton's method, at most
 _SETTLED = 1e-5  # of the fundamental, that a motion may still miss
 _LEAST_STEP = 1 / 64  # of Newton's, below which a state is given up
+_BLOCK = 32  # states in one program, so that their number compiles none anew
 _QUICK = 0.2  # of what a motion missed, that a step with earlier slopes may leave
 
 
@@ -40,6 +42,12 @@ class SurroundedElement(NamedTuple):
     motion: Complex[np.ndarray, "state order"]  # m, a first guess; its order 1 is measured
     # Of the force by the motion's other parts, from a motion nearby; None: not known.
     slopes: Float[np.ndarray, "state part free"] | None = None
+
+    def of(self, states: Bool[np.ndarray, " state"]) -> "SurroundedElement":
+        """What belongs to some of the states."""
+        slopes = None if self.slopes is None else self.slopes[states]
+        given = self.frequency[states], self.receptance[states], self.motion[states]
+        return SurroundedElement(*given, slopes)
 
 
 class ElementForces(NamedTuple):
@@ -55,28 +63,69 @@ class ElementForces(NamedTuple):
     slopes: Float[np.ndarray, "state part free"]  # see `SurroundedElement`
     settled: Bool[np.ndarray, " state"]
 
+    def with_states(
+        self, states: Bool[np.ndarray, " state"], others: "ElementForces"
+    ) -> "ElementForces":
+        """These forces, but those of some states as others have them, one after the other."""
+        whole = ElementForces(*(part.copy() for part in self))
+        for part, other in zip(whole, others, strict=True):
+            part[states] = other
+        return whole
+
+
+class _Formula(NamedTuple):
+    """A law, whose parameters are given apart, and how its force along a cycle is found."""
+
+    effect: Any
+    quick: bool = False
+    at_samples: bool = False  # without exact times of contact, which take long to compile
+
+    def law(self, values: Array) -> Any:
+        """The law with its parameters."""
+        names = self.effect.parameters()
+        return dataclasses.replace(self.effect, **dict(zip(names, values, strict=True)))
+
+    def basis(self, motion: Array) -> HarmonicBasis:
+        """The harmonics of a motion, at samples that resolve the force."""
+        n_samples = _FINE if isinstance(self.effect, CoulombFriction) else _SAMPLES
+        return harmonic_basis((len(motion) - 1) // 2, n_samples)
+
+    def parts(
+        self, values: Array, motion: Float[Array, " part"], omega: Float[Array, ""]
+    ) -> Float[Array, " part"]:
+        """Parts of the force along a motion."""
+        law, basis = self.law(values), self.basis(motion)
+        x, v = _motion(basis, motion, omega)
+        if self.at_samples:
+            force = jax.vmap(law.force)(x, v)
+        else:
+            force = law.quick_cycle_force(x, v) if self.quick else law.cycle_force(x, v)
+        return jnp.asarray(basis.analysis) @ force
+
 
 def element_forces(
     effect: AbstractForce,
     values: Float[np.ndarray, " parameter"],
     element: SurroundedElement,
     *,
+    rough: bool = False,
     exact: bool = False,
 ) -> ElementForces:
     """The forces of a law with its own motion at every state, by Newton's method.
 
-    Arguments: `effect` says which law, `values` its parameters; `exact` slopes are those at the
-    motion found, others may be from nearby. States whose motion was not found are not `settled`:
-    their forces are those of the nearest motion that was.
+    Arguments: `effect` says which law, `values` its parameters; a `rough` force has wider jumps and
+    no exact times of contact; `exact` slopes are those at the motion found, others may be from
+    nearby. States whose motion was not found are not `settled`: their forces are those of the
+    nearest motion that was.
     """
     if isinstance(effect, CoulombFriction):
-        resolved = element.motion.shape[1] > OWN_ORDERS + 1
-        *far, last = _WIDTHS if resolved else _WIDTHS[:-1]
+        *far, last = _WIDTHS[:-1] if rough else _WIDTHS
         for width in far if element.slopes is None else ():
-            nearby = _solved_motion(_with_width(effect, width), values, element)
+            nearby = _solved_motion(_Formula(_with_width(effect, width)), values, element)
             element = element._replace(motion=nearby.motion)
         effect = _with_width(effect, last)
-    return _solved_motion(effect, values, element, exact=exact)
+    formula = _Formula(effect, at_samples=rough and isinstance(effect, AbstractKinked))
+    return _solved_motion(formula, values, element, exact=exact)
 
 
 def _with_width(effect: CoulombFriction, width: float) -> CoulombFriction:
@@ -84,7 +133,7 @@ def _with_width(effect: CoulombFriction, width: float) -> CoulombFriction:
 
 
 def _solved_motion(
-    effect: AbstractForce,
+    formula: _Formula,
     values: Float[np.ndarray, " parameter"],
     element: SurroundedElement,
     *,
@@ -98,12 +147,12 @@ def _solved_motion(
 
     def along(motion: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Force, its slopes, and what the motion misses, over the fundamental."""
-        force, slopes = _force_and_slopes(effect, values, motion, element.frequency)
+        force, slopes = _force_and_slopes(formula, values, motion, element.frequency)
         missed = motion[:, free] + np.einsum("sij,sj->si", receptance, force)
         return force, slopes, np.nan_to_num(missed / size, nan=1e9, posinf=1e9, neginf=-1e9)
 
     def by_free(motion: np.ndarray) -> np.ndarray:
-        return np.nan_to_num(_slopes_by_free(effect, values, motion, element.frequency))
+        return np.nan_to_num(_slopes_by_free(formula, values, motion, element.frequency))
 
     force, slopes, missed = along(motion)
     steep, fresh = element.slopes, False
@@ -150,7 +199,8 @@ def force_along(
 ) -> Complex[np.ndarray, "state order"]:
     """Harmonics of a law's force along the motions as they are given."""
     motion = _real_parts(element.motion)
-    return _complex(_force_and_slopes(effect, values, motion, element.frequency)[0])
+    formula = _Formula(effect, at_samples=isinstance(effect, AbstractKinked))
+    return _complex(_force_and_slopes(formula, values, motion, element.frequency)[0])
 
 
 def _misses(missed: np.ndarray) -> np.ndarray:
@@ -184,67 +234,61 @@ def _products(phasors: Complex[np.ndarray, "state order"]) -> Float[np.ndarray, 
 
 
 def _force_and_slopes(
-    effect: AbstractForce, values: np.ndarray, motion: np.ndarray, frequency: np.ndarray
+    formula: _Formula, values: np.ndarray, motion: np.ndarray, frequency: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Parts of the force, and their slopes by cosine and sine of the fundamental and by values."""
-    force, slopes = _by_formulas(_some_slopes, effect, values, motion, frequency)
+    force, slopes = _by_formulas(_some_slopes, formula, values, motion, frequency)
     return force, slopes
 
 
 def _slopes_by_free(
-    effect: AbstractForce, values: np.ndarray, motion: np.ndarray, frequency: np.ndarray
+    formula: _Formula, values: np.ndarray, motion: np.ndarray, frequency: np.ndarray
 ) -> np.ndarray:
     """Slopes of the force's parts by the mean and the other harmonics of the motion."""
-    return _by_formulas(_other_slopes, effect, values, motion, frequency)[0]
+    # Exact times of contact do not count: one program for both.
+    formula = formula._replace(at_samples=False)
+    return _by_formulas(_other_slopes, formula, values, motion, frequency)[0]
 
 
 def _by_formulas(
-    program: Callable[..., tuple],
-    effect: AbstractForce,
-    values: np.ndarray,
-    motion: np.ndarray,
-    frequency: np.ndarray,
+    program: Callable[..., tuple], formula: _Formula, values: np.ndarray, *states: np.ndarray
 ) -> tuple[np.ndarray, ...]:
     """By the shorter formula where there is one; NaN of it say where it does not hold."""
-    given = tuple(effect.parameters()), values, motion, frequency
-    if type(effect).has_quick_formula():
-        found = tuple(np.array(part) for part in program(effect, True, *given))
+    quick = formula._replace(quick=True)
+    if type(formula.effect).has_quick_formula():
+        found = by_blocks(lambda *some: program(quick, values, *some), _BLOCK, *states)
         if all(np.all(np.isfinite(part)) for part in found):
             return found
-    return tuple(np.array(part) for part in program(effect, False, *given))
+    return by_blocks(lambda *some: program(formula, values, *some), _BLOCK, *states)
 
 
 @compiled
 def _some_slopes(
-    effect: AbstractForce,
-    quick: bool,
-    names: tuple[str, ...],
+    formula: _Formula,
     values: Float[Array, " parameter"],
     motion: Float[Array, "state part"],
     frequency: Float[Array, " state"],
 ) -> tuple[Float[Array, "state part"], Float[Array, "state part argument"]]:
-    # Slopes need no exact times of contact, whose derivatives take long to compile.
-    kinked = isinstance(effect, AbstractKinked)
+    # Slopes need no exact times of contact.
+    by_samples = formula._replace(at_samples=isinstance(formula.effect, AbstractKinked))
 
     def one(motion: Array, omega: Array) -> tuple[Array, Array]:
         def force(given: Array) -> tuple[Array, Array]:
             x, of = jnp.split(given, [2])
-            found = _parts(
-                effect, quick, names, of, motion.at[1:3].set(x), omega, at_samples=kinked
-            )
+            found = by_samples.parts(of, motion.at[1:3].set(x), omega)
             return found, found
 
         slopes, found = jax.jacfwd(force, has_aux=True)(jnp.concatenate([motion[1:3], values]))
-        return _parts(effect, quick, names, values, motion, omega) if kinked else found, slopes
+        if by_samples.at_samples and not formula.at_samples:
+            found = formula.parts(values, motion, omega)
+        return found, slopes
 
     return jax.vmap(one)(motion, frequency)
 
 
 @compiled
 def _other_slopes(
-    effect: AbstractForce,
-    quick: bool,
-    names: tuple[str, ...],
+    formula: _Formula,
     values: Float[Array, " parameter"],
     motion: Float[Array, "state part"],
     frequency: Float[Array, " state"],
@@ -253,7 +297,7 @@ def _other_slopes(
     free = np.delete(np.arange(motion.shape[1]), [1, 2])
 
     def of_samples(motion: Array, omega: Array) -> Array:
-        law, basis = _set(effect, names, values, motion)
+        law, basis = formula.law(values), formula.basis(motion)
         x, v = _motion(basis, motion, omega)
         if isinstance(law, CoulombFriction):
             law = law.scaled_for(jnp.max(x), jnp.sqrt(jnp.mean(v**2)))
@@ -269,44 +313,15 @@ def _other_slopes(
 
     def of_cycle(motion: Array, omega: Array) -> Array:
         def force(x: Array) -> Array:
-            return _parts(effect, quick, names, values, motion.at[free].set(x), omega)
+            return formula.parts(values, motion.at[free].set(x), omega)
 
         return jax.jacfwd(force)(motion[free])
 
-    has_slopes = isinstance(effect, AbstractMemoryless | CoulombFriction)
+    has_slopes = isinstance(formula.effect, AbstractMemoryless | CoulombFriction)
     return (jax.vmap(of_samples if has_slopes else of_cycle)(motion, frequency),)
-
-
-def _set(
-    effect: Any, names: tuple[str, ...], values: Array, motion: Array
-) -> tuple[Any, HarmonicBasis]:
-    """The law with its parameters, and the basis that resolves its force."""
-    n_samples = _FINE if isinstance(effect, CoulombFriction) else _SAMPLES
-    law = dataclasses.replace(effect, **dict(zip(names, values, strict=True)))
-    return law, harmonic_basis((len(motion) - 1) // 2, n_samples)
 
 
 def _motion(basis: HarmonicBasis, motion: Array, omega: Array) -> tuple[Array, Array]:
     """x and ẋ at samples of a cycle."""
     rate = jnp.asarray(basis.synthesis @ basis.derivative)
     return jnp.asarray(basis.synthesis) @ motion, omega * (rate @ motion)
-
-
-def _parts(
-    effect: AbstractForce,
-    quick: bool,
-    names: tuple[str, ...],
-    values: Float[Array, " parameter"],
-    motion: Float[Array, " part"],
-    omega: Float[Array, ""],
-    *,
-    at_samples: bool = False,
-) -> Float[Array, " part"]:
-    """Parts of a law's force along a motion."""
-    law, basis = _set(effect, names, values, motion)
-    x, v = _motion(basis, motion, omega)
-    if at_samples:
-        force = jax.vmap(law.force)(x, v)
-    else:
-        force = law.quick_cycle_force(x, v) if quick else law.cycle_force(x, v)
-    return jnp.asarray(basis.analysis) @ force

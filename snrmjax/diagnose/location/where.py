@@ -2,7 +2,8 @@
 
 import dataclasses
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -24,6 +25,7 @@ from snrmjax.model.effects import EFFECTS, make_effect
 from snrmjax.model.modes import LinearModes
 from snrmjax.model.places import Row, row_over_points
 from snrmjax.model.structures import Structure
+from snrmjax.numerics.blocks import on_one_core, over_cores
 from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, quantity, setting
@@ -36,9 +38,9 @@ _FAR = 40.0  # of χ² over its scale, beyond the best: places that no law can b
 _SURE = 0.5  # probability from which on a place is named
 _MOST = 16  # candidates that are made unasked
 _HOPELESS = 30.0  # times the best misfit of rough fits, beyond which a law is not fitted
+_AGAIN = 8  # of the best fits, that are tried from further starts if they do not fit
 _FEWEST = 3.0  # numbers that count where no law fits
-_AS_NOISE = 1.2  # times the noise, up to which a law leaves no more than that
-_NOT_THERE = 1.5  # times the noise, from which on no candidate explains the sensors
+_NOT_THERE = 1.5  # times the noise, from which on no place reproduces the response
 _STILL = 0.02  # of the largest motion, below which a row says nothing
 
 
@@ -96,8 +98,8 @@ class Whereabouts(AbstractResult):
     def explains(self) -> bool:
         """Whether a law at one place, and no distributed one, leaves no more than noise."""
         first = self.places[0]
-        law = first.law is not None and first.law.chi_square < _AS_NOISE**2 * first.law.freedom
-        return self.told and first.row is not None and law
+        fits = first.law is not None and first.law.fits
+        return self.told and first.row is not None and fits
 
     @property
     def fits(self) -> bool:
@@ -112,7 +114,7 @@ class Whereabouts(AbstractResult):
     def summary(self) -> tuple[str, ...]:
         """See `AbstractResult`."""
         head = self.name[0] if self.told else "cannot be told"
-        head = head if self.fits else "no candidate fits"
+        head = head if self.fits else "at none of these places"
         lines = [f"Whereabouts: {head}"]
         for place in self.places:
             law = "" if place.law is None else f", as {place.law.kind}"
@@ -128,6 +130,7 @@ class Whereabouts(AbstractResult):
 
 
 @on_numbers("Differentiate the force that a motion needs: `sj.identify.inverse_force`.")
+@on_one_core
 def locate_force(
     data: SteadyStates,
     model: Structure,
@@ -236,16 +239,19 @@ def _by_laws(
 ) -> tuple[dict[str, tuple[PlacedLaw, dict[str, float]]], dict[str, float], float]:
     """The best law of every place, the logarithms of their evidence, and what the best leaves."""
     pairs = [(name, kind) for name in near for kind in laws]
-    rough = [
-        law_fit(kind, records, patterns[name], fits[name], rough=True).chi_square
-        for name, kind in pairs
-    ]
+
+    def fitted(
+        pair: tuple[str, str], before: PlacedLaw | None = None, *, rough: bool = False
+    ) -> PlacedLaw:
+        name, kind = pair
+        return law_fit(kind, records, patterns[name], fits[name], rough=rough, before=before)
+
+    rough = [fit.chi_square for fit in over_cores(partial(fitted, rough=True), pairs)]
+    hopeful = [pair for pair, s in zip(pairs, rough, strict=True) if s < _HOPELESS * min(rough)]
+    every = _from_further_starts(hopeful, over_cores(fitted, hopeful), fitted)
     found: dict[str, list[PlacedLaw]] = {}
-    for (name, kind), square in zip(pairs, rough, strict=True):
-        if square < _HOPELESS * min(rough):
-            fit = law_fit(kind, records, patterns[name], fits[name])
-            found.setdefault(name, []).append(fit)
-    every = [fit for fits_there in found.values() for fit in fits_there]
+    for (name, _), fit in zip(hopeful, every, strict=True):
+        found.setdefault(name, []).append(fit)
     least = min(every, key=lambda fit: fit.chi_square)
     scale = max(1.0, least.chi_square / least.freedom)
     # Where no law fits, what is left is no noise: then few numbers count, as of Student's t.
@@ -260,6 +266,23 @@ def _by_laws(
         kinds = {fit.kind: float(share) for fit, share in zip(there, shares, strict=True)}
         best[name] = there[int(np.argmax(shares))], kinds
     return best, evidence, least.chi_square / least.freedom
+
+
+def _from_further_starts(
+    pairs: Sequence[tuple[str, str]],
+    once: Sequence[PlacedLaw],
+    fitted: Callable[..., PlacedLaw],
+) -> list[PlacedLaw]:
+    """Fits at places, those of the best that may have ended too early from further starts."""
+    every = list(once)
+    least = min(every, key=lambda fit: fit.chi_square)
+    near = [k for k, fit in enumerate(every) if fit.chi_square < _HOPELESS * least.chi_square]
+    near.sort(key=lambda k: every[k].chi_square)
+    again = [k for k in near[:_AGAIN] if not (every[k].determined and every[k].fits)]
+    further = over_cores(lambda k: fitted(pairs[k], every[k]), again)
+    for k, fit in zip(again, further, strict=True):
+        every[k] = fit
+    return every
 
 
 def few_places(model: Structure) -> bool:

@@ -72,8 +72,8 @@ def from_matrices(
     further modes of high frequency; without `residuals` it does not, as many places want it.
     `sensors` are the points that are watched, by default all.
     Damping that couples modes is kept. Modes without stiffness become rigid-body modes; those that
-    an effect acts on become modes of zero frequency, behind the others: what elements alone hold,
-    as an absorber without a linear spring.
+    an effect acts on become modes of zero frequency, behind the others: masses without a linear
+    spring, which only nonlinear elements connect, as those of a nonlinear absorber.
 
     Returns a `Structure`. What `n_modes` leaves out is the dynamics of higher modes: a share of
     about (Ω/ω)² of their static part, ω being the first frequency left out, for each harmonic Ω.

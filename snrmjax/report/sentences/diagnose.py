@@ -186,9 +186,9 @@ def _no_place_fits(
 ) -> str:
     law = f"{effect_name(kind)} at {place}" if kind else place
     return (
-        f"no candidate explains the sensors: the best, {law}, leaves {misfit:.2g} times the noise. "
-        "The force acts elsewhere, at several places or by another law, or the linear structure "
-        "is not right."
+        "a force at none of these places reproduces the measured response: the best, "
+        f"{law}, leaves a residual of {misfit:.2g} times the noise. The force acts elsewhere, at "
+        "several places or by another law, or the linear model is wrong."
     )
 
 

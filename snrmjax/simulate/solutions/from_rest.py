@@ -238,7 +238,7 @@ def _add_from_beyond(
     """Curves that enter at the lower (upper) end from below (above) a resonance outside."""
     end = float(ends[int(downward)])
     natural = np.asarray(balances.model.modes.natural_frequency)  # of every member
-    # What elements alone hold has no frequency.
+    # A mass without a linear spring has no natural frequency.
     ratio = (
         natural if downward else np.where(natural > 0, end**2 / np.maximum(natural, 1e-300), 0.0)
     ) / end

@@ -126,5 +126,5 @@ def test_where_no_candidate_fits_the_words_say_so():
     data, model = steady_states(ROW, hardening, sensors, forces=(2.0, 4.0)), structure(sensors)
     found = sj.diagnose.locate_force(data, model, ("x1", "x2-x1"), laws=LAWS)
     assert not found.fits
-    assert "no candidate explains the sensors" in str(found.words)
+    assert "a force at none of these places reproduces the measured response" in str(found.words)
     assert not summarise_whereabouts(found)["where_fits"]

@@ -148,7 +148,7 @@ def test_what_is_no_structure_is_refused(parts, settings, complaint):
         from_matrices(*parts, **{"force": "x1", **settings})
 
 
-def test_what_elements_alone_hold_is_a_mode_of_zero_frequency():
+def test_a_mass_without_a_linear_spring_is_a_mode_of_zero_frequency():
     spring = sj.model.make_effect("cubic_stiffness", {"coefficient": 1.0}, at="x1")
     held = from_matrices(*chain([1.0, 2.0], [0.0, 3.0, 0.0]), force="x1", effects=spring).modes
     np.testing.assert_allclose(held.natural_frequency, [np.sqrt(3 * 1.5), 0.0])

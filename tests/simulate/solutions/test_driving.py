@@ -1,4 +1,4 @@
-"""What drives a structure, and what elements alone hold: against integration of the matrices."""
+"""What drives a structure, masses without a linear spring: against integration of the matrices."""
 
 import dataclasses
 
