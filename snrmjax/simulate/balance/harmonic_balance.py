@@ -27,7 +27,7 @@ from snrmjax.simulate.balance.harmonics import (
     tangent_blocks,
 )
 
-_BY_CYCLE = (AbstractHysteresis, AbstractKinked)  # whose force needs the whole cycle
+BY_CYCLE = (AbstractHysteresis, AbstractKinked)  # whose force needs the whole cycle
 
 
 class HarmonicBalance(eqx.Module):
@@ -162,7 +162,7 @@ class HarmonicBalance(eqx.Module):
         elements = elements_of(model.forces, model.modes)
         x, v_omega = elements.displacement(samples), elements.displacement(by_omega)
         v = omega * v_omega
-        slopes = elements.without(_BY_CYCLE).slopes(x, v)
+        slopes = elements.without(BY_CYCLE).slopes(x, v)
         block = tangent_blocks(basis, slopes.stiffness / fs**2)
         viscous = tangent_blocks(basis, slopes.damping / fs)
         block = block + omega * jnp.einsum("cep,ed->cdp", viscous, basis.derivative)
@@ -170,7 +170,7 @@ class HarmonicBalance(eqx.Module):
         shapes = jnp.asarray(basis.synthesis.T) * self.displacement_scale
         rates = jnp.asarray((basis.synthesis @ basis.derivative).T)
         rates = rates * (omega * fs * self.displacement_scale)
-        by_cycle, across = elements.only(_BY_CYCLE).apart()
+        by_cycle, across = elements.only(BY_CYCLE).apart()
         if by_cycle.groups:
 
             def along(direction: Array, direction_rate: Array) -> Array:
@@ -262,7 +262,7 @@ def samples_for(model: Structure, harmonic_order: int, n_samples: int | None) ->
         n_samples = alias_free_samples(harmonic_order, max(model.potential.degree - 1, 1))
         if model.forces:
             n_samples = max(n_samples, 128, 16 * harmonic_order)
-        if any(isinstance(force, _BY_CYCLE) for force in model.forces):
+        if any(isinstance(force, BY_CYCLE) for force in model.forces):
             n_samples = max(n_samples, 256)
     return n_samples
 

@@ -18,6 +18,7 @@ from snrmjax.simulate.continuation.stability import MARGIN, many_multipliers
 
 _FOLDS_OWN = 12  # points from a fold at which its multiplier may cross
 _CROSSING = 5e-7  # of a step, to which the crossing of the circle is located
+_JUMP = 1e-4  # of a modulus over such a share of a step: more than any smooth motion's
 _SHARES = 4  # of the way through an interval that are looked at side by side
 _ROUNDS = 24  # of looking closer, at most; three or four do
 
@@ -36,7 +37,8 @@ def with_bifurcations(
     """The curves with the points inserted where a multiplier crosses the unit circle.
 
     A real multiplier through −1 is a period doubling, a complex pair a Neimark-Sacker
-    bifurcation, and +1 away from a fold a branch point; "bifurcation" in `not_located` stands for
+    bifurcation, and +1 away from a fold a branch point; where multipliers cross or jump over the
+    circle at a fold itself, the fold stands for both. "bifurcation" in `not_located` stands for
     one that could not be located. Arguments: `balances` stacked, one for every curve, whose
     multipliers are known.
     """
@@ -153,14 +155,29 @@ def _located_bifurcations(
         value_low[still], value_high[still] = height[at, behind - 1], height[at, behind]
         share[still] = _closer(whole, height, behind)
     located = (high - low <= _CROSSING) & (inside | ~missed)
+    # A contact or slip that sets in turns the curve and lets multipliers jump over the circle at
+    # one place; and what is within the location's accuracy of a fold is no event of its own.
+    jumps = value_high - value_low > _JUMP
+    own = without_one & (jumps | _at_folds(curves, crossings, low, high))
     new_points = [
         NewPoint(int(o), int(k), point[e], tangent[e], _crossing_kind(passed[e]), passed[e])
         for e, (o, k, _) in enumerate(crossings)
-        if located[e]
+        if located[e] and not own[e]
     ]
     for o in owner[~located].tolist():
         curves[o] = curves[o]._replace(not_located=(*curves[o].not_located, "bifurcation"))
     return inserted(curves, new_points)
+
+
+def _at_folds(
+    curves: list[TracedCurve], crossings: list[_Crossing], low: np.ndarray, high: np.ndarray
+) -> np.ndarray:
+    """Which crossings, between two shares of their ways, cannot be told from a fold at an end."""
+    before, behind = (
+        np.array([curves[o].events[k + ahead] == CurveEvent.FOLD for o, k, _ in crossings])
+        for ahead in (0, 1)
+    )
+    return (before & (low <= _CROSSING)) | (behind & (high >= 1.0 - _CROSSING))
 
 
 def _closer(share: np.ndarray, height: np.ndarray, behind: np.ndarray) -> np.ndarray:

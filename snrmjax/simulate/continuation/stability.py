@@ -10,6 +10,7 @@ from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import by_member, mapped, on_one_core, stacked
 from snrmjax.numerics.compiled import compiled, on_numbers
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance
+from snrmjax.simulate.continuation.left_out_harmonics import completed_motions, has_contacts
 from snrmjax.simulate.continuation.monodromy import monodromy
 
 STEPS_PER_CYCLE = 6  # of the fastest tangent frequency
@@ -57,8 +58,15 @@ def floquet_multipliers(
 def many_multipliers(
     balances: HarmonicBalance, owner: np.ndarray, points: Float[np.ndarray, "point unknown"]
 ) -> Complex[np.ndarray, "point multiplier"]:
-    """Floquet multipliers of scaled points of several structures: `owner` says of which."""
-    return _multipliers(balances.model, owner, *balances.motions(points, owner), STEPS_PER_CYCLE)
+    """Floquet multipliers of scaled points of several structures: `owner` says of which.
+
+    With contacts or friction they are those of the motions with twice the harmonics.
+    """
+    whole = has_contacts(balances.model) and len(points) > 0
+    motions = (
+        completed_motions(balances, owner, points) if whole else balances.motions(points, owner)
+    )
+    return _multipliers(balances.model, owner, *motions, STEPS_PER_CYCLE)
 
 
 def _multipliers(

@@ -334,6 +334,42 @@ def test_a_bifurcation_that_is_not_located_is_named(monkeypatch):
     assert len(found.points) == 6
 
 
+@pytest.mark.parametrize(
+    ("place", "height", "number"),
+    [
+        (2.0 + 1e-8, 1.00001, 0),  # within the accuracy of the location
+        (2.4, 1.05, 0),  # a jump beside the fold: no pair is on the circle
+        (2.4, 1.0, 1),  # a pair passes the circle beside the fold
+    ],
+)
+def test_a_fold_with_a_crossing_at_one_place_is_one_event(place, height, number, monkeypatch):
+    # A Neimark-Sacker point has a pair on the circle, a fold a real multiplier at +1.
+    model = structure(linear_modes([1.0, 2.0], [0.1, 0.1], [[1.0, 1.0]], [1.0, 1.0]))
+    balance = response_balances([model], np.array([1.0]), 1, None)
+    along = np.eye(7)[-1]
+
+    def multipliers_of(_, __, points):
+        behind = points[:, -1] - place
+        modulus = np.where(behind > 0, height, min(height, 2 - height)) + 0.01 * behind
+        turn = np.exp(0.7j)
+        fold = 1.0 + 0.01 * (points[:, -1] - 2.0)
+        return np.stack([modulus * turn, modulus / turn, fold, 0.1 * fold], axis=1)
+
+    def points_between(_, __, neighbours, share, ___):
+        found = np.outer(neighbours[0][:, -1] + share, along)
+        return found, np.outer(np.ones(len(found)), along), np.ones(len(found), dtype=bool)
+
+    monkeypatch.setattr(bifurcations, "many_multipliers", multipliers_of)
+    monkeypatch.setattr(bifurcations, "points_between", points_between)
+    points = np.outer(np.arange(6.0), along)
+    kinds = [CurveEvent.FOLD if k == 2 else CurveEvent.NONE for k in range(6)]
+    curve = TracedCurve(points, np.outer(np.ones(6), along), events=tuple(kinds))
+    curve = curve._replace(multipliers=multipliers_of(None, None, points))
+    found = with_bifurcations(balance, [curve], StepControl())[0]
+    assert found.not_located == ()
+    assert [e for e in found.events if e] == ["fold", *["neimark_sacker"] * number]
+
+
 def test_a_fold_that_is_not_located_is_named():
     # No error is small enough: Newton's method converges nowhere, and no sign change is resolved.
     model = curved_beam()

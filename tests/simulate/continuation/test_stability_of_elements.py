@@ -90,3 +90,31 @@ def test_multipliers_with_friction_and_a_stop_at_several_points(motion):
     wanted, ours = (np.sort(np.abs(row)) for row in (values[:6], found))
     # Times of slip, from 512 samples, are late by up to 1e-4 of a period; ours of 4 000 steps too.
     np.testing.assert_allclose(ours, wanted, rtol=0, atol=5e-4)
+
+
+@pytest.mark.long
+def test_a_multiplier_is_one_where_a_response_with_sliders_and_stops_turns():
+    # At a fold two motions meet, so that a disturbance from one to the other stays as it is.
+    elements = (
+        ("jenkins_slider", "x1", {"stiffness": 0.1655, "slip_displacement": 0.4998}),
+        (
+            *("jenkins_slider", sj.model.between("x2", "x1")),
+            {"stiffness": 0.3583, "slip_displacement": 0.3066},
+        ),
+        ("one_sided_stop", "x3", {"stiffness": 0.5859, "gap": 0.4062}),
+        ("cubic_stiffness", "x3", {"coefficient": 0.2867}),
+        ("one_sided_stop", sj.model.between("x3", "x2"), {"stiffness": 0.8229, "gap": 0.4772}),
+    )
+    effects = tuple(sj.model.make_effect(kind, given, at=at) for kind, at, given in elements)
+    chain = sj.model.chain(
+        *([1.3601, 1.0579, 1.3834], [0.7566, 1.1251, 0.9635, 1.2613]),
+        [0.0163, 0.01241, 0.01667, 0.01161],
+    )
+    model = sj.model.from_matrices(*chain, force="x1", effects=effects)
+    curve = sj.forced_response(model, 0.5144, 0.75, 0.88)[0]
+    folds = curve.at_events("fold")
+    assert len(folds) == 2
+    for k in folds:
+        # Of the nine harmonics alone the upper fold's is 0.96: a stable motion there. With twice
+        # as many they are right to the next ones' share, 1e-3.
+        assert np.abs(curve.multipliers[k] - 1).min() < 3e-3
