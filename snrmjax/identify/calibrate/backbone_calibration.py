@@ -214,10 +214,12 @@ def _chosen(names: tuple[str, ...], which: np.ndarray) -> tuple[str, ...]:
     return tuple(name for name, there in zip(names, which, strict=True) if there)
 
 
-def _on_parameters(kind: str, names: tuple[str, ...], which: np.ndarray, prior: np.ndarray) -> Fact:
-    """A note on some parameters, which says whether starting values of all are known to `prior`."""
+def _of_parameters(
+    names: tuple[str, ...], which: np.ndarray, prior: np.ndarray
+) -> dict[str, tuple[str, ...] | bool]:
+    """Some parameters, and whether starting values of all are known to `prior`."""
     stated = bool(np.all(np.isfinite(prior[which])))
-    return Fact(kind, names=_chosen(names, which), prior_stated=stated)
+    return {"names": _chosen(names, which), "prior_stated": stated}
 
 
 def _outcome(
@@ -245,14 +247,14 @@ def _outcome(
             notes.append(Fact("calibration_noise", scale=float(np.sqrt(reduced))))
         vague = ~(np.diag(relative) < 1)
         if vague.any():
-            notes.append(_on_parameters("parameters_hardly_known", names, vague, prior))
+            notes.append(Fact("parameters_hardly_known", **_of_parameters(names, vague, prior)))
     if end.status == MinimisationStatus.NOT_FINITE:
         notes.append(Fact("no_mode_at_start"))
     elif not end.status.found_minimum:
         notes.append(Fact("calibration_not_converged"))
     at_limit = np.abs(np.abs(end.point) - _FURTHEST) < 1e-9
     if at_limit.any():
-        notes.append(_on_parameters("parameters_at_limit", names, at_limit, prior))
+        notes.append(Fact("parameters_at_limit", **_of_parameters(names, at_limit, prior)))
     by_value = linear.jacobian[:n] * sigma[:, None] / values
     variance = np.einsum("ki,ij,kj->k", by_value, covariance, by_value)
     return BackboneCalibration(
