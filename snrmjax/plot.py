@@ -26,6 +26,7 @@ from snrmjax.report.figures.modes import (
     modal_responses_figure,
     stabilisation_figure,
 )
+from snrmjax.report.figures.parts import parts_figure
 from snrmjax.report.figures.simulation import (
     batch_figure,
     damped_mode_figure,
@@ -60,6 +61,7 @@ __all__ = [
     "motions_figure",
     "next_measurements_figure",
     "normal_mode_figure",
+    "parts_figure",
     "propagation_figure",
     "residuals_figure",
     "response_figure",

@@ -84,6 +84,7 @@ SUB_ROOMS = {
     "methods.records": {"methods.result", "methods.one_sensor"},
     "identify.test_model": {"identify.checks", "identify.curves"},
     "diagnose.misfit": {"diagnose.priors"},
+    "diagnose.naming": set(),
     "diagnose.search": {"diagnose.misfit", "diagnose.priors"},
     "diagnose.checks": {
         *("diagnose.misfit", "diagnose.search", "diagnose.priors", "diagnose.evidence"),

@@ -9,6 +9,13 @@ import numpy as np
 from jaxtyping import Float
 
 from snrmjax.diagnose import priors
+from snrmjax.diagnose.answer_by_parts import (
+    answers_of,
+    completed_by_parts,
+    fitted_parts,
+    verdict_of,
+    with_parts,
+)
 from snrmjax.diagnose.answers import Search, best_answer
 from snrmjax.diagnose.checks.gains import (
     LevelGain,
@@ -48,6 +55,7 @@ from snrmjax.diagnose.diagnosis_result import (
     Gap,
     completed_model,
 )
+from snrmjax.diagnose.explained_parts import NamedParts, named_parts, shortlist
 from snrmjax.diagnose.laws.law_answer import LawAnswer, law_answer
 from snrmjax.diagnose.misfit.effect_fit import EffectFit, at_phases_of, at_reference, baseline_fit
 from snrmjax.diagnose.misfit.noise_model import notes_without_phases, unit_columns
@@ -113,10 +121,18 @@ def diagnose_model(
         data, gain, of_gain = with_first_gain(model, data)
         force_gain_std = force_gain_std or priors.FREE_GAIN_STD
         notes += of_gain
-    predictions = _corrected_predictions(model, data, force_gain_std)
-    unknown, noise_stated = predictions.chosen.phase_unknown, predictions.chosen.noise_stated
+    recorded = predictions_of(model, data, force_gain_std)
+    unknown, noise_stated = recorded.chosen.phase_unknown, recorded.chosen.noise_stated
     excluded = excluded_kinds(model, force_gain_std, phases=not unknown[:, 0].all())
     kinds = tuple(kind for kind in EFFECTS if kind not in excluded)
+    more_seen = bool(recorded.chosen.orders) or len(recorded.chosen.sensors) > 1
+    named = None if unknown.any() else named_parts(recorded, data, kinds)
+    predictions = _corrected_predictions(recorded, data)
+    if named is not None and not more_seen:
+        found = fitted_parts(named, predictions, data)
+        return _by_parts(model, data, named, found, _Gain(gain, tuple(notes)), former, excluded)
+    if named is not None:
+        kinds = shortlist(named.naming, kinds, more_seen=more_seen)
     search = Search(scales_of(predictions), kinds, former.starts if former else {}, data)
     answered = best_answer(search, predictions)
     as_recorded, rival, best = answered.found, None, answered
@@ -171,6 +187,8 @@ def diagnose_model(
         data=with_forces_that_acted(data, gains),
         level_forces=gains,
     )
+    if named is not None:
+        return with_parts(diagnosis, named, misfit.baseline_parameters(fit.rows), model)
     known = noise_stated and force_gain_std == 0 and phases
     if not known or not law_is_asked_for(judgement, len(fit.kinds)):
         return diagnosis
@@ -179,11 +197,61 @@ def diagnose_model(
     return diagnosis if law is None else _with_law(diagnosis, with_law(judgement, law), law)
 
 
-def _corrected_predictions(
-    model: Structure, data: SteadyStates, force_gain_std: float
-) -> Predictions:
+class _Gain(NamedTuple):
+    """The first value of a force's gain where a drive voltage is known, and notes on it."""
+
+    value: float | None
+    notes: tuple[Fact | str, ...]
+
+
+def _by_parts(
+    model: Structure,
+    data: SteadyStates,
+    named: NamedParts,
+    found: FoundEffects,
+    gain: _Gain,
+    former: FormerAnswer | None,
+    excluded: set[str],
+) -> Diagnosis:
+    """The diagnosis whose answer the readings give, with its laws fitted by harmonic balance."""
+    checked = _Checked.of(found)
+    misfit, fit, naming = checked.misfit, found.fit, named.naming
+    completed = _completed(model, checked)
+    verdict, reasons = verdict_of(named, found)
+    judgement = Judgement(verdict, reasons, (), answers_of(naming, verdict))
+    notes = [*gain.notes, *reasons]
+    if former is not None:
+        notes.append(former.changed_to(judgement.probabilities))
+    answer = _answer(judgement, checked, completed)
+    if gain.value is not None and answer.effects:
+        found_gain = gain.value * answer.force_gain
+        notes.append(Fact("gain_with_effects", gain=found_gain, before=gain.value))
+    notes += [*_notes_on_data(checked), *_notes_on_answer(checked, completed)]
+    test = recommended_test(found) if verdict is Verdict.AMBIGUOUS else None
+    asked = recommendation(found, test, [], phases=True) if verdict.is_answer else None
+    before, after = rms_misfit(misfit, found.baseline), rms_misfit(misfit, fit)
+    if verdict is Verdict.NOTHING_MISSING:  # beside errors of levels that nobody stated
+        before = after = min(after, naming.misfit)
+    diagnosis = Diagnosis(
+        verdict=verdict,
+        answer=answer,
+        recommended=asked,
+        discriminating_test=test,
+        located=checked.located,
+        gap=Gap(before, after, *(checked.levels or (None, None))),
+        checks=Checks(found.p_value, float(np.sqrt(checked.neighbours)), completed.without),
+        detection_limits=detection_limits(misfit, fit, scales_of(misfit.predictions), excluded),
+        table=found.table,
+        notes=tuple(notes),
+        force_misfit=_force_misfit(misfit, found.baseline, fit),
+        data=data,
+        parts=naming.parts,
+    )
+    return completed_by_parts(diagnosis, named, misfit.baseline_parameters(fit.rows), model)
+
+
+def _corrected_predictions(predictions: Predictions, data: SteadyStates) -> Predictions:
     """Predictions weighed by what the states show by themselves, of corrected records."""
-    predictions = predictions_of(model, data, force_gain_std)
     unknown, least = predictions.chosen.phase_unknown[:, 0], 6
     n = len(unknown)
     if 2 * n - unknown.sum() < 2 * least:

@@ -18,6 +18,7 @@ from snrmjax.diagnose.decide import Verdict
 from snrmjax.diagnose.design.discriminating_test import DiscriminatingTest
 from snrmjax.diagnose.evidence import Kinds
 from snrmjax.diagnose.laws.law_search import DrawnLaw
+from snrmjax.diagnose.naming.parts import PartAnswer
 from snrmjax.diagnose.search.locating import Located
 from snrmjax.diagnose.search.model_search import TriedEffect
 from snrmjax.measure.states import SteadyStates
@@ -148,6 +149,7 @@ class Diagnosis(AbstractResult):
     notes: tuple[Fact | str, ...]
     force_misfit: ForceMisfit
     data: SteadyStates  # as they were compared: in N, where a drive voltage was given
+    parts: tuple[PartAnswer, ...] = ()  # what changes stiffness and damping, and by how much
     # Of levels whose force was recorded in a wrong scale: the acting one over it.
     level_forces: dict[int, LevelGain] = eqx.field(default_factory=dict)
 
@@ -200,6 +202,10 @@ class Diagnosis(AbstractResult):
             Fact("level_force", level=level, gain=gain.value, std=gain.std)
             for level, gain in self.level_forces.items()
         ]
+        if self.parts and Verdict(self.verdict).is_answer:
+            changed = [one for one in self.parts if one.verdict != "none"]
+            falls = Fact("misfit_falls", before=self.gap.before, after=self.gap.after)
+            return " ".join(map(str, (*levels, *map(_fact_of, changed), falls)))
         verdict = Fact(
             "verdict",
             verdict=Verdict(self.verdict).value,
@@ -286,6 +292,19 @@ class Diagnosis(AbstractResult):
             "p_value_of_fit": self.checks.p_value,
             "notes": " ".join(map(str, self.notes)),
         }
+
+
+def _fact_of(part: PartAnswer) -> Fact:
+    """What a part of the change is by, for a reader."""
+    return Fact(
+        "part_of_change",
+        part=part.part,
+        verdict=part.verdict,
+        classes=part.candidates,
+        probability=part.probability,
+        explained=None if part.explained is None else tuple(part.explained),
+        left=part.remainder is not None and part.remainder.significant,
+    )
 
 
 def unit_of(parameter: str) -> str:

@@ -8,6 +8,7 @@ from snrmjax.diagnose.design.discriminating_test import DiscriminatingTest
 from snrmjax.diagnose.diagnosis_result import Diagnosis
 from snrmjax.diagnose.laws.law_search import DrawnLaw
 from snrmjax.diagnose.location.where import Whereabouts
+from snrmjax.diagnose.naming.parts import PartAnswer
 from snrmjax.diagnose.response_prediction import LevelResponse
 from snrmjax.diagnose.search.locating import Located
 from snrmjax.model.effect_metadata import Argument
@@ -46,6 +47,7 @@ def summarise_diagnosis(diagnosis: Diagnosis, predicted: Sequence[LevelResponse]
         **({"law": laws[0]} if laws else {}),
         "decide_by": diagnosis.decide_by,
         "request": _test(diagnosis.discriminating_test),
+        "parts": [_by_part(one) for one in diagnosis.parts],
         "located": [_part(part) for part in diagnosis.located],
         "parameters": {
             name: {"value": value, "std": std}
@@ -136,6 +138,19 @@ def _law(law: DrawnLaw) -> dict:
         "measured_up_to": law.largest,
     }
     return table if law.passing is None else table | {"at_velocity_m_s": law.passing}
+
+
+def _by_part(one: PartAnswer) -> dict:
+    explained, left = one.explained, one.remainder
+    return {
+        "part": one.part,
+        "verdict": one.verdict,
+        "effects": list(one.effects),
+        "candidates": [list(group) for group in one.candidates],
+        "probability": one.probability,
+        "explained": None if explained is None else explained._asdict(),
+        "remainder": None if left is None else {"rms": left.rms, "significant": left.significant},
+    }
 
 
 def _part(part: Located) -> dict:

@@ -32,6 +32,7 @@ from snrmjax.diagnose.diagnosis_result import FormerAnswer
 from snrmjax.diagnose.evidence import NONE, answer_of
 from snrmjax.diagnose.measurement_plan import measurement_plan
 from snrmjax.io.measurement_plans import read_former_answer, read_further_states, write_plan
+from snrmjax.numerics.facts import Fact
 
 
 def answer(omega, force, kind, rng):
@@ -202,8 +203,10 @@ def test_answers_of_a_file_are_those_of_a_diagnosis(tmp_path):
 
 @pytest.fixture(scope="module")
 def doubted():
-    """Quadratic damping without harmonics: a drag of one direction has the same fundamental."""
-    return sj.diagnose_model(balanced_model(), balanced(quadratic))
+    """Quadratic damping without harmonics, as if another law had the same fundamental."""
+    found = sj.diagnose_model(balanced_model(), balanced(quadratic))
+    asked = Fact("record_harmonics")
+    return dataclasses.replace(found, verdict=sj.diagnose.Verdict.AMBIGUOUS, recommended=asked)
 
 
 def test_where_no_test_was_compared_the_largest_level_is_measured_again(doubted):

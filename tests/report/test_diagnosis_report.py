@@ -188,7 +188,7 @@ def test_the_report_begins_with_the_verdict_in_a_sentence(drag, pictures):
     body = html[html.index("<h1>") :]
     assert body.index('class="result"') < body.index('class="pairs"') < body.index("<h2>")
     sentence = re.search(r'<p class="result">(.*?)</p>', body)[1]
-    assert "quadratic damping" in sentence
+    assert re.match(r"Quadratic damping explains \d+ % \(\d+ to \d+\) of the change", sentence)
     assert re.search(r"the misfit falls from 4\.\d to 1\.0 times the noise", sentence)
     assert "quadratic_damping" not in body
     assert "may be" not in body
@@ -205,7 +205,7 @@ def test_limits_and_losing_candidates_are_folded_away(drag, pictures):
     ("verdict", "words"),
     [
         ("none", "Nothing is missing that these data could show"),
-        ("named", "The model lacks quadratic damping: with it the misfit falls"),
+        ("named", "Quadratic damping explains "),
         ("unknown", "no effect of the library explains reliably"),
         ("noise_rejected", "The stated noise does not fit"),
     ],
@@ -220,7 +220,7 @@ def test_each_verdict_is_one_plain_sentence(drag, verdict, words):
 def test_rivals_are_told_where_there_are_some(drag):
     rivals = (("quadratic_damping", "cubic_damping", "jenkins_slider"),)
     unclear = dataclasses.replace(
-        drag[2], verdict="ambiguous", answer=drag[2].answer._replace(candidates=rivals)
+        drag[2], verdict="ambiguous", parts=(), answer=drag[2].answer._replace(candidates=rivals)
     )
     assert unclear.verdict_sentence.startswith(
         "The model lacks quadratic damping, cubic damping or Jenkins slider, and these data cannot "

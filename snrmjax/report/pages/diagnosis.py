@@ -36,6 +36,7 @@ from snrmjax.report.figures.diagnosis import (
     misfit_figure,
 )
 from snrmjax.report.figures.drawn_laws import LAW_CAPTION, drawn_laws_figure, law_tables
+from snrmjax.report.figures.parts import parts_figure
 from snrmjax.report.html import (
     PROGRAM,
     Report,
@@ -80,6 +81,10 @@ _CAPTIONS = {
         "How far the force that each measured state needs is from the one that acted, in standard "
         "deviations of the noise (of its size alone where the phase is unknown). A correct model "
         "leaves about 1 everywhere; dark regions show where the model is wrong."
+    ),
+    "parts": (
+        "What every state reads of the change beyond the model, the errors of its level included, "
+        "and the curves that explain it: the laws, and the laws with what is left (95 % band)."
     ),
     "candidates": (
         "How much better each effect, added alone, makes the model: gain of the Bayesian "
@@ -204,7 +209,11 @@ def responses_figure(diagnosis: Diagnosis, simulated: SimulatedLevels) -> Figure
 
 def diagnosis_figures(diagnosis: Diagnosis) -> dict[str, Figure]:
     """The figures that need no simulation, by the names of their files."""
-    figures = {"residuals": misfit_figure(diagnosis), "candidates": candidates_figure(diagnosis)}
+    figures = {"residuals": misfit_figure(diagnosis)}
+    if any(diagnosis.table):
+        figures["candidates"] = candidates_figure(diagnosis)
+    if diagnosis.parts:
+        figures["parts"] = parts_figure(diagnosis)
     found = found_effects(diagnosis)
     if diagnosis.answer.laws:
         figures["laws"] = drawn_laws_figure(diagnosis.answer.laws)
@@ -337,7 +346,7 @@ def _comparison_section(
         tables.append(
             ReportTable(header, resonance_rows(predicted, diagnosis.data.force_unit), caption)
         )
-    figures = [shown[name] for name in ("responses", "residuals") if name in shown]
+    figures = [shown[name] for name in ("parts", "responses", "residuals") if name in shown]
     text = [_located(part, diagnosis.gap.after) for part in diagnosis.located]
     if not text:
         text = ["No part of the force balance differs from the model by more than the noise."]
@@ -356,7 +365,8 @@ def _candidates_section(diagnosis: Diagnosis, shown: Mapping[str, ReportFigure])
         for kinds, value in list(diagnosis.answer.probabilities.items())[:_SHOWN]
     ]
     tables.insert(0, ReportTable(("answer", "probability"), rows, _PROBABILITIES))
-    return Section("What else was considered", (), [shown["candidates"]], tables)
+    figures = [shown["candidates"]] if "candidates" in shown else []
+    return Section("What else was considered", (), figures, tables)
 
 
 def _step(number_of: int, count: int) -> str:

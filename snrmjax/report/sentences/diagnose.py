@@ -115,6 +115,34 @@ def _verdict(
     )
 
 
+def _part_of_change(
+    *,
+    part: str,
+    verdict: str,
+    classes: Sequence[Sequence[str]],
+    probability: float,
+    explained: Sequence[float] | None,
+    left: bool,
+) -> str:
+    laws = " and ".join(effect_names(group, "or") for group in classes)
+    if part == "instrument":
+        return f"The records show {laws}."
+    what = f"the change of {part} with amplitude"
+    if not classes or explained is None:
+        return f"No law of the library explains {what}: it is drawn."
+    value, low, high = (f"{100 * number:.0f}" for number in explained)
+    band = f"{value} %" if low == high else f"{value} % ({low} to {high})"
+    several = any(len(group) > 1 for group in classes)
+    first = f"{laws[0].upper()}{laws[1:]} explain{'' if several or len(classes) > 1 else 's'}"
+    told = f"{first} {band} of {what}" if not several else f"{laws} explains {band} of {what}"
+    told = f"{told[0].upper()}{told[1:]}"
+    if several:
+        told += "; these data cannot tell which"
+    elif probability < 0.99:
+        told += f", with a probability of {probability_in_words(probability)}"
+    return f"{told}. What is left is more than noise: it is drawn." if left else f"{told}."
+
+
 def _most_probable(*, verdict: float, answers: Sequence[tuple[Sequence[str], float]]) -> str:
     listed = ", ".join(f"{kinds_in_words(one)} {probability_in_words(p)}" for one, p in answers)
     return f"{probability_in_words(verdict)} of this verdict ({listed})"
@@ -212,6 +240,10 @@ SENTENCES: dict[str, Wording] = {
     "no_place_fits": _no_place_fits,
     # The verdict and what a result says first.
     "verdict": _verdict,
+    "part_of_change": _part_of_change,
+    "misfit_falls": lambda *, before, after: (
+        f"With that the misfit falls from {_times(before)} to {_times(after)} times the noise."
+    ),
     "level_force": _level_force,
     "most_probable": _most_probable,
     "probability_of_verdict": "probability: {probability}",

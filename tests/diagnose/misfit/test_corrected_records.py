@@ -155,7 +155,7 @@ def test_an_error_of_the_only_level_is_no_defect_of_the_instruments():
     model = linear_model(damping=RATIO, damping_std=0.2 * RATIO, **sizes)
     found = sj.diagnose_model(model, data)
     assert found.verdict == "none"
-    assert "sensor_phase_error" in found.probabilities  # seen, and weighed
+    assert found.gap.after < 1.3  # the level's own phase counts among its errors
 
 
 def test_records_as_they_are_carry_nothing_over():

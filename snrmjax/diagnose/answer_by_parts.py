@@ -1,0 +1,213 @@
+"""A diagnosis with its answer by parts: exact laws, and laws that explain most of a change."""
+
+import dataclasses
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+
+from snrmjax.diagnose import priors
+from snrmjax.diagnose.answers import Search
+from snrmjax.diagnose.decide import Verdict
+from snrmjax.diagnose.diagnosis_result import (
+    CompletedStatus,
+    Diagnosis,
+    Estimate,
+    completed_model,
+)
+from snrmjax.diagnose.evidence import Kinds, answer_of
+from snrmjax.diagnose.explained_parts import NamedParts, overall
+from snrmjax.diagnose.laws.law_search import DrawnLaw
+from snrmjax.diagnose.misfit.candidates import candidate, parameter_labels
+from snrmjax.diagnose.misfit.effect_fit import EffectFit, baseline_fit, fit_effect
+from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
+from snrmjax.diagnose.misfit.predictions import Predictions, scales_of
+from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit, weighted_misfit
+from snrmjax.diagnose.naming.parts import DRAWN, Naming, Remainder
+from snrmjax.diagnose.naming.remainder_law import remainder_laws
+from snrmjax.diagnose.search.model_search import FoundEffects, TriedEffect
+from snrmjax.identify.calibrate.calibration_states import ASSUMED_ERROR
+from snrmjax.measure.states import SteadyStates
+from snrmjax.model.effect_metadata import Argument
+from snrmjax.model.library.free_laws import StiffnessLaw
+from snrmjax.model.structures import Structure
+from snrmjax.numerics.facts import Fact
+
+
+def verdict_of(named: NamedParts, found: FoundEffects) -> tuple[Verdict, tuple[Fact, ...]]:
+    """The verdict on a test, and why nothing is named where the readings do not say it."""
+    noise = float(named.problem.readings.posterior.hyper.noise)
+    low, high = priors.TOLERATED_NOISE
+    if found.misfit.predictions.chosen.noise_stated and not low < np.log(noise) < high:
+        return Verdict.NOISE_REJECTED, (Fact("noise_misstated", ratio=noise),)
+    verdict = overall(named.naming)
+    n_rows = len(named.problem.readings.rows)
+    by_chance = chi_square_p_value(n_rows * named.naming.misfit**2, n_rows)
+    if verdict is Verdict.NOTHING_MISSING and by_chance < priors.REJECTED:
+        return Verdict.UNKNOWN, (Fact("no_effect_explains"),)
+    return verdict, ()
+
+
+def answers_of(naming: Naming, verdict: Verdict) -> dict[Kinds, float]:
+    """Probabilities of all sets of laws; of a verdict without an answer that of itself."""
+    if verdict in (Verdict.NOISE_REJECTED, Verdict.UNKNOWN):
+        return {(verdict.value,): 1.0}
+    return {answer_of(kinds): p for kinds, p in naming.answers.items()}
+
+
+def fitted_parts(named: NamedParts, predictions: Predictions, data: SteadyStates) -> FoundEffects:
+    """The laws of a naming fitted by harmonic balance at the measured motions, all together."""
+    reference, scales = predictions.reference, scales_of(predictions)
+    if not predictions.chosen.noise_stated and reference is not None:
+        scale = reference.posterior.hyper.noise / ASSUMED_ERROR
+        predictions = predictions.with_errors_scaled(scale / predictions.error_scale)
+    misfit = weighted_misfit(predictions)
+    fit = _fitted(misfit, named.naming, named.naming.effects)
+    if fit.kinds:
+        misfit, fit = Search(scales, (), {}, data).refined(misfit, fit)
+    by_kind = {group[0]: group for group in named.naming.candidates}
+    groups = tuple(by_kind[kind] for kind in fit.kinds)
+    rivals = [
+        _fitted(misfit, named.naming, [rival if one == kind else one for one in fit.kinds])
+        for kind, group in by_kind.items()
+        for rival in group[1:]
+    ]
+    nothing = baseline_fit(misfit)
+    rows = tuple(_tried(nothing, one) for one in (fit, *rivals) if one.kinds)
+    return FoundEffects(misfit, fit, nothing, (rows,), (nothing, fit, *rivals), groups)
+
+
+def _fitted(misfit: WeightedMisfit, naming: Naming, effects: Iterable[str]) -> EffectFit:
+    """Effects fitted one beside the other, from the readings' parameters where there are some."""
+    fit, scales = baseline_fit(misfit), scales_of(misfit.predictions)
+    for kind in effects:
+        one, names = candidate(kind, scales), parameter_labels(kind)
+        if all(name in naming.parameters for name in names):
+            first = tuple(naming.parameters[name].value for name in names)
+            one = one._replace(starts=(first, *one.starts[:1]))
+        fit = fit_effect(misfit, one, fit if fit.kinds else None)
+    return fit
+
+
+def _tried(nothing: EffectFit, fit: EffectFit) -> TriedEffect:
+    """What a fit gains over the model as given."""
+    return TriedEffect(
+        fit.kinds[-1],
+        nothing.criterion - fit.criterion,
+        fit.chi_square,
+        dict(zip(fit.labels, fit.values.tolist(), strict=True)),
+        fit.status,
+    )
+
+
+def with_parts(
+    diagnosis: Diagnosis, named: NamedParts, baseline: Mapping[str, float], model: Structure
+) -> Diagnosis:
+    """The diagnosis with its parts, and with their verdict where no exact law explains all.
+
+    Arguments: `baseline` parameters of the model at their most likely values, by name.
+    """
+    naming = named.naming
+    diagnosis = dataclasses.replace(diagnosis, parts=naming.parts)
+    if _explains_all(diagnosis, naming):
+        return diagnosis
+    verdict = overall(naming)
+    if verdict is Verdict.NOTHING_MISSING:  # what is left shows in harmonics or at other sensors
+        return diagnosis
+    answer = diagnosis.answer._replace(
+        effects=naming.effects,
+        candidates=naming.candidates,
+        probabilities=answers_of(naming, verdict),
+    )
+    diagnosis = dataclasses.replace(diagnosis, verdict=verdict, answer=answer)
+    return completed_by_parts(diagnosis, named, baseline, model)
+
+
+def completed_by_parts(
+    diagnosis: Diagnosis, named: NamedParts, baseline: Mapping[str, float], model: Structure
+) -> Diagnosis:
+    """The diagnosis with a completed model that holds laws and remainders.
+
+    Where a remainder is seen the laws' parameters are those beside it; else as they were fitted.
+    """
+    naming, answer = named.naming, diagnosis.answer
+    if not diagnosis.verdict.is_answer:
+        return diagnosis
+    left = {
+        part.part: part.remainder
+        for part in naming.parts
+        if part.remainder is not None and part.remainder.significant
+    }
+    fitted = {*naming.effects} <= {name.partition(".")[0] for name in answer.parameters}
+    if fitted and not left:
+        return diagnosis
+    parameters, checks, gap = _estimates(naming), diagnosis.checks, diagnosis.gap
+    whole = completed_model(model, baseline, *_structural(naming.effects, parameters))
+    completed, status, reason = whole.model, whole.status, whole.reason
+    drawn: tuple[str, ...] = ()
+    laws: tuple[DrawnLaw, ...] = ()
+    if left and completed is not None:
+        added = remainder_laws(named.problem, left)
+        completed = dataclasses.replace(completed, effects=(*completed.effects, *added))
+        status = CompletedStatus.COMPLETED
+        # Without a level the remainder would be another one.
+        checks, gap = checks._replace(completed_without={}), gap._replace(after=naming.misfit)
+        if diagnosis.verdict is Verdict.DRAWN:
+            laws = tuple(_drawn(named, part, one) for part, one in left.items())
+            drawn = tuple(DRAWN[part] for part in left)
+    notes = diagnosis.notes
+    if reason:
+        notes = (*notes, Fact("not_physical", reason=reason))
+    answer = answer._replace(
+        effects=(*naming.effects, *drawn),
+        candidates=(*naming.candidates, *((kind,) for kind in drawn)),
+        parameters=parameters,
+        completed=completed,
+        completed_status=status,
+        laws=laws,
+    )
+    return dataclasses.replace(diagnosis, answer=answer, gap=gap, checks=checks, notes=notes)
+
+
+def _explains_all(diagnosis: Diagnosis, naming: Naming) -> bool:
+    """Whether an exact law explains the test to its noise, and is what most of it is by parts."""
+    if diagnosis.verdict in (Verdict.UNKNOWN, Verdict.DRAWN):
+        return False
+    if not diagnosis.verdict.is_answer:
+        return True
+    groups = naming.candidates
+    found = {*diagnosis.effects}
+    return all(found & {*group} for group in groups) and bool(groups)
+
+
+def _structural(
+    effects: tuple[str, ...], parameters: Mapping[str, Estimate]
+) -> tuple[tuple[str, ...], dict[str, float]]:
+    """Of effects those whose parameters are known, which a model can hold, and their values."""
+    values = {name: one.value for name, one in parameters.items()}
+    held = tuple(k for k in effects if any(name.startswith(f"{k}.") for name in values))
+    return held, values
+
+
+def _estimates(naming: Naming) -> dict[str, Estimate]:
+    return {name: Estimate(*one) for name, one in naming.parameters.items()}
+
+
+def _drawn(named: NamedParts, part: str, remainder: Remainder) -> DrawnLaw:
+    """A remainder as the force at the sensor that has its describing function."""
+    (law,) = remainder_laws(named.problem, {part: remainder})
+    readings = named.problem.readings
+    shape = abs(readings.linear.shape)
+    at = np.asarray(law.displacement)
+    relative = float(np.max(remainder.std) / max(np.max(np.abs(remainder.value)), 1e-300))
+    if isinstance(law, StiffnessLaw):
+        force, passing, name = np.asarray(law.restoring_force), None, "spring"
+    else:
+        passing = float(np.max(remainder.velocity))
+        force, name = np.asarray(law.coefficient) * passing / shape, "displacement_damping"
+    largest = readings.largest * shape
+    std = relative * np.max(np.abs(force)) * np.ones_like(force)
+    return DrawnLaw(
+        *(name, ("odd",), (), Argument.DISPLACEMENT, at * shape, force / shape, std / shape),
+        largest=largest,
+        passing=passing,
+    )

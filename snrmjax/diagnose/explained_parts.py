@@ -1,0 +1,128 @@
+"""Naming for a test and a model: the mode's readings beyond the model, and what explains them."""
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Complex, Float
+
+from snrmjax.diagnose.decide import Verdict
+from snrmjax.diagnose.misfit.predictions import Predictions, scales_of
+from snrmjax.diagnose.misfit.reference import test_states_of
+from snrmjax.diagnose.naming.columns import is_instrument, is_read
+from snrmjax.diagnose.naming.evidence import Problem, best_hypotheses
+from snrmjax.diagnose.naming.parts import Naming, naming_of
+from snrmjax.diagnose.naming.readings import LinearTest, ModelStiffness, Readings, readings_of
+from snrmjax.identify.calibrate.inverse_force import inverse_force
+from snrmjax.measure.states import SteadyStates
+from snrmjax.model.effects import EFFECTS, is_own
+from snrmjax.model.modes import residual_velocity
+from snrmjax.model.parameters import with_parameters
+
+_FEWEST = 6  # states with a phase
+
+
+class NamedParts(NamedTuple):
+    """A naming, and the problem that it is of."""
+
+    naming: Naming
+    problem: Problem
+
+
+def named_parts(
+    predictions: Predictions, data: SteadyStates, kinds: Iterable[str]
+) -> NamedParts | None:
+    """What explains most of the change of stiffness and damping; None where phases are unknown.
+
+    Arguments: `data` as they were measured; `kinds` of effects that may be missing.
+    """
+    rows = np.flatnonzero(~predictions.chosen.phase_unknown[:, 0])
+    if len(rows) < _FEWEST:
+        return None
+    readings = _readings(predictions, data, rows)
+    if predictions.given.modes.modal_mass_std is None:  # the mass that nobody stated is the gain
+        kinds = [kind for kind in kinds if not _is_gain(kind)]
+    problem, cells = best_hypotheses(readings, kinds)
+    return NamedParts(naming_of(problem, cells), problem)
+
+
+def shortlist(naming: Naming, kinds: Iterable[str], *, more_seen: bool) -> tuple[str, ...]:
+    """Kinds of effects that are worth a fit by harmonic balance, after a naming.
+
+    Those of its answer, with what may stand in their place; with `more_seen` (harmonics or several
+    sensors) also those that the fundamental at one sensor cannot show.
+    """
+    likely = [kind for part in naming.parts for group in part.candidates for kind in group]
+    unread = [kind for kind in kinds if more_seen and (_is_gain(kind) or not is_read(kind))]
+    wanted = {*likely, *unread}
+    return tuple(kind for kind in kinds if kind in wanted or is_own(kind))
+
+
+def _is_gain(kind: str) -> bool:
+    """Whether a kind is a gain of the instruments, as another modal mass is."""
+    return EFFECTS[kind].like_force_gain and is_instrument(kind)
+
+
+def overall(naming: Naming) -> Verdict:
+    """The verdict on all parts: the weakest of those that change by more than noise."""
+    verdicts = [Verdict(part.verdict) for part in naming.parts]
+    order = (Verdict.DRAWN, Verdict.AMBIGUOUS, Verdict.NAMED)
+    return next((one for one in order if one in verdicts), Verdict.NOTHING_MISSING)
+
+
+def _readings(predictions: Predictions, data: SteadyStates, rows: np.ndarray) -> Readings:
+    states, modes = test_states_of(predictions, rows), predictions.given.modes
+    j = modes.mode_of_interest
+    order = np.asarray(data.order)[predictions.chosen.rows[rows]]
+    order = np.where(np.isfinite(order), order, np.linspace(0.0, 1.0, len(rows)))
+    linear = LinearTest(
+        modes.natural_frequency.item(j),
+        modes.damping_ratio.item(j),
+        modes.natural_frequency_std.item(j),
+        modes.damping_ratio_std.item(j),
+        states.mass_std,
+        modes.mode_shape.item(predictions.chosen.sensors[0], j),
+        scales_of(predictions),
+    )
+    return readings_of(states, order, _model_stiffness(predictions, data, rows), linear)
+
+
+def _model_stiffness(
+    predictions: Predictions, data: SteadyStates, rows: np.ndarray
+) -> ModelStiffness:
+    """The dynamic stiffness that the model has: of a linear mode as written, else by balance."""
+    model = predictions.given
+    modes, sensor = model.modes, predictions.chosen.sensors[0]
+    j = modes.mode_of_interest
+    natural, ratio = modes.natural_frequency.item(j), modes.damping_ratio.item(j)
+    plain = not (model.effects or model.potential.monomials)
+    if plain and modes.damping_coupling is None and modes.participation_lag is None:
+        return lambda _, omega: (natural**2 - omega**2 + 2j * ratio * natural * omega)[None]
+    constant = modes.mode_shape.item(sensor, j) * modes.participation.item(j)
+    used = predictions.chosen.rows[rows]
+    uncertain = [
+        with_parameters(model, (name,), jnp.asarray([value + std]))
+        for name, (value, std) in predictions.stated.items()
+        if not name.startswith("mode_")  # linear parameters have columns of their own
+    ]
+
+    def balanced(
+        velocity: Complex[np.ndarray, " state"], omega: Float[np.ndarray, " state"]
+    ) -> Complex[np.ndarray, " state"]:
+        own = np.sign(constant) * velocity
+        force = jnp.asarray(np.asarray(data.force)[used])
+        rest = np.asarray(residual_velocity(modes, jnp.asarray(omega), jnp.ones_like(force)))
+        recorded = np.asarray(data.velocity).copy()
+        recorded[used, sensor] = own + rest[:, sensor] * np.asarray(force)
+        moved = eqx.tree_at(lambda d: d.velocity, data, jnp.asarray(recorded))
+        found = []
+        for one in (model, *uncertain):
+            needed = np.asarray(inverse_force(one, moved).force)[used]
+            # The rest of the motion at the force that the model needs, and not the measured one.
+            mode = own + rest[:, sensor] * (np.asarray(force) - needed)
+            found.append(1j * omega * constant * needed / mode)
+        return np.array(found)
+
+    return balanced

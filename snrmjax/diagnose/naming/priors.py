@@ -1,0 +1,63 @@
+"""What naming takes for likely before a test is seen, and numbers that decide, each with why."""
+
+import numpy as np
+
+SIZES = {0: 0.25, 1: 0.5, 2: 0.25}
+"""Of no effect, one, two: who asks has seen a misfit, and one nonlinearity is the rule."""
+
+RESONANCE, INSTRUMENT = 0.03, 0.2
+"""Of an internal resonance and of an instrument's error, over that of a law: modes seldom lie
+within 5 % of a multiple of another, and instruments are checked before a test."""
+
+STRENGTHS = np.geomspace(1e-5, 1.0, 11)
+"""1σ of a law's largest relative change of stiffness, or of damping over ω₀, all as likely: from
+what no test sees to a change as large as the linear stiffness."""
+
+NO_REMAINDER = 0.3
+"""Probability that nothing is left beside the laws: structures are seldom in a library exactly."""
+
+REMAINDERS = np.geomspace(1e-5, 1.0, 9)
+"""Sizes of a remainder where there is one, in the units of strengths, all as likely."""
+
+REMAINDER_LENGTH = 1.0
+"""Of ln a, over which a remainder changes: by a factor of e in amplitude."""
+
+FLOOR = 1e-3
+"""Relative error of a state's amplitude and phase that is never undercut: what is smooth along a
+sweep and in no model. Half and twice as much give the same answers on measured structures."""
+
+INSTRUMENT_PHASE = 0.1
+"""rad, 1σ of a phase that all records share where it is a hypothesis: 6°."""
+
+GAIN = 0.1
+"""Relative 1σ of a gain that is a hypothesis: a wrong range or sensitivity."""
+
+ADDED_MASS = 0.05
+"""Relative 1σ of a mass that was added. Beside a change of stiffness one of any size would follow a
+resonance wherever it goes."""
+
+FORCE_OFFSET = 0.1
+"""1σ of an offset of the force over the smallest force."""
+
+DRIFT = 0.005
+"""1σ of a relative drift of the natural frequency over a test: some 20 K in metals."""
+
+UNSTATED_MASS = 0.05
+"""Relative 1σ of a modal mass of which nobody stated one."""
+
+VISIBLE = 2.0
+"""1σ, from which on a law's strength or a remainder counts as seen: less is no answer."""
+
+NEGLIGIBLE = 0.05
+"""Of a part's change: a law that explains less of it is no part of an answer."""
+
+BELOW_BANDWIDTH = 0.03
+"""Of the damping: changes of it, and of the stiffness over it, that are smaller are no finding: a
+resonance moves by so much of its bandwidth, and describing functions leave out as much."""
+
+NAMED = 0.9
+"""Probability from which on a law is named: a wrong name costs nine times as much as none."""
+
+EXPLAINED = 0.8
+"""Of a part's change, at the lower end of its 95 % band, from which on the law is the answer and
+the remainder a correction."""

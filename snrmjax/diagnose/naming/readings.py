@@ -1,0 +1,155 @@
+"""What every state reads of a mode beyond its model: changes of stiffness and damping, whitened.
+
+With X = V/(iΩ) and the modal constant A a state has the dynamic stiffness Z = FA/X of the mode.
+What it has beyond the model, Z − Z_model(a, Ω) = Σ θⱼhⱼ(a, Ω) + remainder + errors, is linear in
+all that is unknown. Slopes, noise and sizes of levels' errors are those of smooth curves through
+the states (`identify.test_model`); amplitudes are corrected for the errors that these find.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from snrmjax.diagnose.naming import priors
+from snrmjax.identify.test_model.balance import Balance, whitening
+from snrmjax.identify.test_model.hyper import MASS, PHASE
+from snrmjax.identify.test_model.posterior import TestPosterior, fit_test
+from snrmjax.identify.test_model.priors import OFF_RESONANCE
+from snrmjax.identify.test_model.states import TestStates
+from snrmjax.model.effect_metadata import MotionScales
+
+ModelStiffness = Callable[
+    [Complex[np.ndarray, " state"], Float[np.ndarray, " state"]], Complex[np.ndarray, "model state"]
+]
+"""Z of the model for velocities (m/s) and frequencies (rad/s) of the mode alone, in 1/s²: first of
+the model as given, then with each of its stated nonlinear parameters moved by its 1σ."""
+
+
+class LinearTest(NamedTuple):
+    """The linear mode, and 1σ of what was stated of it."""
+
+    natural_frequency: float  # rad/s
+    damping_ratio: float
+    frequency_std: float  # rad/s
+    damping_std: float
+    mass_std: float  # relative
+    shape: float  # of the mode at the sensor, kg^-1/2
+    scales: MotionScales  # of the motions that were measured
+
+
+class Readings(NamedTuple):
+    """Whitened readings of a test."""
+
+    linear: LinearTest
+    velocity: Complex[np.ndarray, " state"]  # m/s, of the mode, corrected
+    frequency: Float[np.ndarray, " state"]  # rad/s
+    force: Float[np.ndarray, " state"]  # N
+    order: Float[np.ndarray, " state"]  # place in the test, 0 to 1
+    dynamic_stiffness: Complex[np.ndarray, " state"]  # Z, 1/s²
+    slope: Complex[np.ndarray, " state"]  # dZ/d ln a by smooth curves
+    root: Float[np.ndarray, "state 2 2"]  # whitens real and imaginary part of Z
+    beyond: Complex[np.ndarray, " state"]  # Z less that of the model, 1/s²
+    rows: Float[np.ndarray, " row"]  # Z less that of the model, whitened
+    errors: Float[np.ndarray, "row error"]  # of levels, modal mass, linear test: by their own 1σ
+    posterior: TestPosterior
+
+    @property
+    def natural_frequency(self) -> float:
+        """ω₀ of the model, rad/s."""
+        return self.linear.natural_frequency
+
+    @property
+    def scales(self) -> MotionScales:
+        """Typical magnitudes of the measured motions."""
+        return self.linear.scales
+
+    @property
+    def damping_ratio(self) -> float:
+        """ζ₀ of the model."""
+        return self.linear.damping_ratio
+
+    @property
+    def relative_damping(self) -> Float[np.ndarray, " state"]:
+        """Damping δ of every state by smooth curves, over ω₀."""
+        damping = self.posterior.curves(self.amplitude).modal_damping
+        return np.abs(damping) / self.natural_frequency
+
+    @property
+    def amplitude(self) -> Float[np.ndarray, " state"]:
+        """Displacement amplitudes of the mode at the sensor, m."""
+        return np.abs(self.velocity) / self.frequency
+
+    @property
+    def largest(self) -> float:
+        """The largest modal amplitude, kg^1/2 m."""
+        return float(np.max(self.amplitude)) / abs(self.linear.shape)
+
+    @property
+    def relative_amplitude(self) -> Float[np.ndarray, " state"]:
+        """Over the largest one."""
+        return self.amplitude / np.max(self.amplitude)
+
+    @property
+    def relative_frequency(self) -> Float[np.ndarray, " state"]:
+        """Ω/ω₀."""
+        return self.frequency / self.natural_frequency
+
+    def whitened(
+        self, change: Complex[np.ndarray, "*several state"]
+    ) -> Float[np.ndarray, "*several row"]:
+        """Changes of Z (1/s²) as the rows show them."""
+        parts = np.stack([np.real(change), np.imag(change)], axis=-1)
+        white = np.einsum("nij,...nj->...ni", self.root, parts)
+        return white.reshape(*white.shape[:-2], -1)
+
+
+def readings_of(
+    states: TestStates,
+    order: Float[np.ndarray, " state"],
+    model: ModelStiffness,
+    linear: LinearTest,
+) -> Readings:
+    """The readings of a test's states, beyond a model."""
+    # Curves may go with the forcing frequency too.
+    states = states._replace(off_resonance_std=OFF_RESONANCE)
+    found = fit_test(states, compare_levels=False, tempered=True)
+    balance = Balance(
+        *(states, found.basis, found.places, found.units, found.weight),
+        np.zeros((len(states.level), 0), complex),
+    )
+    now, omega = balance.at(found.mean, found.corrections), states.frequency
+    slopes = now.by_error
+    floor = np.array([0.0, priors.FLOOR**2, priors.FLOOR**2])
+    std = np.sqrt((found.hyper.noise * states.errors) ** 2 + floor) / np.sqrt(found.share)
+    root, _ = whitening(slopes, std, found.weight)
+    # Records less the model's, by their straight line about the corrected motion.
+    known, *moved = model(now.velocity, omega)
+    rows = now.z - known - np.sum(slopes * found.corrections, axis=1)
+    rows = rows - 1j * now.z * found.mean[PHASE]
+    of_gain = now.z if states.force_is_free else -now.z - now.slope
+    linear_stiffness = linear.natural_frequency**2 * np.ones_like(now.z)
+    of_levels = (of_gain, -1j * now.z, linear_stiffness, now.damping)
+    columns = [linear.mass_std * now.model / (1 + found.mean[MASS])]
+    natural = linear.natural_frequency
+    columns.append(2 * natural * linear.frequency_std * np.ones_like(now.z))
+    columns.append(2j * omega * natural * linear.damping_std)
+    sizes = np.hypot(found.hyper.level_std, [priors.FLOOR, priors.FLOOR, 0.0, 0.0])
+    columns += [one - known for one in moved]
+    for kind, (column, size) in enumerate(zip(of_levels, sizes, strict=True)):
+        if kind < 2:  # of which the records were corrected
+            rows = rows + column * found.level_errors[states.level, kind]
+        of_level = [size * column * (states.level == k) for k in range(states.n_levels)]
+        # A gain or a phase that all levels have in common is one of the instruments.
+        if kind < 2 and states.n_levels > 1 and not states.level_std[kind] > 0:
+            of_level = list(np.array(of_level) - np.mean(of_level, axis=0))
+        columns += of_level
+    for k, size in enumerate(OFF_RESONANCE):
+        columns.append(size * now.with_frequency[:, k])
+    none, slope = np.empty(0), now.slope
+    bare = Readings(
+        *(linear, now.velocity, omega, now.force, order, now.z, slope, root, rows, none, none),
+        posterior=found,
+    )
+    return bare._replace(rows=bare.whitened(rows), errors=bare.whitened(np.array(columns)).T)
