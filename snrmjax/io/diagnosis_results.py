@@ -140,6 +140,19 @@ def _law(law: DrawnLaw) -> dict:
     return table if law.passing is None else table | {"at_velocity_m_s": law.passing}
 
 
+def remainder_columns(parts: Sequence[PartAnswer]) -> dict[str, list]:
+    """The remainders of all parts as columns of a table: relative, with their 1σ."""
+    columns: dict[str, list] = {"part": [], "velocity_m_s": [], "value": [], "std": []}
+    for one in parts:
+        if one.remainder is not None:
+            left = one.remainder
+            columns["part"] += [one.part] * len(left.velocity)
+            columns["velocity_m_s"] += left.velocity.tolist()
+            columns["value"] += left.value.tolist()
+            columns["std"] += left.std.tolist()
+    return columns
+
+
 def _by_part(one: PartAnswer) -> dict:
     explained, left = one.explained, one.remainder
     return {

@@ -19,9 +19,15 @@ from snrmjax.diagnose.response_prediction import (
 )
 from snrmjax.diagnose.search.locating import Located
 from snrmjax.diagnose.search.model_search import TriedEffect, beyond_data
-from snrmjax.io.diagnosis_results import placed_answer, summarise_diagnosis, summarise_whereabouts
+from snrmjax.io.diagnosis_results import (
+    placed_answer,
+    remainder_columns,
+    summarise_diagnosis,
+    summarise_whereabouts,
+)
 from snrmjax.io.files import write_summary
 from snrmjax.io.models import write_model
+from snrmjax.io.tables import write_table
 from snrmjax.measure.states import relative_errors
 from snrmjax.model.effect_shape import shape_of
 from snrmjax.model.effects import EFFECTS, effect_class
@@ -120,6 +126,8 @@ def write(folder: Path, found: DiagnosedTest, *, title: str = "", data: str = ""
         if found.is_placed:
             summary |= placed_answer(found.where)
     write_summary(folder / "diagnosis.json", summary)
+    if diagnosis.parts:
+        write_table(folder / "remainder.csv", remainder_columns(diagnosis.parts))
     if found.where is not None and found.where.explains:
         write_model(folder / "model.toml", found.where.model)
     elif diagnosis.completed is not None:

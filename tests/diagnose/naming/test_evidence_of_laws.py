@@ -1,0 +1,199 @@
+"""Evidences and fractions of a small test whose truth is known, against dense linear algebra."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import snrmjax.identify.test_model.states as test_states
+from snrmjax.diagnose.naming import evidence, priors
+from snrmjax.diagnose.naming.columns import hypothesis_columns
+from snrmjax.diagnose.naming.evidence import (
+    Cell,
+    best_hypotheses,
+    hypotheses_of,
+    problem_of,
+    solved,
+)
+from snrmjax.diagnose.naming.parts import naming_of
+from snrmjax.diagnose.naming.readings import LinearTest, readings_of
+from snrmjax.diagnose.naming.remainder_law import remainder_laws
+from snrmjax.model.effect_metadata import MotionScales
+from snrmjax.model.effects import EFFECTS
+
+OMEGA, RATIO, SHAPE = 500.0, 0.01, 2.0
+LAWS = ("cubic_stiffness", "quintic_stiffness", "quadratic_damping", "coulomb_friction")
+
+
+def states_of(stiffness, damping, *, noise=2e-3, seed=0, levels=5):
+    """States of one mode at some levels of amplitude, off resonance by set phases, with noise.
+
+    Arguments: relative changes of ω₀² and of 2ζ as functions of amplitude over the largest.
+    """
+    rng = np.random.default_rng(seed)
+    amplitude = np.geomspace(1e-4, 1e-3, levels)
+    phase = np.radians([-60.0, -40, -20, 0, 20, 40, 60])
+    a, turn = (part.ravel() for part in np.meshgrid(amplitude, phase, indexing="ij"))
+    level = np.repeat(np.arange(levels), len(phase))
+    x = a / a.max()
+    squared = OMEGA**2 * (1 + stiffness(x))
+    # At the velocity phase θ: Re Z = tan θ · Im Z, and Im Z = Ω δ.
+    omega = np.sqrt(squared)
+    for _ in range(50):
+        lost = OMEGA * (2 * RATIO + damping(x, omega / OMEGA))
+        omega = np.sqrt(squared - np.tan(turn) * omega * lost)
+    z = squared - omega**2 + 1j * omega * lost
+    constant = SHAPE**2
+    velocity = 1j * omega * a * np.exp(1j * (turn - np.pi / 2))
+    force = np.abs(z) * a / constant
+    velocity = velocity * np.exp(noise * (rng.normal(size=a.size) + 1j * rng.normal(size=a.size)))
+    errors = np.tile([0.1 * noise, noise, noise], (a.size, 1))
+    return test_states.TestStates(
+        *(level, omega, force, velocity, errors, True, constant, (1e-3, 1e-3, 1e-4, 1e-3), 0.01)
+    )
+
+
+def readings(stiffness, damping, **settings):
+    states = states_of(stiffness, damping, **settings)
+    scales = MotionScales(
+        *(float(np.median(states.amplitude)) / SHAPE, float(states.amplitude.max()) / SHAPE, OMEGA),
+        *(0.01 * OMEGA**2, 1e-4, float(states.force.min()), RATIO),
+    )
+    linear = LinearTest(OMEGA, RATIO, 0.0, 0.0, 0.01, SHAPE, scales)
+    n = len(states.level)
+    return readings_of(
+        states,
+        np.linspace(0, 1, n),
+        lambda _, omega: (OMEGA**2 - omega**2 + 2j * RATIO * OMEGA * omega)[None],
+        linear,
+    )
+
+
+def named(stiffness, damping, **settings):
+    problem, cells = best_hypotheses(readings(stiffness, damping, **settings), EFFECTS)
+    return problem, naming_of(problem, cells)
+
+
+def nothing(x, _=None):
+    return 0 * x
+
+
+def test_an_evidence_is_that_of_the_dense_gaussian():
+    read = readings(lambda x: 0.02 * x**2, nothing)
+    problem = problem_of(read, hypothesis_columns(read, LAWS))
+    sizes = (float(priors.REMAINDERS[4]), 0.0)
+    cells = {c.columns: c for c in hypotheses_of(problem, 1e6) if c.sizes == sizes}
+    base = problem.design * np.sqrt(problem.variances(sizes))
+    noise = np.eye(len(read.rows)) + base @ base.T
+
+    def log_density(covariance):
+        factor = np.linalg.cholesky(covariance)
+        white = np.linalg.solve(factor, read.rows)
+        return -0.5 * white @ white - np.sum(np.log(np.diag(factor)))
+
+    # Cubic stiffness against none: the mixture over strengths, one by one.
+    column = problem.laws[:, [0]]
+    each = [log_density(noise + s**2 * column @ column.T) for s in priors.STRENGTHS]
+    alone = log_density(noise)
+    wanted = np.logaddexp.reduce(each) - np.log(len(each)) - alone
+    wanted += np.log(priors.SIZES[1] / len(LAWS)) - np.log(priors.SIZES[0])
+    found = cells[0,].log_evidence - cells[()].log_evidence
+    assert found == pytest.approx(wanted, abs=1e-4)
+
+
+def test_strengths_are_those_of_least_squares_where_nothing_else_is_unknown():
+    read = readings(lambda x: 0.02 * x**2, nothing, noise=1e-5)
+    problem = problem_of(read, hypothesis_columns(read, LAWS))
+    found = solved(problem, Cell(0.0, (0,), (0.0, 0.0)))
+    assert found.mean[0] == pytest.approx(0.02, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("stiffness", "damping", "effects"),
+    [
+        (lambda x: 0.02 * x**2, nothing, ("cubic_stiffness",)),
+        (lambda x: 0.02 * x**4, nothing, ("quintic_stiffness",)),
+        (nothing, lambda x, om: 0.01 * x * om, ("quadratic_damping",)),
+        (lambda x: -0.01 * x**2, lambda x, om: 0.003 / (x * om), ("coulomb_friction",)),
+        (nothing, nothing, ()),
+    ],
+)
+def test_an_exact_law_is_named_and_explains_all(stiffness, damping, effects):
+    _, found = named(stiffness, damping)
+    for part in found.parts[:2]:
+        if part.verdict != "none":
+            assert part.explained is not None
+            assert part.explained.high > 0.98
+    assert set(effects) <= {kind for group in found.candidates for kind in group}
+    assert effects != () or all(part.verdict == "none" for part in found.parts)
+    assert sum(found.answers.values()) == pytest.approx(1.0)
+
+
+def test_a_law_with_a_fifth_from_elsewhere_is_listed_with_its_fraction_and_the_rest_is_drawn():
+    def bump(x):
+        return 0.03 * x**2 + 0.006 * np.exp(-0.5 * ((x - 0.35) / 0.1) ** 2)
+
+    problem, found = named(bump, nothing, noise=5e-4, levels=15)
+    part = found.parts[0]
+    assert "cubic_stiffness" in part.effects
+    x = problem.readings.relative_amplitude
+    true = 1 - np.std(bump(x) - 0.03 * x**2) / np.std(bump(x))
+    assert part.explained.low - 0.05 < true < part.explained.high + 0.05
+    assert part.remainder.significant
+
+
+def test_what_no_law_follows_is_drawn():
+    def waves(x):
+        return 0.02 * np.sin(5 * np.log(x))
+
+    _, found = named(waves, nothing, noise=5e-4, levels=10)
+    assert found.parts[0].verdict == "drawn"
+    assert found.parts[0].remainder.significant
+
+
+def test_the_force_of_a_remainder_has_its_describing_function():
+    def waves(x):
+        return 0.02 * np.sin(3 * np.log(x))
+
+    problem, found = named(waves, nothing, noise=2e-4, levels=10)
+    part = found.parts[0]
+    (law,) = remainder_laws(problem, {"stiffness": part.remainder})
+    t = (np.arange(2000) + 0.5) * 2 * np.pi / 2000
+    left = part.remainder
+    for k in (20, 40, 55):
+        a = problem.readings.largest * left.velocity[k] / left.velocity[-1]
+        force = np.array(law.cycle_force(a * np.cos(t), -a * OMEGA * np.sin(t)))
+        stiffness = 2 * np.mean(force * np.cos(t)) / a / OMEGA**2
+        assert stiffness == pytest.approx(left.value[k], abs=0.05 * np.ptp(left.value))
+
+
+def test_pairs_that_are_left_out_could_not_count():
+    """With and without the bound on pairs the probable hypotheses are the same."""
+    read = readings(lambda x: 0.02 * x**2, lambda x, om: 0.004 * x * om)
+    problem = problem_of(read, hypothesis_columns(read, LAWS))
+    first = hypotheses_of(problem)
+    few = evidence._sizes(2)
+    for one in [c for c in first if len(c.columns) == 2][:5]:
+        assert set(one.sizes) <= set(few)
+    top = first[0]
+    assert {problem.columns[k].kind for k in top.columns} == {
+        "cubic_stiffness",
+        "quadratic_damping",
+    }
+
+
+def test_readings_do_not_change_with_units_of_force():
+    """A force in other units with the modal constant in theirs is the same test."""
+    states = states_of(lambda x: 0.02 * x**2, nothing)
+    other = states._replace(force=10 * states.force, constant=0.1 * states.constant)
+    linear = readings(lambda x: 0.02 * x**2, nothing).linear
+    rows = [
+        readings_of(
+            one,
+            np.zeros(len(one.level)),
+            lambda _, omega: (OMEGA**2 - omega**2 + 2j * RATIO * OMEGA * omega)[None],
+            dataclasses.replace(linear) if dataclasses.is_dataclass(linear) else linear,
+        ).rows
+        for one in (states, other)
+    ]
+    np.testing.assert_allclose(rows[0], rows[1], rtol=1e-6, atol=1e-6)
