@@ -55,7 +55,7 @@ from snrmjax.diagnose.diagnosis_result import (
     Gap,
     completed_model,
 )
-from snrmjax.diagnose.explained_parts import NamedParts, named_parts, shortlist
+from snrmjax.diagnose.explained_parts import NamedParts, named_parts
 from snrmjax.diagnose.laws.law_answer import LawAnswer, law_answer
 from snrmjax.diagnose.misfit.effect_fit import EffectFit, at_phases_of, at_reference, baseline_fit
 from snrmjax.diagnose.misfit.noise_model import notes_without_phases, unit_columns
@@ -131,8 +131,6 @@ def diagnose_model(
     if named is not None and not more_seen:
         found = fitted_parts(named, predictions, data)
         return _by_parts(model, data, named, found, _Gain(gain, tuple(notes)), former, excluded)
-    if named is not None:
-        kinds = shortlist(named.naming, kinds, more_seen=more_seen)
     search = Search(scales_of(predictions), kinds, former.starts if former else {}, data)
     answered = best_answer(search, predictions)
     as_recorded, rival, best = answered.found, None, answered

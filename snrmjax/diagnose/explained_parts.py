@@ -11,13 +11,13 @@ from jaxtyping import Complex, Float
 from snrmjax.diagnose.decide import Verdict
 from snrmjax.diagnose.misfit.predictions import Predictions, scales_of
 from snrmjax.diagnose.misfit.reference import test_states_of
-from snrmjax.diagnose.naming.columns import is_instrument, is_read
+from snrmjax.diagnose.naming.columns import is_instrument
 from snrmjax.diagnose.naming.evidence import Problem, best_hypotheses
 from snrmjax.diagnose.naming.parts import Naming, naming_of
 from snrmjax.diagnose.naming.readings import LinearTest, ModelStiffness, Readings, readings_of
 from snrmjax.identify.calibrate.inverse_force import inverse_force
 from snrmjax.measure.states import SteadyStates
-from snrmjax.model.effects import EFFECTS, is_own
+from snrmjax.model.effects import EFFECTS
 from snrmjax.model.modes import residual_velocity
 from snrmjax.model.parameters import with_parameters
 
@@ -46,18 +46,6 @@ def named_parts(
         kinds = [kind for kind in kinds if not _is_gain(kind)]
     problem, cells = best_hypotheses(readings, kinds)
     return NamedParts(naming_of(problem, cells), problem)
-
-
-def shortlist(naming: Naming, kinds: Iterable[str], *, more_seen: bool) -> tuple[str, ...]:
-    """Kinds of effects that are worth a fit by harmonic balance, after a naming.
-
-    Those of its answer, with what may stand in their place; with `more_seen` (harmonics or several
-    sensors) also those that the fundamental at one sensor cannot show.
-    """
-    likely = [kind for part in naming.parts for group in part.candidates for kind in group]
-    unread = [kind for kind in kinds if more_seen and (_is_gain(kind) or not is_read(kind))]
-    wanted = {*likely, *unread}
-    return tuple(kind for kind in kinds if kind in wanted or is_own(kind))
 
 
 def _is_gain(kind: str) -> bool:

@@ -54,11 +54,11 @@ from snrmjax.model.library.stiffness import (
 _GAPS = np.linspace(0.05, 0.95, 19)  # over the largest amplitude
 _STIFFNESSES = np.log([0.1, 1.0, 10.0, 100.0])  # ln, of a stop, over ω₀²
 _QUADRATICS = np.log([0.02, 0.05, 0.12, 0.3])  # ln, over ω₀² and the largest amplitude
-_SLIPS = np.linspace(np.log(0.02), np.log(0.95), 10)  # ln, over the largest amplitude
+_SLIPS = np.linspace(np.log(0.02), np.log(0.95), 28)  # ln, over the largest amplitude
 _EXPONENTS = np.linspace(1.1, 2.9, 10)
-_DETUNINGS = np.linspace(-0.05, 0.05, 9)
+_DETUNINGS = np.linspace(-0.04, 0.04, 9)
 _APART = np.array([-0.3, -0.1, -0.05, -0.02, 0.02, 0.05, 0.1, 0.3])  # of a close mode
-_DAMPINGS = np.log([0.3, 1.0, 3.0])  # ln, of a further mode, over the mode's own
+_DAMPINGS = np.log([0.5, 2.0])  # ln, of a further mode, over the mode's own
 _SAMPLES, _AMPLITUDES = 256, 60  # of a user's own force
 _PARTS = 3  # that an interval of a shape is divided into, where it counts
 
@@ -299,14 +299,6 @@ def parameters_of(readings: Readings, column: Column, strength: float) -> dict[s
 def is_instrument(kind: str) -> bool:
     """Whether a kind is an error of a test and no property of the structure."""
     return kind in LAWS and LAWS[kind].of_instrument
-
-
-def is_read(kind: str) -> bool:
-    """Whether the fundamental at one sensor shows a kind of effect by itself.
-
-    Internal resonances it does, but their harmonics show them better.
-    """
-    return kind in LAWS and LAWS[kind].odds != priors.RESONANCE
 
 
 def odds_of(kind: str) -> float:

@@ -139,17 +139,20 @@ def hypotheses_of(problem: Problem, reach: float = 0.0) -> list[Cell]:
     all_sizes, few_sizes = _sizes(1), _sizes(2)
     grid = [_Normal.of(problem, sizes) for sizes in itertools.product(all_sizes, all_sizes)]
     fewer = (len(priors.REMAINDERS) - 1) / (len(few_sizes) - 2)  # of pairs: coarser, as likely
-    cells = []
+    cells, best = [], -np.inf
     for normal in grid:
-        cells.append(Cell(normal.base + np.log(priors.SIZES[0]), (), normal.sizes))
-        cells += normal.singles(np.log(priors.SIZES[1]))
+        some = [Cell(normal.base + np.log(priors.SIZES[0]), (), normal.sizes)]
+        some += normal.singles(np.log(priors.SIZES[1]), best - max(_LEAST, reach))
+        best = max(best, *(cell.log_evidence for cell in some))
+        cells += some
     for normal in grid:
         if not {*normal.sizes} <= {*few_sizes}:
             continue
-        least = max(cell.log_evidence for cell in cells) - _LEAST
         coarser = np.log(fewer) * np.count_nonzero(normal.sizes)
-        cells += normal.pairs(problem, np.log(priors.SIZES[2]) + coarser, least)
-    least = max(cell.log_evidence for cell in cells) - max(_LEAST, reach)
+        some = normal.pairs(problem, np.log(priors.SIZES[2]) + coarser, best - _LEAST)
+        best = max([best, *(cell.log_evidence for cell in some)])
+        cells += some
+    least = best - max(_LEAST, reach)
     kept = [cell for cell in cells if cell.log_evidence > least]
     return sorted(kept, key=lambda cell: -cell.log_evidence)
 
@@ -198,8 +201,8 @@ class _Normal(NamedTuple):
         std = self.std[some, None]
         return np.where(np.isfinite(std), std, tried)
 
-    def singles(self, log_prior: float) -> list[Cell]:
-        """One law each."""
+    def singles(self, log_prior: float, least: float) -> list[Cell]:
+        """One law each, of those that are as probable as `least`."""
         every = np.arange(len(self.b))
         narrow = self.strengths(every, 1) ** -2.0
         precision = np.diag(self.gram)[:, None] + narrow
@@ -208,7 +211,8 @@ class _Normal(NamedTuple):
         value = value + _log_half(self.sign[:, None], mean * np.sqrt(precision))
         value = logsumexp(value, axis=1) - np.log(value.shape[1]) + np.log(self.prior)
         value = value + self.base + log_prior
-        return [Cell(float(v), (k,), self.sizes) for k, v in enumerate(value)]
+        kept = np.flatnonzero(value > least)
+        return [Cell(float(value[k]), (int(k),), self.sizes) for k in kept]
 
     def pairs(self, problem: Problem, log_prior: float, least: float) -> list[Cell]:
         """Pairs that may be as probable as `least`."""

@@ -14,7 +14,7 @@ from snrmjax.model.library.free_laws import DisplacementDampingLaw, StiffnessLaw
 PARTS = ("stiffness", "damping")
 DRAWN = {"stiffness": StiffnessLaw.kind, "damping": DisplacementDampingLaw.kind}
 """The law that a remainder of a part is."""
-_CELLS = 400  # most probable hypotheses whose strengths are solved for
+_CELLS = 150  # most probable hypotheses whose strengths are solved for
 _DRAWS = 500  # of fractions
 _POINTS = 60  # of a drawn remainder
 

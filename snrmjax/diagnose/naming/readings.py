@@ -140,11 +140,9 @@ def readings_of(
     for kind, (column, size) in enumerate(zip(of_levels, sizes, strict=True)):
         if kind < 2:  # of which the records were corrected
             rows = rows + column * found.level_errors[states.level, kind]
-        of_level = [size * column * (states.level == k) for k in range(states.n_levels)]
-        # A gain or a phase that all levels have in common is one of the instruments.
-        if kind < 2 and states.n_levels > 1 and not states.level_std[kind] > 0:
-            of_level = list(np.array(of_level) - np.mean(of_level, axis=0))
-        columns += of_level
+        # Of which the standard deviation is that of differences: a gain or a phase that all levels
+        # have in common is one of the instruments where it is much larger.
+        columns += [size * column * (states.level == k) for k in range(states.n_levels)]
     for k, size in enumerate(OFF_RESONANCE):
         columns.append(size * now.with_frequency[:, k])
     none, slope = np.empty(0), now.slope

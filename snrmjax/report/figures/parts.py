@@ -18,6 +18,11 @@ from snrmjax.report.style import (
     unit_for,
 )
 
+PARTS_CAPTION = (
+    "What every state reads of the change beyond the model, the errors of its level included, "
+    "and the curves that explain it: the laws, and the laws with what is left (95 % band)."
+)
+
 
 def parts_figure(diagnosis: Diagnosis) -> Figure:
     """Changes of stiffness and damping beyond the model, against velocity amplitude.

@@ -19,12 +19,7 @@ from snrmjax.diagnose.response_prediction import (
 )
 from snrmjax.diagnose.search.locating import Located
 from snrmjax.diagnose.search.model_search import TriedEffect, beyond_data
-from snrmjax.io.diagnosis_results import (
-    placed_answer,
-    remainder_columns,
-    summarise_diagnosis,
-    summarise_whereabouts,
-)
+from snrmjax.io import diagnosis_results as written
 from snrmjax.io.files import write_summary
 from snrmjax.io.models import write_model
 from snrmjax.io.tables import write_table
@@ -42,7 +37,7 @@ from snrmjax.report.figures.diagnosis import (
     misfit_figure,
 )
 from snrmjax.report.figures.drawn_laws import LAW_CAPTION, drawn_laws_figure, law_tables
-from snrmjax.report.figures.parts import parts_figure
+from snrmjax.report.figures.parts import PARTS_CAPTION, parts_figure
 from snrmjax.report.html import (
     PROGRAM,
     Report,
@@ -88,10 +83,7 @@ _CAPTIONS = {
         "deviations of the noise (of its size alone where the phase is unknown). A correct model "
         "leaves about 1 everywhere; dark regions show where the model is wrong."
     ),
-    "parts": (
-        "What every state reads of the change beyond the model, the errors of its level included, "
-        "and the curves that explain it: the laws, and the laws with what is left (95 % band)."
-    ),
+    "parts": PARTS_CAPTION,
     "candidates": (
         "How much better each effect, added alone, makes the model: gain of the Bayesian "
         "information criterion. Left of the dashed line an effect is not detected; vermilion bars "
@@ -120,14 +112,14 @@ def write(folder: Path, found: DiagnosedTest, *, title: str = "", data: str = ""
     figures = diagnosis_figures(diagnosis)
     if found.simulated is not None:
         figures["responses"] = responses_figure(diagnosis, found.simulated)
-    summary = summarise_diagnosis(diagnosis, predicted)
+    summary = written.summarise_diagnosis(diagnosis, predicted)
     if found.where is not None:
-        summary |= summarise_whereabouts(found.where)
+        summary |= written.summarise_whereabouts(found.where)
         if found.is_placed:
-            summary |= placed_answer(found.where)
+            summary |= written.placed_answer(found.where)
     write_summary(folder / "diagnosis.json", summary)
     if diagnosis.parts:
-        write_table(folder / "remainder.csv", remainder_columns(diagnosis.parts))
+        write_table(folder / "remainder.csv", written.remainder_columns(diagnosis.parts))
     if found.where is not None and found.where.explains:
         write_model(folder / "model.toml", found.where.model)
     elif diagnosis.completed is not None:
