@@ -172,10 +172,9 @@ def _explains_all(diagnosis: Diagnosis, naming: Naming) -> bool:
     """Whether an exact law explains the test to its noise, and is what most of it is by parts."""
     if diagnosis.verdict in (Verdict.UNKNOWN, Verdict.DRAWN):
         return False
-    if not diagnosis.verdict.is_answer:
+    if not diagnosis.verdict.is_answer or diagnosis.checks.p_value > priors.REJECTED:
         return True
-    groups = naming.candidates
-    found = {*diagnosis.effects}
+    groups, found = naming.candidates, {*diagnosis.effects}
     return all(found & {*group} for group in groups) and bool(groups)
 
 

@@ -17,6 +17,7 @@ from snrmjax.diagnose.naming.parts import Naming, naming_of
 from snrmjax.diagnose.naming.readings import LinearTest, ModelStiffness, Readings, readings_of
 from snrmjax.identify.calibrate.inverse_force import inverse_force
 from snrmjax.measure.states import SteadyStates
+from snrmjax.model.effect_base import AbstractAddedMode
 from snrmjax.model.effects import EFFECTS
 from snrmjax.model.modes import residual_velocity
 from snrmjax.model.parameters import with_parameters
@@ -41,6 +42,8 @@ def named_parts(
     rows = np.flatnonzero(~predictions.chosen.phase_unknown[:, 0])
     if len(rows) < _FEWEST:
         return None
+    if not predictions.chosen.orders:  # only its harmonics tell a further mode from a softening law
+        kinds = [k for k in kinds if not issubclass(EFFECTS[k], AbstractAddedMode)]
     readings = _readings(predictions, data, rows)
     if predictions.given.modes.modal_mass_std is None:  # the mass that nobody stated is the gain
         kinds = [kind for kind in kinds if not _is_gain(kind)]
