@@ -28,6 +28,7 @@ from snrmjax.diagnose.search.model_search import FoundEffects, TriedEffect
 from snrmjax.identify.calibrate.calibration_states import ASSUMED_ERROR
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.effect_metadata import Argument
+from snrmjax.model.effects import is_own
 from snrmjax.model.library.free_laws import StiffnessLaw
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.facts import Fact
@@ -71,6 +72,10 @@ def fitted_parts(named: NamedParts, predictions: Predictions, data: SteadyStates
         for kind, group in by_kind.items()
         for rival in group[1:]
     ]
+    tried = {*fit.kinds, *(kind for one in rivals for kind in one.kinds)}
+    own = {one.kind for one in named.problem.columns if is_own(one.kind)}
+    for kind in sorted(own - tried):
+        rivals.append(_fitted(misfit, named.naming, [kind]))  # who brings an effect sees it fitted
     nothing = baseline_fit(misfit)
     rows = tuple(_tried(nothing, one) for one in (fit, *rivals) if one.kinds)
     return FoundEffects(misfit, fit, nothing, (rows,), (nothing, fit, *rivals), groups)

@@ -14,6 +14,7 @@ from jaxtyping import Complex, Float
 from snrmjax.diagnose.naming import describing, priors
 from snrmjax.diagnose.naming.readings import Readings
 from snrmjax.model.effect_base import AbstractForce
+from snrmjax.model.effect_shape import starts_of
 from snrmjax.model.effects import EFFECTS, is_own, make_effect
 from snrmjax.model.library.damping import (
     CubicDamping,
@@ -74,6 +75,7 @@ class Column(NamedTuple):
     std: float | None = None  # 1σ of the strength where it is an instrument's; None: any size
     fraction: float = 1.0  # of its kind's prior
     widths: tuple[float, ...] = ()  # of the intervals that the shape stands for
+    start: tuple[float, ...] = ()  # parameters of a user's own force at strength 1
 
     def divided(self, readings: Readings) -> "list[Column]":
         """Columns for the parts of its intervals."""
@@ -249,7 +251,7 @@ def _of_own_force(readings: Readings, kind: str) -> list[Column]:
     grid = np.geomspace(np.min(x), 1.0, _AMPLITUDES)
     q = readings.largest * grid[:, None] * np.cos(angle)
     rate = -readings.natural_frequency * readings.largest * grid[:, None] * np.sin(angle)
-    names, starts = tuple(effect.parameters()), effect.starts(readings.scales)
+    names, starts = tuple(effect.parameters()), starts_of(effect, readings.scales)
     found = []
     for start in starts:
         law: Any = make_effect(kind, dict(zip(names, start, strict=True)))
@@ -258,7 +260,8 @@ def _of_own_force(readings: Readings, kind: str) -> list[Column]:
         of_state = np.interp(np.log(x), np.log(grid), change) / readings.natural_frequency**2
         scale = float(np.max(np.abs(of_state), initial=0.0))
         if np.isfinite(scale) and scale > 0:
-            one = Column(kind, (), of_state / scale, scale, fraction=1 / len(starts))
+            fraction = 1 / len(starts)
+            one = Column(kind, (), of_state / scale, scale, fraction=fraction, start=start)
             found.append(one)
     return found
 
@@ -288,11 +291,13 @@ def rows_of_columns(readings: Readings, columns: list[Column]) -> Float[np.ndarr
 
 def parameters_of(readings: Readings, column: Column, strength: float) -> dict[str, float] | None:
     """The effect's parameters by name, in modal units; None where the readings do not give them."""
-    law = LAWS.get(column.kind)
-    if law is None or law.parameters is None:
+    law, own = LAWS.get(column.kind), strength / column.scale
+    if column.start:
+        values: tuple[float, ...] = (own * column.start[0], *column.start[1:])
+    elif law is None or law.parameters is None:
         return None
-    own = strength / column.scale
-    values = law.parameters(readings.natural_frequency, readings.largest, own, *column.shape)
+    else:
+        values = law.parameters(readings.natural_frequency, readings.largest, own, *column.shape)
     return dict(zip(EFFECTS[column.kind].parameters(), map(float, values), strict=True))
 
 
