@@ -344,7 +344,9 @@ def write_model(path: FilePath, model: Structure) -> None:
     """
     if model.modes.natural_frequency.ndim != 1:
         raise ValueError("`model` must be one structure, but is a batch of them.")
-    text = tomli_w.dumps(_entries(jax.tree.map(np.asarray, model)))
+    # A zero without a sign: of matrices of one column its sign is lost in reading.
+    unsigned = jax.tree.map(lambda leaf: np.asarray(leaf) + 0.0, model)
+    text = tomli_w.dumps(_entries(unsigned))
     _read(text, file_name(path), Path(path))
     write_atomically(path, text)
 
