@@ -146,6 +146,12 @@ def completed_by_parts(
     if fitted and not left:
         return diagnosis
     parameters, checks, gap = _estimates(naming), diagnosis.checks, diagnosis.gap
+    if left:  # beside a remainder the linear mode is the one that the readings found with it
+        mode = f"mode_{model.modes.mode_of_interest + 1}"
+        found = (naming.natural_frequency, naming.damping_ratio)
+        names = (f"{mode}.natural_frequency", f"{mode}.damping_ratio")
+        beside = dict(zip(names, found, strict=True))
+        baseline = {name: value for name, value in beside.items() if name in baseline}
     whole = completed_model(model, baseline, *_structural(naming.effects, parameters))
     completed, status, reason = whole.model, whole.status, whole.reason
     drawn: tuple[str, ...] = ()

@@ -28,6 +28,9 @@ from snrmjax.measure.states import SteadyStates
 from snrmjax.model.structures import Structure, driven_in_newtons
 from snrmjax.numerics.facts import Fact
 
+# Of a completed model's resonance from the measured one: far beyond what levels repeat to.
+_FAR_OFF = 0.01  # relative, of frequencies
+_FAR_APART = 0.2  # of the logarithm of velocities
 _log = logging.getLogger(__name__)
 
 
@@ -100,7 +103,18 @@ def diagnose_test(
     if levels:
         note = Fact("responses_not_complete", levels=levels)
         found = dataclasses.replace(found, notes=(*found.notes, note))
+    missed = tuple(each.level for each in simulated.predicted.levels if _is_missed(each))
+    if missed:
+        note = Fact("resonances_missed", levels=missed)
+        found = dataclasses.replace(found, notes=(*found.notes, note))
     return DiagnosedTest(found, model, simulated, place)
+
+
+def _is_missed(level: LevelResponse) -> bool:
+    """Whether the completed model's resonance lies far from the measured one of its level."""
+    there, after = level.measured, level.completed
+    off = abs(after.frequency - there.frequency) > _FAR_OFF * there.frequency
+    return bool(off or abs(np.log(after.velocity / there.velocity)) > _FAR_APART)
 
 
 def _whereabouts(

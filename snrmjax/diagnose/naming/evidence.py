@@ -262,6 +262,7 @@ class Solved(NamedTuple):
     mean: Float[np.ndarray, " unknown"]  # strengths, then both remainders' functions
     covariance: Float[np.ndarray, "unknown unknown"]
     misfit: float  # root-mean-square of what is left of the rows
+    linear: tuple[float, float]  # errors of the natural frequency and damping ratio, in their 1σ
 
 
 def solved(problem: Problem, cell: Cell) -> Solved:
@@ -277,4 +278,6 @@ def solved(problem: Problem, cell: Cell) -> Solved:
     left = problem.readings.rows - design @ mean
     misfit = float(np.sqrt(np.mean(left**2)))
     kept = np.r_[: len(laws), len(laws) + n : len(root)]
-    return Solved(mean[kept], (inverse @ inverse.T)[np.ix_(kept, kept)], misfit)
+    # The first error is that of the modal mass.
+    linear = float(mean[len(laws) + 1]), float(mean[len(laws) + 2])
+    return Solved(mean[kept], (inverse @ inverse.T)[np.ix_(kept, kept)], misfit, linear)

@@ -68,6 +68,8 @@ class Naming(NamedTuple):
     answers: Mapping[Laws, float]  # probabilities of sets of laws, the likeliest first
     parameters: Mapping[str, Strength]  # of the laws in the most probable hypothesis with them all
     misfit: float  # root-mean-square residual of that hypothesis, over the noise
+    natural_frequency: float  # rad/s, of the linear mode in that hypothesis
+    damping_ratio: float
 
     @property
     def effects(self) -> Laws:
@@ -111,7 +113,12 @@ def naming_of(problem: Problem, cells: list[Cell]) -> Naming:
     with_all = [one for one in reads if wanted <= {k for some in one.laws.values() for k in some}]
     best = max(with_all or reads, key=lambda one: one.weight)
     parts = [_part(problem, reads, part, best, classes[part]) for part in classes]
-    return Naming(tuple(parts), answers, _parameters(problem, best, wanted), best.solved.misfit)
+    linear, (softer, lossier) = problem.readings.linear, best.solved.linear
+    return Naming(
+        *(tuple(parts), answers, _parameters(problem, best, wanted), best.solved.misfit),
+        natural_frequency=linear.natural_frequency + softer * linear.frequency_std,
+        damping_ratio=linear.damping_ratio + lossier * linear.damping_std,
+    )
 
 
 def _parameters(problem: Problem, one: _Read, wanted: set[str]) -> dict[str, Strength]:

@@ -112,6 +112,11 @@ SENTENCES: dict[str, Wording] = {
         "{relative_std:%.2g}); if the model's modal mass is wrong, so is the gain."
     ),
     "fewer_advised": "{n} of {wanted} further measurements are advised: {why}.",
+    "resonances_missed": (
+        "the completed model's resonances lie far from the measured ones at level {levels}: it "
+        "does not reproduce these responses. Check the model's participation and linear "
+        "frequency, and the scale of the force."
+    ),
     "responses_not_complete": (
         "the simulated responses of level {levels} were not traced to the end of the frequency "
         "range: a resonance may be missing there."
