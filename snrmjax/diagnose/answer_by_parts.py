@@ -22,7 +22,7 @@ from snrmjax.diagnose.misfit.effect_fit import EffectFit, baseline_fit, fit_effe
 from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
 from snrmjax.diagnose.misfit.predictions import Predictions, scales_of
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit, weighted_misfit
-from snrmjax.diagnose.naming.parts import DRAWN, Naming, Remainder
+from snrmjax.diagnose.naming.parts import DRAWN, Naming, PartAnswer, Remainder
 from snrmjax.diagnose.naming.remainder_law import remainder_laws
 from snrmjax.diagnose.search.model_search import FoundEffects, TriedEffect
 from snrmjax.identify.calibrate.calibration_states import ASSUMED_ERROR
@@ -114,7 +114,9 @@ def with_parts(
     naming = named.naming
     diagnosis = dataclasses.replace(diagnosis, parts=naming.parts)
     if _explains_all(diagnosis, naming):
-        return diagnosis
+        kept = {kind for group in diagnosis.candidates for kind in group}
+        parts = tuple(_narrowed(part, kept) for part in naming.parts)
+        return dataclasses.replace(diagnosis, parts=parts)
     verdict = overall(naming)
     if verdict is Verdict.NOTHING_MISSING:  # what is left shows in harmonics or at other sensors
         return diagnosis
@@ -177,6 +179,18 @@ def completed_by_parts(
         laws=laws,
     )
     return dataclasses.replace(diagnosis, answer=answer, gap=gap, checks=checks, notes=notes)
+
+
+def _narrowed(part: PartAnswer, kept: set[str]) -> PartAnswer:
+    """A part's answer by what harmonics and further sensors leave of its candidates."""
+    groups = tuple(tuple(k for k in group if k in kept) or group for group in part.candidates)
+    single = all(len(group) == 1 for group in groups)
+    named = single and part.verdict == Verdict.AMBIGUOUS
+    return part._replace(
+        verdict=Verdict.NAMED.value if named else part.verdict,
+        effects=tuple(group[0] for group in groups),
+        candidates=groups,
+    )
 
 
 def _explains_all(diagnosis: Diagnosis, naming: Naming) -> bool:
