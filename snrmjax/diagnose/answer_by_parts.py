@@ -82,7 +82,7 @@ def fitted_parts(named: NamedParts, predictions: Predictions, data: SteadyStates
 
 
 def _fitted(misfit: WeightedMisfit, naming: Naming, effects: Iterable[str]) -> EffectFit:
-    """Effects fitted one beside the other, from the readings' parameters where there are some."""
+    """Effects fitted together, from the readings' parameters where there are some."""
     fit, scales = baseline_fit(misfit), scales_of(misfit.predictions)
     for kind in effects:
         one, names = candidate(kind, scales), parameter_labels(kind)
@@ -134,7 +134,7 @@ def completed_by_parts(
 ) -> Diagnosis:
     """The diagnosis with a completed model that holds laws and remainders.
 
-    Where a remainder is seen the laws' parameters are those beside it; else as they were fitted.
+    Where a remainder is seen the laws' parameters are those found with it; else those of the fit.
     """
     naming, answer = named.naming, diagnosis.answer
     if not diagnosis.verdict.is_answer:
@@ -148,12 +148,12 @@ def completed_by_parts(
     if fitted and not left:
         return diagnosis
     parameters, checks, gap = _estimates(naming), diagnosis.checks, diagnosis.gap
-    if left:  # beside a remainder the linear mode is the one that the readings found with it
+    if left:  # the linear mode is the one that the readings found together with the remainder
         mode = f"mode_{model.modes.mode_of_interest + 1}"
         found = (naming.natural_frequency, naming.damping_ratio)
         names = (f"{mode}.natural_frequency", f"{mode}.damping_ratio")
-        beside = dict(zip(names, found, strict=True))
-        baseline = {name: value for name, value in beside.items() if name in baseline}
+        linear = dict(zip(names, found, strict=True))
+        baseline = {name: value for name, value in linear.items() if name in baseline}
     whole = completed_model(model, baseline, *_structural(naming.effects, parameters))
     completed, status, reason = whole.model, whole.status, whole.reason
     drawn: tuple[str, ...] = ()

@@ -1,4 +1,4 @@
-"""Evidences of laws, alone and in pairs, beside remainders of every size, in closed form.
+"""Evidences of laws, alone and in pairs, with remainders of every size, in closed form.
 
 With the sizes (σ₁, σ₂) of the remainders of stiffness and damping fixed, rows y = Aθ + e have
 e ~ N(0, C). All that counts of the columns A is b = AᵀC⁻¹y and S = AᵀC⁻¹A, from one Cholesky
@@ -31,7 +31,7 @@ Sizes = tuple[float, float]
 
 
 class Cell(NamedTuple):
-    """One hypothesis: some columns beside remainders of some sizes."""
+    """One hypothesis: some columns with remainders of some sizes."""
 
     log_evidence: float  # times the prior
     columns: tuple[int, ...]  # places in `Problem.columns`
@@ -197,7 +197,8 @@ class _Normal(NamedTuple):
 
     def strengths(self, some: Int[np.ndarray, " some"], every: int) -> np.ndarray:
         """1σ of the strengths of some columns that are tried, (some, strength)."""
-        tried = np.broadcast_to(priors.STRENGTHS[::every], (len(some), -(-11 // every)))
+        values = priors.STRENGTHS[::every]
+        tried = np.broadcast_to(values, (len(some), len(values)))
         std = self.std[some, None]
         return np.where(np.isfinite(std), std, tried)
 

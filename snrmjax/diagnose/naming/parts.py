@@ -138,28 +138,34 @@ def _parameters(problem: Problem, one: _Read, wanted: set[str]) -> dict[str, Str
 
 def _changes(problem: Problem, cell: Cell, solution: Solved, part: str) -> tuple[np.ndarray, ...]:
     """Of a part at every state: changes by law and by the remainder's functions, and their mean."""
-    k, n = len(cell.columns), problem.functions.shape[1]
+    k = len(cell.columns)
     take = np.real if part == "stiffness" else np.imag
     over = 1.0 if part == "stiffness" else problem.readings.relative_frequency
     changes = [take(problem.columns[c].change) / over for c in cell.columns]
     laws = np.array(changes).reshape(k, len(problem.functions)).T
-    first = k if part == "stiffness" else k + n
-    return laws, problem.functions, solution.mean[:k], solution.mean[first : first + n]
+    return laws, problem.functions, solution.mean[:k], solution.mean[_rest(problem, cell, part)]
+
+
+def _rest(problem: Problem, cell: Cell, part: str) -> slice:
+    """Where the remainder of a part stands among a hypothesis' unknowns."""
+    n = problem.functions.shape[1]
+    first = len(cell.columns) + PARTS.index(part) * n
+    return slice(first, first + n)
 
 
 def _read(problem: Problem, cell: Cell, weight: float) -> _Read:
     solution = solved(problem, cell)
-    k, n = len(cell.columns), problem.functions.shape[1]
+    k = len(cell.columns)
     std = np.sqrt(np.diag(solution.covariance))[:k]
     seen = np.abs(solution.mean[:k]) > priors.VISIBLE * std
     laws: dict[str, Laws] = {"instrument": ()}
     left = {"instrument": False}
     small = priors.BELOW_BANDWIDTH * problem.readings.relative_damping
-    for number, part in enumerate(PARTS):
+    for part in PARTS:
         of_law, functions, strength, rest = _changes(problem, cell, solution, part)
         remainder = functions @ rest
-        first = k + number * n
-        covariance = solution.covariance[first : first + n, first : first + n]
+        some = _rest(problem, cell, part)
+        covariance = solution.covariance[some, some]
         size = np.sqrt(np.einsum("si,ij,sj->s", functions, covariance, functions))
         whole = _size(of_law @ strength + remainder)
         seen_left = np.max(np.abs(remainder) / (size + 1e-300)) > priors.VISIBLE + 1
@@ -267,12 +273,11 @@ def _explained(
         draws = rng.multivariate_normal(
             one.solved.mean, one.solved.covariance, size=times, method="eigh"
         )
-        n_laws, n = len(one.cell.columns), functions.shape[1]
-        first = n_laws if part == "stiffness" else n_laws + n
+        n_laws = len(one.cell.columns)
         mine = np.array([problem.columns[c].kind in named for c in one.cell.columns])
         law = (draws[:, :n_laws] * mine) @ laws.T
         other = (draws[:, :n_laws] * ~mine) @ laws.T
-        rest = draws[:, first : first + n] @ functions.T + other
+        rest = draws[:, _rest(problem, one.cell, part)] @ functions.T + other
         spread = _size_of if _is_flat(law) else _std_of
         fractions.append(1 - spread(rest) / np.maximum(spread(law + rest), 1e-300))
     every = np.clip(np.concatenate(fractions), 0.0, 1.0)
@@ -295,9 +300,7 @@ def _size_of(curves: np.ndarray) -> np.ndarray:
 def _remainder(problem: Problem, reads: list[_Read], part: str, best: _Read) -> Remainder:
     readings = problem.readings
     x = np.geomspace(np.min(readings.relative_amplitude), 1.0, _POINTS)
-    functions, n_laws, n = problem.remainders(x), len(best.cell.columns), problem.functions.shape[1]
-    first = n_laws if part == "stiffness" else n_laws + n
-    some = slice(first, first + n)
+    functions, some = problem.remainders(x), _rest(problem, best.cell, part)
     unit = 1.0 if part == "stiffness" else 0.5
     value = unit * functions @ best.solved.mean[some]
     covariance = best.solved.covariance[some, some]

@@ -14,7 +14,7 @@ STRENGTHS = np.geomspace(1e-5, 1.0, 11)
 what no test sees to a change as large as the linear stiffness."""
 
 NO_REMAINDER = 0.3
-"""Probability that nothing is left beside the laws: structures are seldom in a library exactly."""
+"""Probability that laws leave nothing: structures are seldom in a library exactly."""
 
 REMAINDERS = np.geomspace(1e-5, 1.0, 9)
 """Sizes of a remainder where there is one, in the units of strengths, all as likely."""

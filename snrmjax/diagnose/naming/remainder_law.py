@@ -47,6 +47,6 @@ def _secants(
     weight = 2 * (np.cos(t) ** 2 if in_phase else np.sin(t) ** 2) / _ANGLES
     at = np.log(np.maximum(np.outer(amplitude, np.cos(t)), knots[0]))
     hats = np.array([np.interp(at, np.log(knots), unit) @ weight for unit in np.eye(len(knots))]).T
-    bends = _SMOOTH * np.diff(np.eye(len(knots)), 2, axis=0)
-    rows, goal = np.vstack([hats, bends]), np.concatenate([value, np.zeros(len(bends))])
+    roughness = _SMOOTH * np.diff(np.eye(len(knots)), 2, axis=0)
+    rows, goal = np.vstack([hats, roughness]), np.concatenate([value, np.zeros(len(roughness))])
     return np.linalg.lstsq(rows, goal, rcond=None)[0]
