@@ -34,11 +34,16 @@ from snrmjax.model.structures import Structure
 from snrmjax.numerics.facts import Fact
 
 
+_INDEPENDENT = 0.5  # of the states that err by themselves, from which on a misfit may be noise
+
+
 def verdict_of(named: NamedParts, found: FoundEffects) -> tuple[Verdict, tuple[Fact, ...]]:
     """The verdict on a test, and why nothing is named where the readings do not say it."""
-    noise = float(named.problem.readings.posterior.hyper.noise)
-    low, high = priors.TOLERATED_NOISE
-    if found.misfit.predictions.chosen.noise_stated and not low < np.log(noise) < high:
+    posterior = named.problem.readings.posterior
+    noise, (low, high) = float(posterior.hyper.noise), priors.TOLERATED_NOISE
+    # What neighbouring states miss alike is no noise of any standard deviation.
+    stated = found.misfit.predictions.chosen.noise_stated and posterior.share > _INDEPENDENT
+    if stated and not low < np.log(noise) < high:
         return Verdict.NOISE_REJECTED, (Fact("noise_misstated", ratio=noise),)
     verdict = overall(named.naming)
     n_rows = len(named.problem.readings.rows)
