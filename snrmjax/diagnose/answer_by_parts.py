@@ -33,7 +33,6 @@ from snrmjax.model.library.free_laws import StiffnessLaw
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.facts import Fact
 
-
 _INDEPENDENT = 0.5  # of the states that err by themselves, from which on a misfit may be noise
 
 
