@@ -1,7 +1,8 @@
 """Naming for a test and a model: the mode's readings beyond the model, and what explains them."""
 
+import dataclasses
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,18 +12,30 @@ from jaxtyping import Complex, Float
 from snrmjax.diagnose.decide import Verdict
 from snrmjax.diagnose.misfit.predictions import Predictions, scales_of
 from snrmjax.diagnose.misfit.reference import test_states_of
-from snrmjax.diagnose.naming.columns import is_instrument
 from snrmjax.diagnose.naming.evidence import Problem, best_hypotheses
 from snrmjax.diagnose.naming.parts import Naming, naming_of
-from snrmjax.diagnose.naming.readings import LinearTest, ModelStiffness, Readings, readings_of
+from snrmjax.diagnose.naming.phases import likely_dynamic_stiffness
+from snrmjax.diagnose.naming.readings import (
+    LinearTest,
+    ModelMotion,
+    MotionOfModel,
+    Readings,
+    RecordedHarmonics,
+    readings_of,
+)
+from snrmjax.identify.calibrate.calibration_states import ASSUMED_ERROR
 from snrmjax.identify.calibrate.inverse_force import inverse_force
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.effect_base import AbstractAddedMode
 from snrmjax.model.effects import EFFECTS
-from snrmjax.model.modes import residual_velocity
+from snrmjax.model.library.measurement_chain import ModeShapeChange
+from snrmjax.model.modes import linear_response, residual_velocity
 from snrmjax.model.parameters import with_parameters
+from snrmjax.numerics.blocks import padded
 
-_FEWEST = 6  # states with a phase
+_ANY_PHASE = 1.0  # rad, 1σ of a phase that was not recorded, about the likely one
+_SEEN_BY_HARMONICS = (AbstractAddedMode, ModeShapeChange)
+"""What only other harmonics tell from a law: one sensor's fundamental follows either."""
 
 
 class NamedParts(NamedTuple):
@@ -32,28 +45,39 @@ class NamedParts(NamedTuple):
     problem: Problem
 
 
-def named_parts(
-    predictions: Predictions, data: SteadyStates, kinds: Iterable[str]
-) -> NamedParts | None:
-    """What explains most of the change of stiffness and damping; None where phases are unknown.
+def named_parts(predictions: Predictions, data: SteadyStates, kinds: Iterable[str]) -> NamedParts:
+    """What explains most of the change of stiffness, damping and every other harmonic.
 
-    Arguments: `data` as they were measured; `kinds` of effects that may be missing.
+    Arguments: `data` as they were measured; `kinds` of effects that may be missing. States without
+    phases count by their sizes alone.
     """
-    rows = np.flatnonzero(~predictions.chosen.phase_unknown[:, 0])
-    if len(rows) < _FEWEST:
-        return None
-    if not predictions.chosen.orders:  # only its harmonics tell a further mode from a softening law
-        kinds = [k for k in kinds if not issubclass(EFFECTS[k], AbstractAddedMode)]
-    readings = _readings(predictions, data, rows)
-    if predictions.given.modes.modal_mass_std is None:  # the mass that nobody stated is the gain
-        kinds = [kind for kind in kinds if not _is_gain(kind)]
-    problem, cells = best_hypotheses(readings, kinds)
+    unknown = predictions.chosen.phase_unknown[:, 0]
+    if unknown.any():
+        predictions = _with_likely_phases(predictions, data)
+    if not predictions.chosen.orders or unknown.any():
+        kinds = [k for k in kinds if not issubclass(EFFECTS[k], _SEEN_BY_HARMONICS)]
+    problem, cells = best_hypotheses(_readings(predictions, data, unknown), kinds)
     return NamedParts(naming_of(problem, cells), problem)
 
 
-def _is_gain(kind: str) -> bool:
-    """Whether a kind is a gain of the instruments, as another modal mass is."""
-    return EFFECTS[kind].like_force_gain and is_instrument(kind)
+def _with_likely_phases(predictions: Predictions, data: SteadyStates) -> Predictions:
+    """Velocities of unknown phase at those of smooth curves with the recorded sizes."""
+    chosen, modes = predictions.chosen, predictions.given.modes
+    rows = np.arange(len(chosen.rows))
+    states = test_states_of(predictions, rows)
+    amplitude = np.abs(states.velocity) / states.frequency
+    model = _motion_of_model(predictions, data, rows, ())(states.velocity, states.frequency)
+    natural = modes.natural_frequency.item(modes.mode_of_interest)
+    z = likely_dynamic_stiffness(
+        states.force * states.constant / amplitude, model.dynamic_stiffness[0], amplitude, natural
+    )
+    side = modes.mode_shape[chosen.sensors[0]] * modes.participation
+    behind = np.pi if float(side[modes.mode_of_interest]) < 0 else 0.0
+    found = predictions.with_phases(np.pi / 2 - np.angle(z) + behind)
+    error = np.asarray(chosen.states.error).copy()
+    error[chosen.phase_unknown[:, 0], 1 + len(chosen.sensors)] = _ANY_PHASE
+    states_found = found.chosen.states._replace(error=error)
+    return dataclasses.replace(found, chosen=found.chosen._replace(states=states_found))
 
 
 def overall(naming: Naming) -> Verdict:
@@ -63,8 +87,14 @@ def overall(naming: Naming) -> Verdict:
     return next((one for one in order if one in verdicts), Verdict.NOTHING_MISSING)
 
 
-def _readings(predictions: Predictions, data: SteadyStates, rows: np.ndarray) -> Readings:
+def _readings(predictions: Predictions, data: SteadyStates, unknown: np.ndarray) -> Readings:
+    rows = np.arange(len(unknown))
     states, modes = test_states_of(predictions, rows), predictions.given.modes
+    if unknown.any():
+        errors = states.errors.copy()
+        if not states.stated:  # over those of sizes, which are taken for `ASSUMED_ERROR`
+            errors[unknown, 2] = _ANY_PHASE / ASSUMED_ERROR
+        states = states._replace(errors=errors, phase_std=0.0)
     j = modes.mode_of_interest
     order = np.asarray(data.order)[predictions.chosen.rows[rows]]
     order = np.where(np.isfinite(order), order, np.linspace(0.0, 1.0, len(rows)))
@@ -75,22 +105,54 @@ def _readings(predictions: Predictions, data: SteadyStates, rows: np.ndarray) ->
         modes.damping_ratio_std.item(j),
         states.mass_std,
         modes.mode_shape.item(predictions.chosen.sensors[0], j),
+        np.sign(modes.mode_shape.item(predictions.chosen.sensors[0], j) * modes.participation[j]),
         scales_of(predictions),
     )
-    return readings_of(states, order, _model_stiffness(predictions, data, rows), linear)
+    # The other harmonics of a state turn with its fundamental, whose phase must be known.
+    recorded = _recorded_harmonics(predictions, rows, none=bool(unknown.any()))
+    model = _motion_of_model(predictions, data, rows, recorded.order)
+    alike = not unknown.any()  # likely phases are smooth by themselves
+    return readings_of(states, order, model, linear, recorded, tempered=alike)
 
 
-def _model_stiffness(
-    predictions: Predictions, data: SteadyStates, rows: np.ndarray
-) -> ModelStiffness:
-    """The dynamic stiffness that the model has: of a linear mode as written, else by balance."""
+def _recorded_harmonics(
+    predictions: Predictions, rows: np.ndarray, *, none: bool
+) -> RecordedHarmonics:
+    """Harmonics at the reference sensor, and what an exciter's would cause there."""
+    chosen, modes = predictions.chosen, predictions.given.modes
+    sensor, orders = chosen.sensors[0], () if none else chosen.orders
+    states, n = chosen.states, len(chosen.sensors)
+    first = 2 * n  # of the columns of the reference sensor's harmonics
+    size = np.abs(np.asarray(states.velocity)[rows, 0])[:, None]
+    std = np.asarray(states.own_std)[rows, first : first + 2 * len(orders) : 2] * size
+    known = np.asarray(states.known)[rows, first : first + 2 * len(orders) : 2]
+    forced = np.zeros((len(rows), len(orders)), complex)
+    for place, order in enumerate(orders):
+        load: list[Any] = [
+            padded(order * np.asarray(states.frequency)[rows]),
+            padded(np.asarray(states.force)[rows]),
+        ]
+        forced[:, place] = np.asarray(linear_response(modes, *load))[: len(rows), sensor]
+    velocity = np.asarray(states.harmonics)[rows, 0, : len(orders)]
+    return RecordedHarmonics(orders, velocity, np.where(known, std, np.nan), forced)
+
+
+def _motion_of_model(
+    predictions: Predictions, data: SteadyStates, rows: np.ndarray, orders: tuple[int, ...]
+) -> MotionOfModel:
+    """The motion that the model has: of a linear mode as written, else by balance."""
     model = predictions.given
     modes, sensor = model.modes, predictions.chosen.sensors[0]
     j = modes.mode_of_interest
     natural, ratio = modes.natural_frequency.item(j), modes.damping_ratio.item(j)
     plain = not (model.effects or model.potential.monomials)
     if plain and modes.damping_coupling is None and modes.participation_lag is None:
-        return lambda _, omega: (natural**2 - omega**2 + 2j * ratio * natural * omega)[None]
+
+        def linear(velocity: Complex[np.ndarray, " state"], omega: np.ndarray) -> ModelMotion:
+            none = np.zeros((1, len(omega), len(orders)), complex)
+            return ModelMotion((natural**2 - omega**2 + 2j * ratio * natural * omega)[None], none)
+
+        return linear
     constant = modes.mode_shape.item(sensor, j) * modes.participation.item(j)
     used = predictions.chosen.rows[rows]
     uncertain = [
@@ -101,19 +163,22 @@ def _model_stiffness(
 
     def balanced(
         velocity: Complex[np.ndarray, " state"], omega: Float[np.ndarray, " state"]
-    ) -> Complex[np.ndarray, " state"]:
+    ) -> ModelMotion:
         own = np.sign(constant) * velocity
         force = jnp.asarray(np.asarray(data.force)[used])
         rest = np.asarray(residual_velocity(modes, jnp.asarray(omega), jnp.ones_like(force)))
         recorded = np.asarray(data.velocity).copy()
         recorded[used, sensor] = own + rest[:, sensor] * np.asarray(force)
-        moved = eqx.tree_at(lambda d: d.velocity, data, jnp.asarray(recorded))
-        found = []
+        known = jnp.asarray(recorded), jnp.zeros_like(data.phase_std)
+        moved = eqx.tree_at(lambda d: (d.velocity, d.phase_std), data, known)
+        found, higher = [], []
         for one in (model, *uncertain):
-            needed = np.asarray(inverse_force(one, moved).force)[used]
+            solved = inverse_force(one, moved)
+            needed = np.asarray(solved.force)[used]
+            higher.append(np.asarray(solved.velocity)[used][:, list(orders), sensor])
             # The rest of the motion at the force that the model needs, and not the measured one.
             mode = own + rest[:, sensor] * (np.asarray(force) - needed)
             found.append(1j * omega * constant * needed / mode)
-        return np.array(found)
+        return ModelMotion(np.array(found), np.array(higher))
 
     return balanced

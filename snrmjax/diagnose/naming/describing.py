@@ -6,10 +6,27 @@ Reference: Gelb & Vander Velde, Multiple-Input Describing Functions and Nonlinea
 (1968), appendix B; for Masing's rule on a power law, Segalman, ASME J. Appl. Mech. 72 (2005) 752.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 from jaxtyping import Complex, Float
 
 Amplitudes = Float[np.ndarray, " state"]
+Cycle = Float[np.ndarray, "state sample"]
+Force = Callable[[Cycle, Cycle], Cycle]
+"""Of a displacement x cos t and of its slope −x sin t, over half a cycle or the whole."""
+
+_SAMPLES = 256
+
+
+def harmonic(force: Force, x: Amplitudes, order: int) -> Complex[np.ndarray, " state"]:
+    """Harmonic of a force that a harmonic motion causes, over the amplitude: f = Re Σ cₕ eʰⁱᵗ.
+
+    By quadrature over the cycle.
+    """
+    t = (np.arange(_SAMPLES) + 0.5) * 2 * np.pi / _SAMPLES
+    values = force(np.outer(x, np.cos(t)), -np.outer(x, np.sin(t)))
+    return 2 * np.mean(values * np.exp(-1j * order * t), axis=1) / np.maximum(x, 1e-12)
 
 
 def gap(x: Amplitudes, width: float) -> Amplitudes:
@@ -18,10 +35,10 @@ def gap(x: Amplitudes, width: float) -> Amplitudes:
     return np.where(x > width, 1 - (2 / np.pi) * (np.arcsin(r) + r * np.sqrt(1 - r * r)), 0.0)
 
 
-def stop(x: Amplitudes, width: float, stiffness: float) -> Amplitudes:
-    """Stiffness of a spring of ω₀² `stiffness` behind a gap on one side, over that stiffness.
+def mean_at_stop(x: Amplitudes, width: float, stiffness: float) -> Amplitudes:
+    """Mean of a motion that a spring of ω₀² `stiffness` behind a gap on one side pushes back.
 
-    The motion's mean gives way to it: q₀ + stiffness · mean contact force = 0, by bisection.
+    q₀ + stiffness · mean contact force = 0, by bisection.
     """
     low, high = -x, np.zeros_like(x)
     for _ in range(50):
@@ -31,6 +48,14 @@ def stop(x: Amplitudes, width: float, stiffness: float) -> Amplitudes:
         contact = x * (np.sin(angle) - s * angle) / np.pi
         too_high = mean + stiffness * contact > 0
         low, high = np.where(too_high, low, mean), np.where(too_high, mean, high)
+    return mean
+
+
+def stop(x: Amplitudes, width: float, stiffness: float) -> Amplitudes:
+    """Stiffness of a spring of ω₀² `stiffness` behind a gap on one side, over that stiffness."""
+    mean = mean_at_stop(x, width, stiffness)
+    s = np.clip((width - mean) / np.maximum(x, 1e-12), -1.0, 1.0)
+    angle = np.arccos(s)
     return (angle - s * np.sqrt(1 - s * s)) / np.pi
 
 
@@ -54,12 +79,33 @@ def masing(exponent: float, samples: int = 400) -> tuple[float, float]:
     return 2 * float(np.mean(force * q)), -2 * float(np.mean(force * np.sin(t)))
 
 
+def slipping(q: Cycle, slope: Cycle, slip: float) -> Cycle:
+    """Force of a slider of stuck stiffness 1, less that of the stuck one."""
+    largest = np.max(np.abs(q), axis=1, keepdims=True)
+    down = np.maximum(_falling(q, slope) - largest + slip, -slip)
+    force = np.where(slope <= 0, down, -down)
+    return np.where(largest > slip, force - q, 0.0)
+
+
+def microslip(q: Cycle, slope: Cycle, exponent: float) -> Cycle:
+    """Force of the backbone −|x|^p sgn x by Masing's rule."""
+    largest = np.max(np.abs(q), axis=1, keepdims=True)
+    down = 2 * ((largest - _falling(q, slope)) / 2) ** exponent - largest**exponent
+    return np.where(slope <= 0, down, -down)
+
+
+def _falling(q: Cycle, slope: Cycle) -> Cycle:
+    """The displacement, mirrored where it rises: both halves of a loop are one curve."""
+    return np.where(slope <= 0, q, -q)
+
+
 def quadratic(
     x: Amplitudes, frequency: Float[np.ndarray, " state"], ratio: float, strength: float
-) -> Complex[np.ndarray, " state"]:
-    """Dynamic stiffness that a spring of force `strength` q² (over ω₀² and the largest a) adds.
+) -> tuple[Complex[np.ndarray, " state"], Complex[np.ndarray, " state"]]:
+    """Fundamental and second harmonic of a spring of force `strength` q², over the amplitude.
 
-    By the mean and the second harmonic of the motion: s q₀ + ½ s a² + … = 0, in fixed-point steps.
+    `strength` is over ω₀² and the largest amplitude. By the mean and the second harmonic of the
+    motion: q₀ + ½ s a² + … = 0, in fixed-point steps.
     """
     own = 1 - 4 * frequency**2 + 4j * ratio * frequency
     mean, second = np.zeros_like(x), np.zeros_like(x) + 0j
@@ -67,7 +113,8 @@ def quadratic(
         square = mean**2 + 0.5 * x**2 + 0.5 * np.abs(second) ** 2
         mean = np.clip(-strength * square, -0.5 / strength, 0.0)
         second = -0.5 * strength * x**2 / (own + 2 * strength * mean)
-    return strength * (2 * mean + second)
+    twice = strength * (0.5 * x**2 + 2 * mean * second) / np.maximum(x, 1e-12)
+    return strength * (2 * mean + second), twice
 
 
 def resonant(

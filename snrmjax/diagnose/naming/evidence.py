@@ -1,23 +1,26 @@
 """Evidences of laws, alone and in pairs, with remainders of every size, in closed form.
 
-With the sizes (σ₁, σ₂) of the remainders of stiffness and damping fixed, rows y = Aθ + e have
-e ~ N(0, C). All that counts of the columns A is b = AᵀC⁻¹y and S = AᵀC⁻¹A, from one Cholesky
-factor; for θ ~ N(0, τ²) evidences are those of one and two Gaussian numbers, or of their positive
-half. Pairs that cannot reach the best answer, as ½ bᵀS⁻¹b bounds them, are left out.
+With the sizes of the remainders fixed, rows y = Aθ + e have e ~ N(0, C). All that counts of the
+columns A is b = AᵀC⁻¹y and S = AᵀC⁻¹A, from one Cholesky factor; for θ ~ N(0, τ²) evidences are
+those of one and two Gaussian numbers, or of their positive half. Pairs that cannot reach the best
+answer, as ½ bᵀS⁻¹b bounds them, are left out. Fundamentals and every other harmonic are blocks of
+rows that have nothing but the laws in common, so that their b and S add up.
 """
 
+import functools
 import itertools
 from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.linalg import cholesky, solve_triangular
+from scipy.linalg import block_diag, cholesky, solve_triangular
 from scipy.special import log_ndtr, logsumexp
 
 from snrmjax.diagnose.naming import priors
-from snrmjax.diagnose.naming.columns import Column, hypothesis_columns, odds_of, rows_of_columns
+from snrmjax.diagnose.naming.columns import Column, hypothesis_columns, odds_of
 from snrmjax.diagnose.naming.readings import Readings
+from snrmjax.model.library.measurement_chain import ForceHarmonics
 
 _ROUNDS = 3  # of finer shapes
 _COARSE = 40.0  # nats that a coarse shape may lack
@@ -26,8 +29,9 @@ _LEAST = 8.0  # of ln p below the most probable answer: what is less likely is l
 _KNOTS_A_UNIT = 8  # of ln a
 _MOST_KNOTS = 40
 _NO_VARIANCE = 1e-8  # of the largest: a function of the remainder that adds nothing
+_PRIOR_OF_PAIRS = np.log(priors.SIZES[2]) + 5 * np.log(2)  # at most, with both signs known
 
-Sizes = tuple[float, float]
+Sizes = tuple[float, ...]
 
 
 class Cell(NamedTuple):
@@ -35,7 +39,44 @@ class Cell(NamedTuple):
 
     log_evidence: float  # times the prior
     columns: tuple[int, ...]  # places in `Problem.columns`
-    sizes: Sizes  # σ of the remainders of stiffness and damping
+    sizes: Sizes  # σ of the remainders of stiffness, damping and every other harmonic
+
+
+class Block(NamedTuple):
+    """Rows that have errors and remainders of their own, made triangular once."""
+
+    rows: Float[np.ndarray, " row"]
+    design: Float[np.ndarray, "row unknown"]  # errors, then remainders of size 1
+    groups: tuple[int, ...]  # how many unknowns are errors, and functions of every remainder
+    directions: Float[np.ndarray, "row direction"]  # of the design, orthogonal
+    triangle: Float[np.ndarray, "direction unknown"]
+    laws: Float[np.ndarray, "row column"]
+    along: Float[np.ndarray, "direction column"]  # laws and, last, the rows
+    across: Float[np.ndarray, "column column"]  # Gram matrix of what is left of them
+
+    @classmethod
+    def of(
+        cls,
+        rows: Float[np.ndarray, " row"],
+        errors: Float[np.ndarray, "row error"],
+        *remainders: Float[np.ndarray, "row function"],
+    ) -> "Block":
+        """A block without laws."""
+        design = np.hstack([errors, *remainders])
+        groups = errors.shape[1], *(one.shape[1] for one in remainders)
+        none = np.empty((0, 0))
+        return cls(rows, design, groups, *np.linalg.qr(design), none, none, none)
+
+    def with_laws(self, laws: Float[np.ndarray, "row column"]) -> "Block":
+        """The same with the columns of laws."""
+        both = np.column_stack([laws, self.rows])
+        along = self.directions.T @ both
+        left = both - self.directions @ along
+        return self._replace(laws=laws, along=along, across=left.T @ left)
+
+    def variances(self, sizes: Sizes) -> Float[np.ndarray, " unknown"]:
+        """Prior variances of the design's unknowns."""
+        return np.repeat([1.0, *(size**2 for size in sizes)], self.groups)
 
 
 class Problem(NamedTuple):
@@ -44,30 +85,24 @@ class Problem(NamedTuple):
     readings: Readings
     columns: list[Column]
     functions: Float[np.ndarray, "state function"]  # of a remainder of size 1
-    design: Float[np.ndarray, "row unknown"]  # errors, then both remainders of size 1
-    laws: Float[np.ndarray, "row column"]
-    directions: Float[np.ndarray, "row direction"]  # of the design, orthogonal
-    triangle: Float[np.ndarray, "direction unknown"]
-    along: Float[np.ndarray, "direction column"]  # laws and, last, the rows
-    across: Float[np.ndarray, "column column"]  # Gram matrix of what is left of them
+    blocks: tuple[Block, ...]  # fundamentals, then every other harmonic
 
     @property
-    def n_errors(self) -> int:
-        """How many unknowns are errors."""
-        return self.readings.errors.shape[1]
-
-    def variances(self, sizes: Sizes) -> Float[np.ndarray, " unknown"]:
-        """Prior variances of the design's unknowns."""
-        n = self.functions.shape[1]
-        return np.repeat([1.0, sizes[0] ** 2, sizes[1] ** 2], [self.n_errors, n, n])
+    def parts(self) -> tuple[str, ...]:
+        """What of the test may have a remainder."""
+        higher = (f"harmonic_{one.order}" for one in self.readings.harmonics)
+        return ("stiffness", "damping", *higher)
 
     def with_columns(self, columns: list[Column]) -> "Problem":
         """The same with other columns."""
-        laws = rows_of_columns(self.readings, columns)
-        both = np.column_stack([laws, self.readings.rows])
-        along = self.directions.T @ both
-        left = both - self.directions @ along
-        return self._replace(columns=columns, laws=laws, along=along, across=left.T @ left)
+        readings = self.readings
+        unit = readings.natural_frequency**2
+        laws = [readings.whitened(unit * np.array([column.change for column in columns])).T]
+        for place, one in enumerate(readings.harmonics):
+            higher = np.array([column.higher[place] for column in columns])
+            laws.append(one.whitened(unit * higher).T)
+        blocks = [block.with_laws(own) for block, own in zip(self.blocks, laws, strict=True)]
+        return self._replace(columns=columns, blocks=tuple(blocks))
 
     def remainders(self, at: Float[np.ndarray, " point"]) -> Float[np.ndarray, "point function"]:
         """The remainder's functions at amplitudes over the largest one."""
@@ -78,14 +113,14 @@ def problem_of(readings: Readings, columns: list[Column]) -> Problem:
     """The problem, made triangular once for all hypotheses."""
     x, natural = readings.relative_amplitude, readings.natural_frequency
     functions = _functions(x, x)
-    stiff = natural**2 * functions.T
-    lossy = 1j * readings.frequency * natural * functions.T
-    remainders = readings.whitened(np.concatenate([stiff, lossy])).T
-    design = np.hstack([readings.errors, remainders])
-    directions, triangle = np.linalg.qr(design)
-    none = np.empty((0, 0))
-    bare = Problem(readings, [], functions, design, none, directions, triangle, none, none)
-    return bare.with_columns(columns)
+    curves = natural**2 * functions.T
+    lossy = 1j * readings.relative_frequency * curves
+    remainders = readings.whitened(curves).T, readings.whitened(lossy).T
+    blocks = [Block.of(readings.rows, readings.errors, *remainders)]
+    for one in readings.harmonics:
+        both = np.concatenate([one.whitened(curves), one.whitened(1j * curves)]).T
+        blocks.append(Block.of(one.whitened(one.beyond), one.whitened(one.errors).T, both))
+    return Problem(readings, [], functions, tuple(blocks)).with_columns(columns)
 
 
 def _functions(
@@ -109,7 +144,7 @@ def best_hypotheses(readings: Readings, kinds: Iterable[str]) -> tuple[Problem, 
     """All hypotheses that can count, the most probable first; their shapes as fine as needed."""
     problem = problem_of(readings, hypothesis_columns(readings, kinds))
     for _ in range(_ROUNDS):
-        counts = _worth_dividing(problem, hypotheses_of(problem, _COARSE))
+        counts = _worth_dividing(problem, *_weighed(problem))
         if not counts:
             break
         finer = [one for k in counts for one in problem.columns[k].divided(readings)]
@@ -118,43 +153,71 @@ def best_hypotheses(readings: Readings, kinds: Iterable[str]) -> tuple[Problem, 
     return problem, hypotheses_of(problem)
 
 
-def _worth_dividing(problem: Problem, cells: list[Cell]) -> list[int]:
+def _worth_dividing(
+    problem: Problem, cells: list[Cell], alone: Float[np.ndarray, " column"]
+) -> list[int]:
     """Columns whose shape counts: of every kind the best, and all that are probable."""
-    weight = np.exp([cell.log_evidence - cells[0].log_evidence for cell in cells])
     mass = np.zeros(len(problem.columns))
+    for cell in cells:
+        mass[list(cell.columns)] += np.exp(cell.log_evidence - cells[0].log_evidence)
     best: dict[str, int] = {}
-    for cell, w in zip(cells, weight / weight.sum(), strict=True):
-        mass[list(cell.columns)] += w
-        for k in cell.columns:
+    for k in np.argsort(-alone).tolist():
+        if alone[k] > cells[0].log_evidence - _COARSE:
             best.setdefault(problem.columns[k].kind, k)
-    counts = {*best.values(), *np.flatnonzero(mass > _COUNTS).tolist()}
-    return [k for k in sorted(counts) if problem.columns[k].shape]
+    whole = sum(np.exp(cell.log_evidence - cells[0].log_evidence) for cell in cells)
+    counts = {*best.values(), *np.flatnonzero(mass > _COUNTS * whole).tolist()}
+    return [k for k in sorted(counts) if problem.columns[k].widths]
 
 
-def hypotheses_of(problem: Problem, reach: float = 0.0) -> list[Cell]:
-    """The hypotheses of a problem that can count, the most probable first.
+def hypotheses_of(problem: Problem) -> list[Cell]:
+    """The hypotheses of a problem that can count, the most probable first."""
+    return _weighed(problem)[0]
 
-    And single laws down to a `reach` below, in nats: with a finer shape they may count.
-    """
-    all_sizes, few_sizes = _sizes(1), _sizes(2)
-    grid = [_Normal.of(problem, sizes) for sizes in itertools.product(all_sizes, all_sizes)]
-    fewer = (len(priors.REMAINDERS) - 1) / (len(few_sizes) - 2)  # of pairs: coarser, as likely
-    cells, best = [], -np.inf
+
+def _weighed(problem: Problem) -> tuple[list[Cell], Float[np.ndarray, " column"]]:
+    """Hypotheses that can count, and ln evidence of every column alone with its best remainders."""
+    few, each = _sizes(2), _sizes(1)
+    own, *others = problem.blocks
+    grid = [_Normal.of(problem.columns, own, s) for s in itertools.product(each, each)]
+    higher = _of_harmonics(problem.columns, others)
+    cells: list[Cell] = []
+    alone, best = np.full(len(problem.columns), -np.inf), -np.inf
+    of_higher = _Diagonals.of(higher)
     for normal in grid:
-        some = [Cell(normal.base + np.log(priors.SIZES[0]), (), normal.sizes)]
-        some += normal.singles(np.log(priors.SIZES[1]), best - max(_LEAST, reach))
-        best = max(best, *(cell.log_evidence for cell in some))
-        cells += some
+        base, value = of_higher.singles(normal)
+        alone = np.maximum(alone, np.max(value, axis=0, initial=-np.inf))
+        best = max(best, np.max(base), np.max(value, initial=-np.inf))
+        sizes = [normal.sizes if one is None else (*normal.sizes, *one.sizes) for one in higher]
+        cells += [Cell(float(v), (), s) for v, s in zip(base, sizes, strict=True)]
+        for one, k in np.argwhere(value > best - _LEAST).tolist():
+            cells.append(Cell(float(value[one, k]), (k,), sizes[one]))
+    bounds = [None if other is None else other.most() for other in higher]
     for normal in grid:
-        if not {*normal.sizes} <= {*few_sizes}:
+        if not {*normal.sizes} <= {*few}:
             continue
-        coarser = np.log(fewer) * np.count_nonzero(normal.sizes)
-        some = normal.pairs(problem, np.log(priors.SIZES[2]) + coarser, best - _LEAST)
-        best = max([best, *(cell.log_evidence for cell in some)])
-        cells += some
-    least = best - max(_LEAST, reach)
-    kept = [cell for cell in cells if cell.log_evidence > least]
-    return sorted(kept, key=lambda cell: -cell.log_evidence)
+        most = normal.most() + np.log(np.outer(normal.prior, normal.prior)) + _PRIOR_OF_PAIRS
+        most = np.where(normal.apart(), most, -np.inf)
+        for other, bound in zip(higher, bounds, strict=True):
+            places = np.nonzero((most if bound is None else most + bound) > best - _LEAST)
+            if places[0].size:
+                whole = normal if other is None else normal.with_rows_of(other)
+                some = whole.pairs(*places, best - _LEAST)
+                best = max([best, *(cell.log_evidence for cell in some)])
+                cells += some
+    kept = [cell for cell in cells if cell.log_evidence > best - _LEAST]
+    return sorted(kept, key=lambda cell: -cell.log_evidence), alone
+
+
+def _of_harmonics(columns: list[Column], blocks: list[Block]) -> "list[_Normal | None]":
+    """What counts of all other harmonics, for remainders of every combination of sizes."""
+    if not blocks:
+        return [None]
+    sizes = [(size,) for size in priors.HARMONIC_REMAINDERS.tolist()]
+    each = [[_Normal.of(columns, block, size) for size in sizes] for block in blocks]
+    return [
+        functools.reduce(lambda one, other: one.with_rows_of(other), some)
+        for some in itertools.product(*each)
+    ]
 
 
 def _sizes(every: int) -> list[float]:
@@ -162,37 +225,49 @@ def _sizes(every: int) -> list[float]:
 
 
 def _log_prior(sizes: Sizes) -> float:
-    some = (1 - priors.NO_REMAINDER) / len(priors.REMAINDERS)
-    return float(sum(np.log(priors.NO_REMAINDER if s == 0 else some) for s in sizes))
+    of_harmonic = len(sizes) == 1
+    some = len(priors.HARMONIC_REMAINDERS) - 1 if of_harmonic else len(priors.REMAINDERS)
+    share = (1 - priors.NO_REMAINDER) / some
+    return float(sum(np.log(priors.NO_REMAINDER if s == 0 else share) for s in sizes))
 
 
 class _Normal(NamedTuple):
-    """What counts of all columns for one pair of sizes."""
+    """What counts of all columns for remainders of some sizes."""
 
     sizes: Sizes
     base: float  # ln p of the rows without any law, times the prior of the sizes
     b: Float[np.ndarray, " column"]
     gram: Float[np.ndarray, "column column"]
+    kind: np.ndarray  # of every column
     sign: Int[np.ndarray, " column"]
     std: Float[np.ndarray, " column"]  # NaN: of any size
     prior: Float[np.ndarray, " column"]  # probability among single laws
 
     @classmethod
-    def of(cls, problem: Problem, sizes: Sizes) -> "_Normal":
+    def of(cls, columns: list[Column], block: Block, sizes: Sizes) -> "_Normal":
         """By one Cholesky factor."""
-        root = problem.triangle * np.sqrt(problem.variances(sizes))
+        root = block.triangle * np.sqrt(block.variances(sizes))
         factor = cholesky(root @ root.T + np.eye(len(root)), lower=True)
-        white = solve_triangular(factor, problem.along, lower=True)
-        gram = problem.across + white.T @ white
+        white = solve_triangular(factor, block.along, lower=True)
+        gram = block.across + white.T @ white
         base = -0.5 * float(gram[-1, -1]) - float(np.sum(np.log(np.diag(factor))))
-        kinds = dict.fromkeys(column.kind for column in problem.columns)
-        odds = {kind: odds_of(kind) for kind in kinds}
+        kinds = [column.kind for column in columns]
+        odds = {kind: odds_of(kind) for kind in dict.fromkeys(kinds)}
         every = sum(odds.values())
         return cls(
-            *(sizes, base + _log_prior(sizes), gram[:-1, -1], gram[:-1, :-1]),
-            np.array([column.sign for column in problem.columns]),
-            np.array([np.nan if c.std is None else c.std for c in problem.columns]),
-            np.array([odds[c.kind] / every * c.fraction for c in problem.columns]),
+            *(sizes, base + _log_prior(sizes), gram[:-1, -1], gram[:-1, :-1], np.array(kinds)),
+            np.array([column.sign for column in columns]),
+            np.array([np.nan if c.std is None else c.std for c in columns]),
+            np.array([odds[c.kind] / every * c.fraction for c in columns]),
+        )
+
+    def with_rows_of(self, other: "_Normal") -> "_Normal":
+        """By the rows of both."""
+        return self._replace(
+            sizes=(*self.sizes, *other.sizes),
+            base=self.base + other.base,
+            b=self.b + other.b,
+            gram=self.gram + other.gram,
         )
 
     def strengths(self, some: Int[np.ndarray, " some"], every: int) -> np.ndarray:
@@ -202,38 +277,47 @@ class _Normal(NamedTuple):
         std = self.std[some, None]
         return np.where(np.isfinite(std), std, tried)
 
-    def singles(self, log_prior: float, least: float) -> list[Cell]:
-        """One law each, of those that are as probable as `least`."""
-        every = np.arange(len(self.b))
-        narrow = self.strengths(every, 1) ** -2.0
-        precision = np.diag(self.gram)[:, None] + narrow
-        mean = self.b[:, None] / precision
-        value = 0.5 * self.b[:, None] * mean - 0.5 * np.log(precision / narrow)
-        value = value + _log_half(self.sign[:, None], mean * np.sqrt(precision))
-        value = logsumexp(value, axis=1) - np.log(value.shape[1]) + np.log(self.prior)
-        value = value + self.base + log_prior
-        kept = np.flatnonzero(value > least)
-        return [Cell(float(value[k]), (int(k),), self.sizes) for k in kept]
-
-    def pairs(self, problem: Problem, log_prior: float, least: float) -> list[Cell]:
-        """Pairs that may be as probable as `least`."""
-        s = np.diag(self.gram)
-        across = np.outer(s, s) - self.gram**2
-        across = np.maximum(across, 1e-9 * np.outer(s, s))
+    def most(self) -> Float[np.ndarray, "column column"]:
+        """What the rows of a pair can gain at most, with the base: no strength is larger than 1."""
+        s = np.diag(self.gram) + 1.0
+        across = np.maximum(np.outer(s, s) - self.gram**2, 1e-9 * np.outer(s, s))
         square = np.outer(self.b**2, s)
         square = square + square.T - 2 * self.gram * np.outer(self.b, self.b)
-        most = 0.5 * square / across + np.log(np.outer(self.prior, self.prior)) + 3 * np.log(2)
-        kinds = np.array([column.kind for column in problem.columns])
-        chosen = np.triu(kinds[:, None] != kinds[None]) & (most + self.base + log_prior > least)
-        i, j = np.nonzero(chosen)
+        return 0.5 * square / across + self.base
+
+    def apart(self) -> np.ndarray:
+        """Which columns can be a pair, each pair once."""
+        other = (self.kind[:, None] != self.kind[None]) | (self.kind == ForceHarmonics.kind)
+        return np.triu(other, 1)
+
+    def pairs(self, i: np.ndarray, j: np.ndarray, least: float) -> list[Cell]:
+        """Of some pairs those that are as probable as `least`."""
+        likely = self._likely(i, j) > least
+        i, j = i[likely], j[likely]
         if not i.size:
             return []
-        values = []
-        for begin in range(0, len(i), 4096):
-            values.append(self._pair(i[begin : begin + 4096], j[begin : begin + 4096]))
-        value = np.concatenate(values) + self.base + log_prior
+        blocks = range(0, len(i), 4096)
+        values = [self._pair(i[begin : begin + 4096], j[begin : begin + 4096]) for begin in blocks]
+        # Sizes of remainders are coarser than those of single laws, and as likely together.
+        fewer = (len(priors.REMAINDERS) - 1) / (len(_sizes(2)) - 2)
+        prior = np.log(priors.SIZES[2]) + np.log(fewer) * np.count_nonzero(self.sizes[:2])
+        value = np.concatenate(values) + self.base + prior
         keep = np.flatnonzero(value > least)
         return [Cell(float(value[k]), (int(i[k]), int(j[k])), self.sizes) for k in keep]
+
+    def _likely(self, i: np.ndarray, j: np.ndarray) -> np.ndarray:
+        """What pairs may reach: with the strengths' best prior, a half nat of slack for each.
+
+        A pair of which one is not seen reads as the other alone, and is left out.
+        """
+        s, t, b, c, g = *np.diag(self.gram)[[i, j]], *self.b[[i, j]], self.gram[i, j]
+        s, t = s + 1.0, t + 1.0
+        both = (b * b * t + c * c * s - 2 * g * b * c) / np.maximum(s * t - g * g, 1e-9 * s * t)
+        first, second = both - c * c / t, both - b * b / s  # gain of one beside the other
+        occam = np.log(np.maximum(first, 1.0)) + np.log(np.maximum(second, 1.0))
+        prior = np.log(self.prior[i] * self.prior[j]) + _PRIOR_OF_PAIRS
+        value = 0.5 * both - 0.5 * occam + self.base + prior + 1.0
+        return np.where(np.minimum(first, second) > priors.VISIBLE**2, value, -np.inf)
 
     def _pair(self, i: np.ndarray, j: np.ndarray) -> np.ndarray:
         first = self.strengths(i, 2)[:, :, None] ** -2.0
@@ -252,6 +336,39 @@ class _Normal(NamedTuple):
         return value + np.log(2 * self.prior[i] * self.prior[j])
 
 
+class _Diagonals(NamedTuple):
+    """What counts of other harmonics for single laws, for all combinations of sizes at once."""
+
+    base: Float[np.ndarray, " combination"]
+    b: Float[np.ndarray, "combination column"]
+    square: Float[np.ndarray, "combination column"]
+
+    @classmethod
+    def of(cls, higher: list[_Normal | None]) -> "_Diagonals":
+        """Zeros where no other harmonic was recorded."""
+        some = [one for one in higher if one is not None]
+        if not some:
+            return cls(np.zeros(1), np.zeros((1, 1)), np.zeros((1, 1)))
+        squares = np.array([np.diag(one.gram) for one in some])
+        return cls(np.array([one.base for one in some]), np.array([o.b for o in some]), squares)
+
+    def singles(self, own: _Normal) -> tuple[np.ndarray, np.ndarray]:
+        """ln evidence without a law, and of every law alone: (combination,), (combination, column).
+
+        By the fundamentals' rows too.
+        """
+        base = own.base + self.base
+        narrow = own.strengths(np.arange(len(own.b)), 1) ** -2.0
+        b = (own.b + self.b)[..., None]
+        precision = (np.diag(own.gram) + self.square)[..., None] + narrow
+        mean = b / precision
+        value = 0.5 * b * mean - 0.5 * np.log(precision / narrow)
+        value = value + _log_half(own.sign[:, None], mean * np.sqrt(precision))
+        value = logsumexp(value, axis=2) - np.log(value.shape[2]) + np.log(own.prior)
+        value = value + base[:, None] + np.log(priors.SIZES[1])
+        return base + np.log(priors.SIZES[0]), value
+
+
 def _log_half(sign: np.ndarray, standardised: np.ndarray) -> np.ndarray:
     """ln of what a law of one sign gains: the posterior's part of that sign, over the prior's."""
     return np.where(sign == 0, 0.0, np.log(2) + log_ndtr(sign * standardised))
@@ -260,7 +377,7 @@ def _log_half(sign: np.ndarray, standardised: np.ndarray) -> np.ndarray:
 class Solved(NamedTuple):
     """Most likely strengths of a hypothesis' laws and its remainders, with their covariance."""
 
-    mean: Float[np.ndarray, " unknown"]  # strengths, then both remainders' functions
+    mean: Float[np.ndarray, " unknown"]  # strengths, then the remainders' functions, part by part
     covariance: Float[np.ndarray, "unknown unknown"]
     misfit: float  # root-mean-square of what is left of the rows
     linear: tuple[float, float]  # errors of the natural frequency and damping ratio, in their 1σ
@@ -268,17 +385,22 @@ class Solved(NamedTuple):
 
 def solved(problem: Problem, cell: Cell) -> Solved:
     """The unknowns of a hypothesis; a law's strength has no prior but what an instrument's has."""
-    n, laws = problem.n_errors, list(cell.columns)
-    design = np.hstack([problem.laws[:, laws], problem.design])
-    wide = np.ones(len(laws))  # what is seen at all is far smaller
-    root = np.concatenate([wide, np.sqrt(problem.variances(cell.sizes))])
-    stacked = np.vstack([design * root, np.eye(len(root))])
-    q, r = np.linalg.qr(stacked)
+    laws, blocks = list(cell.columns), problem.blocks
+    design = block_diag(*(block.design for block in blocks))
+    design = np.hstack([np.vstack([block.laws[:, laws] for block in blocks]), design])
+    rows = np.concatenate([block.rows for block in blocks])
+    variances = [np.ones(len(laws))]  # what is seen at all is far smaller
+    kept, first = [np.ones(len(laws), bool)], 2
+    for place, block in enumerate(blocks):
+        sizes = cell.sizes[:first] if place == 0 else cell.sizes[first + place - 1 :][:1]
+        variances.append(block.variances(sizes))
+        kept.append(np.repeat([False, True], [block.groups[0], sum(block.groups[1:])]))
+    root, remain = np.sqrt(np.concatenate(variances)), np.concatenate(kept)
+    q, r = np.linalg.qr(np.vstack([design * root, np.eye(len(root))]))
     inverse = root[:, None] * solve_triangular(r, np.eye(len(root)))
-    mean = inverse @ (q[: len(problem.readings.rows)].T @ problem.readings.rows)
-    left = problem.readings.rows - design @ mean
-    misfit = float(np.sqrt(np.mean(left**2)))
-    kept = np.r_[: len(laws), len(laws) + n : len(root)]
+    mean = inverse @ (q[: len(rows)].T @ rows)
+    misfit = float(np.sqrt(np.mean((rows - design @ mean) ** 2)))
     # The first error is that of the modal mass.
     linear = float(mean[len(laws) + 1]), float(mean[len(laws) + 2])
-    return Solved(mean[kept], (inverse @ inverse.T)[np.ix_(kept, kept)], misfit, linear)
+    covariance = (inverse @ inverse.T)[np.ix_(remain, remain)]
+    return Solved(mean[remain], covariance, misfit, linear)

@@ -1,6 +1,6 @@
 """The answer by parts: laws that change stiffness and damping, their fraction, what is left."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -11,10 +11,9 @@ from snrmjax.diagnose.naming.columns import is_instrument, parameters_of
 from snrmjax.diagnose.naming.evidence import Cell, Problem, Solved, solved
 from snrmjax.model.library.free_laws import DisplacementDampingLaw, StiffnessLaw
 
-PARTS = ("stiffness", "damping")
 DRAWN = {"stiffness": StiffnessLaw.kind, "damping": DisplacementDampingLaw.kind}
 """The law that a remainder of a part is."""
-_CELLS = 150  # most probable hypotheses whose strengths are solved for
+_CELLS = 100  # most probable hypotheses whose strengths are solved for
 _DRAWS = 500  # of fractions
 _POINTS = 60  # of a drawn remainder
 
@@ -33,7 +32,7 @@ class Remainder(NamedTuple):
     """What is left of a part: a curve of amplitude."""
 
     velocity: Float[np.ndarray, " point"]  # m/s, of the mode at its natural frequency
-    value: Float[np.ndarray, " point"]  # relative, of ω₀² or of 2ω₀²
+    value: Float[np.ndarray, " point"]  # relative, of ω₀² or of 2ω₀²; of a harmonic in m/s
     laws: Float[np.ndarray, " point"]  # what the laws add, alike
     std: Float[np.ndarray, " point"]
     state_velocity: Float[np.ndarray, " state"]  # m/s, alike
@@ -104,11 +103,11 @@ def naming_of(problem: Problem, cells: list[Cell]) -> Naming:
     reads = [_read(problem, cell, float(w)) for cell, w in zip(cells, weight, strict=True)]
     answers: dict[Laws, float] = {}
     for one in reads:
-        drawn = (DRAWN[part] for part in PARTS if one.left[part])
+        drawn = (kind for part, kind in DRAWN.items() if one.left[part])
         laws = tuple(sorted({*drawn, *(law for part in one.laws.values() for law in part)}))
         answers[laws] = answers.get(laws, 0.0) + one.weight
     answers = dict(sorted(answers.items(), key=lambda pair: -pair[1]))
-    classes = {part: _classes(reads, part) for part in (*PARTS, "instrument")}
+    classes = {part: _classes(reads, part) for part in (*problem.parts, "instrument")}
     wanted = {kind for effects, _, _ in classes.values() for kind in effects}
     with_all = [one for one in reads if wanted <= {k for some in one.laws.values() for k in some}]
     best = max(with_all or reads, key=lambda one: one.weight)
@@ -136,21 +135,57 @@ def _parameters(problem: Problem, one: _Read, wanted: set[str]) -> dict[str, Str
     return found
 
 
-def _changes(problem: Problem, cell: Cell, solution: Solved, part: str) -> tuple[np.ndarray, ...]:
-    """Of a part at every state: changes by law and by the remainder's functions, and their mean."""
-    k = len(cell.columns)
-    take = np.real if part == "stiffness" else np.imag
-    over = 1.0 if part == "stiffness" else problem.readings.relative_frequency
-    changes = [take(problem.columns[c].change) / over for c in cell.columns]
-    laws = np.array(changes).reshape(k, len(problem.functions)).T
-    return laws, problem.functions, solution.mean[:k], solution.mean[_rest(problem, cell, part)]
+class _Changes(NamedTuple):
+    """Changes of a part at every state, over ω₀²; of another harmonic they are complex."""
+
+    of_law: np.ndarray  # (state, law)
+    functions: np.ndarray  # (state, function), of the remainder
+    strength: np.ndarray
+    rest: np.ndarray  # of the remainder's functions
+    covariance: np.ndarray  # of these
+
+    @property
+    def left(self) -> np.ndarray:
+        """The remainder."""
+        return self.functions @ self.rest
+
+    @property
+    def left_std(self) -> np.ndarray:
+        """1σ of the remainder."""
+        return _std_along(self.functions, self.covariance)
+
+
+def _std_along(functions: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    return np.sqrt(np.einsum("si,ij,sj->s", functions, covariance, functions.conj()).real)
+
+
+def _changes(problem: Problem, cell: Cell, solution: Solved, part: str) -> _Changes:
+    readings, k = problem.readings, len(cell.columns)
+    columns = [problem.columns[c] for c in cell.columns]
+    functions = problem.functions
+    if part == "stiffness":
+        changes = [column.change.real for column in columns]
+    elif part == "damping":
+        changes = [column.change.imag / readings.relative_frequency for column in columns]
+    else:
+        changes = [column.higher[problem.parts.index(part) - 2] for column in columns]
+        functions = _both_parts(functions)
+    some = _rest(problem, cell, part)
+    laws = np.array(changes).reshape(k, len(functions)).T
+    covariance = solution.covariance[some, some]
+    return _Changes(laws, functions, solution.mean[:k], solution.mean[some], covariance)
+
+
+def _both_parts(functions: np.ndarray) -> np.ndarray:
+    """Functions of the real and of the imaginary part."""
+    return np.hstack([functions, 1j * functions])
 
 
 def _rest(problem: Problem, cell: Cell, part: str) -> slice:
     """Where the remainder of a part stands among a hypothesis' unknowns."""
-    n = problem.functions.shape[1]
-    first = len(cell.columns) + PARTS.index(part) * n
-    return slice(first, first + n)
+    n, k = problem.functions.shape[1], problem.parts.index(part)
+    first = len(cell.columns) + n * (k if k < 2 else 2 * k - 2)
+    return slice(first, first + (n if k < 2 else 2 * n))
 
 
 def _read(problem: Problem, cell: Cell, weight: float) -> _Read:
@@ -160,37 +195,50 @@ def _read(problem: Problem, cell: Cell, weight: float) -> _Read:
     seen = np.abs(solution.mean[:k]) > priors.VISIBLE * std
     laws: dict[str, Laws] = {"instrument": ()}
     left = {"instrument": False}
-    small = priors.BELOW_BANDWIDTH * problem.readings.relative_damping
-    for part in PARTS:
-        of_law, functions, strength, rest = _changes(problem, cell, solution, part)
-        remainder = functions @ rest
-        some = _rest(problem, cell, part)
-        covariance = solution.covariance[some, some]
-        size = np.sqrt(np.einsum("si,ij,sj->s", functions, covariance, functions))
-        whole = _size(of_law @ strength + remainder)
-        seen_left = np.max(np.abs(remainder) / (size + 1e-300)) > priors.VISIBLE + 1
-        left[part] = bool(seen_left and _size(remainder / small) > 1)
+    for part in problem.parts:
+        small, visible = _smallest(problem, part)
+        change = _changes(problem, cell, solution, part)
+        rest, each = change.left, change.of_law * change.strength
+        whole = _size(np.sum(each, axis=1) + rest)
+        seen_left = np.max(np.abs(rest) / (change.left_std + 1e-300)) > priors.VISIBLE + 1
+        left[part] = bool(seen_left and np.max(np.abs(rest) / small) > 1)
         found = []
         for place, column in enumerate(cell.columns):
-            kind, own = problem.columns[column].kind, of_law[:, place] * strength[place]
-            matters = _size(own) > priors.NEGLIGIBLE * whole and _size(own / small) > 1
-            if not (seen[place] and matters):
-                continue
-            found.append(kind)
+            own = each[:, place]
+            matters = _size(own) > priors.NEGLIGIBLE * whole and np.max(np.abs(own) / small) > 1
+            if seen[place] and matters and visible(own):
+                found.append(problem.columns[column].kind)
         laws[part] = tuple(sorted(kind for kind in found if not is_instrument(kind)))
+        if part.startswith("harmonic"):  # an exciter's are what it shows
+            laws[part] = tuple(sorted(found))
     laws["instrument"] = tuple(
         sorted(
-            problem.columns[c].kind
-            for place, c in enumerate(cell.columns)
-            if seen[place] and is_instrument(problem.columns[c].kind)
+            {
+                problem.columns[c].kind
+                for place, c in enumerate(cell.columns)
+                if seen[place] and is_instrument(problem.columns[c].kind)
+            }
         )
     )
     return _Read(weight, cell, solution, laws, left)
 
 
+def _smallest(problem: Problem, part: str) -> tuple[np.ndarray, Callable[[np.ndarray], bool]]:
+    """Changes that are no finding at every state, and whether rows show a change."""
+    if part in DRAWN:
+        return priors.BELOW_BANDWIDTH * problem.readings.relative_damping, lambda _: True
+    one = problem.readings.harmonics[problem.parts.index(part) - 2]
+    unit = problem.readings.natural_frequency**2
+
+    def shown(change: np.ndarray) -> bool:
+        return bool(np.linalg.norm(one.whitened(unit * change)) > priors.VISIBLE + 1)
+
+    return np.full(len(one.weight), 1e-12), shown
+
+
 def _size(values: np.ndarray) -> float:
     """How much a curve changes over the states, a constant included."""
-    return float(np.sqrt(np.mean(values**2)))
+    return float(np.sqrt(np.mean(np.abs(values) ** 2)))
 
 
 def _part(
@@ -269,16 +317,16 @@ def _explained(
     fractions = []
     drawn, counts = np.unique(rng.choice(len(reads), _DRAWS, p=weights), return_counts=True)
     for one, times in zip([reads[k] for k in drawn], counts.tolist(), strict=True):
-        laws, functions, _, _ = _changes(problem, one.cell, one.solved, part)
+        change = _changes(problem, one.cell, one.solved, part)
         draws = rng.multivariate_normal(
             one.solved.mean, one.solved.covariance, size=times, method="eigh"
         )
         n_laws = len(one.cell.columns)
         mine = np.array([problem.columns[c].kind in named for c in one.cell.columns])
-        law = (draws[:, :n_laws] * mine) @ laws.T
-        other = (draws[:, :n_laws] * ~mine) @ laws.T
-        rest = draws[:, _rest(problem, one.cell, part)] @ functions.T + other
-        spread = _size_of if _is_flat(law) else _std_of
+        law = (draws[:, :n_laws] * mine) @ change.of_law.T
+        other = (draws[:, :n_laws] * ~mine) @ change.of_law.T
+        rest = draws[:, _rest(problem, one.cell, part)] @ change.functions.T + other
+        spread = _size_of if part not in DRAWN or _is_flat(law) else _std_of
         fractions.append(1 - spread(rest) / np.maximum(spread(law + rest), 1e-300))
     every = np.clip(np.concatenate(fractions), 0.0, 1.0)
     return Explained(float(np.median(every)), *np.quantile(every, [0.025, 0.975]).tolist())
@@ -294,29 +342,38 @@ def _std_of(curves: np.ndarray) -> np.ndarray:
 
 
 def _size_of(curves: np.ndarray) -> np.ndarray:
-    return np.sqrt(np.mean(curves**2, axis=1))
+    return np.sqrt(np.mean(np.abs(curves) ** 2, axis=1))
 
 
 def _remainder(problem: Problem, reads: list[_Read], part: str, best: _Read) -> Remainder:
     readings = problem.readings
     x = np.geomspace(np.min(readings.relative_amplitude), 1.0, _POINTS)
-    functions, some = problem.remainders(x), _rest(problem, best.cell, part)
-    unit = 1.0 if part == "stiffness" else 0.5
-    value = unit * functions @ best.solved.mean[some]
-    covariance = best.solved.covariance[some, some]
-    std = unit * np.sqrt(np.einsum("pi,ij,pj->p", functions, covariance, functions))
-    at_states = unit * problem.functions @ best.solved.mean[some]
-    probability = sum(one.weight for one in reads if one.left[part])
-    velocity = x * np.max(readings.amplitude) * readings.natural_frequency
-    of_law, _, strength, _ = _changes(problem, best.cell, best.solved, part)
+    natural, velocity = readings.natural_frequency, np.max(readings.amplitude)
+    velocity = x * velocity * natural
+    change = _changes(problem, best.cell, best.solved, part)
+    functions = problem.remainders(x)
     order = np.argsort(readings.relative_amplitude)
-    laws = unit * np.interp(x, readings.relative_amplitude[order], (of_law @ strength)[order])
-    natural, beyond = readings.natural_frequency, readings.beyond
-    change = np.real(beyond) / natural**2
-    if part == "damping":
-        change = np.imag(beyond) / (2 * natural * readings.frequency)
+    at_states = change.of_law @ change.strength
+    laws = np.interp(x, readings.relative_amplitude[order], at_states[order])
+    if part in DRAWN:
+        unit = unit_of_state = 1.0 if part == "stiffness" else 0.5
+        beyond = np.real(readings.beyond) / natural**2
+        if part == "damping":
+            beyond = np.imag(readings.beyond) / (2 * natural * readings.frequency)
+        std = _std_along(functions, change.covariance)
+        value = functions @ change.rest
+    else:  # sizes, of the velocity at the sensor
+        functions = _both_parts(functions)
+        one = readings.harmonics[problem.parts.index(part) - 2]
+        unit = velocity * one.order / (one.order**2 - 1)
+        unit_of_state = readings.amplitude * natural * one.order / (one.order**2 - 1)
+        beyond = np.where(one.weight > 0, np.abs(one.beyond) / natural**2, np.nan) * unit_of_state
+        std = _std_along(functions, change.covariance)
+        value = np.abs(laws + functions @ change.rest) - np.abs(laws)
+        laws = np.abs(laws)
+    probability = sum(one.weight for one in reads if one.left[part])
     return Remainder(
-        *(velocity, value, laws, std, readings.amplitude * natural, change),
-        rms=_size(at_states),
+        *(velocity, unit * value, unit * laws, unit * std, readings.amplitude * natural, beyond),
+        rms=_size(unit_of_state * change.left),
         significant=probability > 0.5,
     )

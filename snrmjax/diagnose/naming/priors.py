@@ -26,6 +26,14 @@ FLOOR = 1e-3
 """Relative error of a state's amplitude and phase that is never undercut: what is smooth along a
 sweep and in no model. Half and twice as much give the same answers on measured structures."""
 
+HARMONIC = 0.02
+"""Relative error of a reading of another harmonic: a law's force is taken at the fundamental alone,
+whose other harmonics change it by about as much."""
+
+HARMONIC_REMAINDERS = np.array([0.0, 1e-4, 1e-3, 1e-2, 1e-1])
+"""Sizes of what laws leave of another harmonic of the force, over ω₀² and the amplitude: zero with
+`NO_REMAINDER`, the others as likely."""
+
 INSTRUMENT_PHASE = 0.1
 """rad, 1σ of a phase that all records share where it is a hypothesis: 6°."""
 

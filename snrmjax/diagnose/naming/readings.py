@@ -20,11 +20,40 @@ from snrmjax.identify.test_model.priors import OFF_RESONANCE
 from snrmjax.identify.test_model.states import TestStates
 from snrmjax.model.effect_metadata import MotionScales
 
-ModelStiffness = Callable[
-    [Complex[np.ndarray, " state"], Float[np.ndarray, " state"]], Complex[np.ndarray, "model state"]
-]
-"""Z of the model for velocities (m/s) and frequencies (rad/s) of the mode alone, in 1/s²: first of
-the model as given, then with each of its stated nonlinear parameters moved by its 1σ."""
+
+class ModelMotion(NamedTuple):
+    """What a model has at a motion: as given, then with each stated parameter moved by its 1σ."""
+
+    dynamic_stiffness: Complex[np.ndarray, "model state"]  # Z, 1/s²
+    harmonics: Complex[np.ndarray, "model state order"]  # of the velocity, m/s, as recorded
+
+
+MotionOfModel = Callable[[Complex[np.ndarray, " state"], Float[np.ndarray, " state"]], ModelMotion]
+"""That of velocities (m/s) and frequencies (rad/s) of the mode alone."""
+
+
+class RecordedHarmonics(NamedTuple):
+    """Other harmonics that the reference sensor recorded."""
+
+    order: tuple[int, ...]
+    velocity: Complex[np.ndarray, "state order"]  # m/s
+    std: Float[np.ndarray, "state order"]  # 1σ of each part, m/s; NaN where not recorded
+    forced: Complex[np.ndarray, "state order"]  # m/s, of such a harmonic as large as the force
+
+
+class HarmonicReading(NamedTuple):
+    """A harmonic of the force that a motion x cos t needs beyond the model: cₕ/x, 1/s²."""
+
+    order: int
+    beyond: Complex[np.ndarray, " state"]
+    weight: Float[np.ndarray, " state"]  # 1 over the 1σ of each part; 0 where not recorded
+    forced: Complex[np.ndarray, " state"]  # by a harmonic of the exciter as large as the force
+    errors: Complex[np.ndarray, "error state"]  # of the model's parameters, by their own 1σ
+
+    def whitened(self, change: Complex[np.ndarray, "*several state"]) -> np.ndarray:
+        """Changes (1/s²) as the rows show them, (…, row)."""
+        parts = np.stack([np.real(change), np.imag(change)], axis=-1) * self.weight[:, None]
+        return parts.reshape(*parts.shape[:-2], 2 * len(self.weight))
 
 
 class LinearTest(NamedTuple):
@@ -36,6 +65,7 @@ class LinearTest(NamedTuple):
     damping_std: float
     mass_std: float  # relative
     shape: float  # of the mode at the sensor, kg^-1/2
+    side: float  # −1 where the sensor moves against the force, whose states are turned; else 1
     scales: MotionScales  # of the motions that were measured
 
 
@@ -54,6 +84,7 @@ class Readings(NamedTuple):
     rows: Float[np.ndarray, " row"]  # Z less that of the model, whitened
     errors: Float[np.ndarray, "row error"]  # of levels, modal mass, linear test: by their own 1σ
     posterior: TestPosterior
+    harmonics: tuple[HarmonicReading, ...] = ()
 
     @property
     def natural_frequency(self) -> float:
@@ -108,13 +139,19 @@ class Readings(NamedTuple):
 def readings_of(
     states: TestStates,
     order: Float[np.ndarray, " state"],
-    model: ModelStiffness,
+    model: MotionOfModel,
     linear: LinearTest,
+    recorded: RecordedHarmonics | None = None,
+    *,
+    tempered: bool = True,
 ) -> Readings:
-    """The readings of a test's states, beyond a model."""
+    """The readings of a test's states, beyond a model.
+
+    `tempered`: neighbouring states that err alike count as fewer.
+    """
     # Curves may go with the forcing frequency too.
     states = states._replace(off_resonance_std=OFF_RESONANCE)
-    found = fit_test(states, compare_levels=False, tempered=True)
+    found = fit_test(states, compare_levels=False, tempered=tempered)
     balance = Balance(
         *(states, found.basis, found.places, found.units, found.weight),
         np.zeros((len(states.level), 0), complex),
@@ -125,7 +162,8 @@ def readings_of(
     std = np.sqrt((found.hyper.noise * states.errors) ** 2 + floor) / np.sqrt(found.share)
     root, _ = whitening(slopes, std, found.weight)
     # Records less the model's, by their straight line about the corrected motion.
-    known, *moved = model(now.velocity, omega)
+    motion = model(now.velocity, omega)
+    known, *moved = motion.dynamic_stiffness
     rows = now.z - known - np.sum(slopes * found.corrections, axis=1)
     rows = rows - 1j * now.z * found.mean[PHASE]
     of_gain = now.z if states.force_is_free else -now.z - now.slope
@@ -150,4 +188,38 @@ def readings_of(
         *(linear, now.velocity, omega, now.force, order, now.z, slope, root, rows, none, none),
         posterior=found,
     )
-    return bare._replace(rows=bare.whitened(rows), errors=bare.whitened(np.array(columns)).T)
+    higher = () if recorded is None else _higher(linear, states, now.velocity, motion, recorded)
+    return bare._replace(
+        rows=bare.whitened(rows), errors=bare.whitened(np.array(columns)).T, harmonics=higher
+    )
+
+
+def _higher(
+    linear: LinearTest,
+    states: TestStates,
+    velocity: Complex[np.ndarray, " state"],
+    motion: ModelMotion,
+    recorded: RecordedHarmonics,
+) -> tuple[HarmonicReading, ...]:
+    """Harmonics of the force by those of the motion, which the linear mode answers.
+
+    An error of a state's phase is one of time: it turns the fundamental alike.
+    """
+    omega, natural = states.frequency, linear.natural_frequency
+    mode = linear.side * velocity / (1j * omega * linear.shape)
+    found = []
+    for place, order in enumerate(recorded.order):
+        driven = order * omega
+        stiffness = natural**2 - driven**2 + 2j * linear.damping_ratio * natural * driven
+        turn = (np.abs(mode) / mode) ** order
+        unit = -stiffness / (1j * driven * linear.shape) * turn / np.abs(mode)
+        model, *moved = unit * motion.harmonics[:, :, place]
+        beyond = unit * recorded.velocity[:, place] - model
+        std = np.hypot(np.abs(unit) * recorded.std[:, place], priors.HARMONIC * np.abs(beyond))
+        there = np.isfinite(std) & (std > 0)
+        weight = np.where(there, 1 / np.where(there, std, 1.0), 0.0)
+        forced = unit * recorded.forced[:, place]
+        errors = np.array([one - model for one in moved]).reshape(-1, len(omega))
+        beyond = np.where(there, beyond, 0.0)
+        found.append(HarmonicReading(order, beyond, weight, forced, errors))
+    return tuple(found)

@@ -1,0 +1,315 @@
+"""What every kind of effect changes in the readings, to first order: the library's laws.
+
+Values are over ω₀² and functions of the amplitude over the largest one. Parameters that are not
+linear (a gap, an exponent) have a grid of values. Other harmonics are those of the force that the
+measured fundamental causes.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Complex
+
+from snrmjax.diagnose.naming import describing, priors
+from snrmjax.diagnose.naming.readings import HarmonicReading, Readings
+from snrmjax.model.library.damping import (
+    CubicDamping,
+    QuadraticDamping,
+    VanDerPolDamping,
+)
+from snrmjax.model.library.friction import (
+    CoulombFriction,
+    IwanMicroslip,
+    JenkinsSlider,
+)
+from snrmjax.model.library.internal_resonances import (
+    InternalResonanceOneToThree,
+    InternalResonanceOneToTwo,
+)
+from snrmjax.model.library.linear_changes import (
+    AddedMass,
+    FrequencyDrift,
+    LinearDampingChange,
+    LinearFrequencyShift,
+)
+from snrmjax.model.library.measurement_chain import (
+    CloseMode,
+    ForceGainError,
+    ForceHarmonics,
+    ForceOffsetError,
+    ModeShapeChange,
+    ResidualMode,
+    SensorGainError,
+    SensorPhaseError,
+)
+from snrmjax.model.library.stiffness import (
+    BilinearStiffness,
+    CubicStiffness,
+    GapStiffness,
+    OneSidedStop,
+    QuadraticStiffness,
+    QuinticStiffness,
+)
+
+_GAPS = np.linspace(0.05, 0.95, 19)  # over the largest amplitude
+_STIFFNESSES = np.log([0.1, 1.0, 10.0, 100.0])  # ln, of a stop, over ω₀²
+_QUADRATICS = np.log(
+    [0.003, 0.008, 0.02, 0.05, 0.12, 0.3]
+)  # ln, over ω₀² and the largest amplitude
+_BILINEARS = np.log([0.003, 0.01, 0.03, 0.1, 0.3])  # ln, over ω₀²
+_SLIPS = np.linspace(np.log(0.02), np.log(0.95), 28)  # ln, over the largest amplitude
+_EXPONENTS = np.linspace(1.1, 2.9, 10)
+_DETUNINGS = np.linspace(-0.04, 0.04, 9)
+_APART = np.array([-0.3, -0.1, -0.05, -0.02, 0.02, 0.05, 0.1, 0.3])  # of a close mode
+_DAMPINGS = np.log([0.5, 2.0])  # ln, of a further mode, over the mode's own
+
+
+class Law(NamedTuple):
+    """What one kind of effect changes."""
+
+    # Of the readings and a shape: the dynamic stiffness over ω₀².
+    change: Callable[..., Complex[np.ndarray, " state"]]
+    # Of the readings, one recorded harmonic and a shape: that harmonic of the force, alike.
+    higher: Callable[..., Complex[np.ndarray, " state"]] | None = None
+    axes: tuple[np.ndarray, ...] = ()  # values of the shape
+    choices: tuple[float, ...] = ()  # of a last number of the shape, that is not divided
+    sign: int = 0  # of the strength
+    std: float | None = None  # 1σ of the strength; None: any size
+    odds: float = 1.0  # over those of a law
+    of_instrument: bool = False
+    # Parameters of the effect by ω₀, the largest modal amplitude, strength and shape.
+    parameters: Callable[..., tuple[float, ...]] | None = None
+
+
+Change = Callable[..., np.ndarray]
+
+
+def _stiffness(power: int) -> Change:
+    return lambda r: r.relative_amplitude**power + 0j
+
+
+def _damping(power: int, frequency_power: int) -> Change:
+    """Of a force ∝ a^(power + 1) Ω^frequency_power."""
+    return lambda r: 1j * r.relative_amplitude**power * r.relative_frequency**frequency_power
+
+
+def _of_force(force: Callable[..., np.ndarray]) -> Change:
+    """Harmonics of a force by displacement, velocity over ω₀ and shape."""
+
+    def higher(r: Readings, one: HarmonicReading, *shape: float) -> np.ndarray:
+        omega = r.relative_frequency[:, None]
+        return describing.harmonic(
+            lambda q, slope: force(q, omega * slope, *shape), r.relative_amplitude, one.order
+        )
+
+    return higher
+
+
+def _slider(r: Readings, log_slip: float) -> np.ndarray:
+    lost, damping = describing.slider(r.relative_amplitude, np.exp(log_slip))
+    return lost + 1j * damping
+
+
+def _iwan(r: Readings, exponent: float) -> np.ndarray:
+    lost, damping = describing.masing(exponent)
+    return (lost + 1j * damping) * r.relative_amplitude ** (exponent - 1)
+
+
+def _quadratic(r: Readings, log_s: float) -> tuple[np.ndarray, np.ndarray]:
+    x, omega = r.relative_amplitude, r.relative_frequency
+    return describing.quadratic(x, omega, r.damping_ratio, np.exp(log_s))
+
+
+def _bilinear(r: Readings, log_k: float) -> tuple[np.ndarray, np.ndarray]:
+    """Of k|q|/2, by the mean −ka/π and the second harmonic 2ka/(3π) that it causes."""
+    k = np.exp(log_k)
+    twice = 2 * k / (3 * np.pi) * np.ones_like(r.dynamic_stiffness)
+    return -2 * (k / np.pi) ** 2 + twice**2 / (4 * r.relative_frequency**2 - 1), twice
+
+
+def _second_of(law: Callable[[Readings, float], tuple[np.ndarray, np.ndarray]]) -> Change:
+    """The second harmonic of an even law, of either side."""
+
+    def higher(r: Readings, one: HarmonicReading, log_s: float, side: float) -> np.ndarray:
+        return side * law(r, log_s)[1] * (one.order == 2)
+
+    return higher
+
+
+def _at_stop(r: Readings, one: HarmonicReading, width: float, log_k: float) -> np.ndarray:
+    mean = describing.mean_at_stop(r.relative_amplitude, width, np.exp(log_k))[:, None]
+    return describing.harmonic(
+        lambda q, _: np.maximum(q + mean - width, 0.0), r.relative_amplitude, one.order
+    )
+
+
+def _resonance(order: int) -> Change:
+    def change(r: Readings, detuning: float, log_times: float) -> np.ndarray:
+        ratio = np.exp(log_times) * max(r.damping_ratio, 1e-4)
+        return describing.resonant(
+            *(r.relative_amplitude, r.relative_frequency, order, detuning, ratio)
+        )
+
+    return change
+
+
+def _third_of_resonance(order: int) -> Change:
+    """n b qⁿ⁻¹ p, with p at n times the frequency, has its third harmonic n − 1 times as large."""
+    change = _resonance(order)
+
+    def higher(r: Readings, one: HarmonicReading, *shape: float) -> np.ndarray:
+        return (order - 1) * change(r, *shape) * (one.order == 3)
+
+    return higher
+
+
+def _close_mode(r: Readings, apart: float, log_times: float) -> np.ndarray:
+    """Of a mode at (1 + `apart`) ω₀ that the force drives too."""
+    own, omega = 1 + apart, r.relative_frequency
+    ratio = np.exp(log_times) * max(r.damping_ratio, 1e-4)
+    return _relative(r) ** 2 / (own**2 - omega**2 + 2j * ratio * own * omega)
+
+
+def _relative(r: Readings) -> np.ndarray:
+    return r.dynamic_stiffness / r.natural_frequency**2
+
+
+def _larger_motion(r: Readings) -> np.ndarray:
+    """Of motions that are recorded too large, by a fraction: the state stands for a smaller one."""
+    return -(r.dynamic_stiffness + r.slope) / r.natural_frequency**2
+
+
+def _forced(r: Readings, one: HarmonicReading, order: float) -> np.ndarray:
+    return one.forced / r.natural_frequency**2 * (one.order == order)
+
+
+_INSTRUMENT: dict[str, Any] = {"odds": priors.INSTRUMENT, "of_instrument": True}
+_OF_GAIN: dict[str, Any] = {"std": 1.0, **_INSTRUMENT}
+
+LAWS: dict[str, Law] = {
+    LinearFrequencyShift.kind: Law(
+        _stiffness(0), parameters=lambda _, b, s: (float(np.sqrt(max(1 + s, 0.0))) - 1,)
+    ),
+    CubicStiffness.kind: Law(
+        *(_stiffness(2), _of_force(lambda q, _: 4 / 3 * q**3)),
+        parameters=lambda w, b, s: (s * w**2 / (0.75 * b**2),),
+    ),
+    QuinticStiffness.kind: Law(
+        *(_stiffness(4), _of_force(lambda q, _: 1.6 * q**5)),
+        parameters=lambda w, b, s: (s * w**2 / (0.625 * b**4),),
+    ),
+    QuadraticStiffness.kind: Law(
+        *(lambda r, log_s, _: _quadratic(r, log_s)[0], _second_of(_quadratic)),
+        axes=(_QUADRATICS,),
+        choices=(1.0, -1.0),
+        sign=1,
+        parameters=lambda w, b, s, log_s, side: (
+            side * float(np.exp(log_s) * np.sqrt(max(s, 0.0))) * w**2 / b,
+        ),
+    ),
+    BilinearStiffness.kind: Law(
+        *(lambda r, log_k, _: _bilinear(r, log_k)[0], _second_of(_bilinear)),
+        axes=(_BILINEARS,),
+        choices=(1.0, -1.0),
+        sign=-1,
+        parameters=lambda w, b, s, log_k, side: (
+            side * float(np.exp(log_k) * np.sqrt(max(-s, 0.0))) * w**2,
+        ),
+    ),
+    GapStiffness.kind: Law(
+        lambda r, width: describing.gap(r.relative_amplitude, width) + 0j,
+        _of_force(lambda q, _, width: np.sign(q) * np.maximum(np.abs(q) - width, 0.0)),
+        (_GAPS,),
+        sign=1,
+        parameters=lambda w, b, s, width: (s * w**2, width * b),
+    ),
+    OneSidedStop.kind: Law(
+        lambda r, width, log_k: describing.stop(r.relative_amplitude, width, np.exp(log_k)) + 0j,
+        _at_stop,
+        (_GAPS[::3], _STIFFNESSES),
+        sign=1,
+        parameters=lambda w, b, s, width, _: (s * w**2, width * b),
+    ),
+    LinearDampingChange.kind: Law(_damping(0, 1), parameters=lambda w, b, s: (s / 2,)),
+    QuadraticDamping.kind: Law(
+        *(_damping(1, 2), _of_force(lambda _, v: 3 * np.pi / 8 * v * np.abs(v))),
+        sign=1,
+        parameters=lambda w, b, s: (s * 3 * np.pi / (8 * b),),
+    ),
+    CubicDamping.kind: Law(
+        *(_damping(2, 3), _of_force(lambda _, v: 4 / 3 * v**3)),
+        parameters=lambda w, b, s: (s / (0.75 * b**2 * w),),
+    ),
+    VanDerPolDamping.kind: Law(
+        *(_damping(2, 1), _of_force(lambda q, v: 4 * q**2 * v)),
+        parameters=lambda w, b, s: (4 * s * w / b**2,),
+    ),
+    CoulombFriction.kind: Law(
+        *(_damping(-1, 0), _of_force(lambda _, v: np.pi / 4 * np.sign(v))),
+        sign=1,
+        parameters=lambda w, b, s: (s * w**2 * np.pi * b / 4,),
+    ),
+    JenkinsSlider.kind: Law(
+        _slider,
+        _of_force(lambda q, v, log_slip: describing.slipping(q, v, np.exp(log_slip))),
+        (_SLIPS,),
+        sign=1,
+        parameters=lambda w, b, s, log_slip: (s * w**2, float(np.exp(log_slip)) * b),
+    ),
+    IwanMicroslip.kind: Law(
+        *(_iwan, _of_force(describing.microslip), (_EXPONENTS,)),
+        sign=1,
+        parameters=lambda w, b, s, p: (s * w**2 / b ** (p - 1), p),
+    ),
+    InternalResonanceOneToTwo.kind: Law(
+        *(_resonance(2), _third_of_resonance(2), (_DETUNINGS, _DAMPINGS)),
+        sign=1,
+        odds=priors.RESONANCE,
+    ),
+    InternalResonanceOneToThree.kind: Law(
+        *(_resonance(3), _third_of_resonance(3), (_DETUNINGS, _DAMPINGS)),
+        sign=1,
+        odds=priors.RESONANCE,
+    ),
+    AddedMass.kind: Law(
+        lambda r: -(r.relative_frequency**2) * priors.ADDED_MASS + 0j,
+        std=1.0,
+        odds=priors.INSTRUMENT,
+    ),
+    ForceHarmonics.kind: Law(
+        lambda r, _: np.zeros_like(r.dynamic_stiffness), _forced, choices=(2.0, 3.0), **_INSTRUMENT
+    ),
+    ForceGainError.kind: Law(
+        lambda r: _relative(r) * priors.GAIN,
+        parameters=lambda w, b, s: (-s * priors.GAIN,),
+        **_OF_GAIN,
+    ),
+    SensorGainError.kind: Law(
+        lambda r: _larger_motion(r) * priors.GAIN,
+        parameters=lambda w, b, s: (s * priors.GAIN,),
+        **_OF_GAIN,
+    ),
+    ModeShapeChange.kind: Law(
+        lambda r: _larger_motion(r) * priors.GAIN * r.relative_amplitude**2,
+        std=1.0,
+        odds=priors.INSTRUMENT,
+        parameters=lambda w, b, s: (s * priors.GAIN / b**2,),
+    ),
+    CloseMode.kind: Law(_close_mode, axes=(_APART, _DAMPINGS), **_INSTRUMENT),
+    ResidualMode.kind: Law(lambda r: _relative(r) ** 2, **_INSTRUMENT),
+    SensorPhaseError.kind: Law(
+        lambda r: -1j * _relative(r) * priors.INSTRUMENT_PHASE,
+        parameters=lambda w, b, s: (float(np.rad2deg(s * priors.INSTRUMENT_PHASE)),),
+        **_OF_GAIN,
+    ),
+    ForceOffsetError.kind: Law(
+        lambda r: _relative(r) * np.min(r.force) / r.force * priors.FORCE_OFFSET, **_OF_GAIN
+    ),
+    FrequencyDrift.kind: Law(
+        lambda r: 2 * r.order * priors.DRIFT + 0j,
+        parameters=lambda w, b, s: (s * priors.DRIFT,),
+        **_OF_GAIN,
+    ),
+}
+"""Of every kind what it changes in the dynamic stiffness, over ω₀²."""
