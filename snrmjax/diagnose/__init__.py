@@ -1,26 +1,20 @@
 """What a model lacks: from a row of a table to a verdict.
 
 1. `io.read_steady_states` makes a row a steady state: frequency, force, velocity phasors, errors.
-2. `misfit.predictions.predictions_of` prescribes each state's measured fundamental, and harmonic
-   balance finds the other harmonics and the force that this motion needs: one value for any model,
-   however a response folds. A column is what is compared: the force over the measured one, other
-   sensors, harmonics.
-3. `identify.test_model.posterior.fit_test` draws smooth curves through the same states, without any
-   law. They say how an error of amplitude moves the force, by how much levels differ, and the noise
-   where none is stated (`misfit.reference`). Every hypothesis is weighed by these alike
-   (`misfit.weighted_misfit`); errors of levels and of the model's own parameters are shared rows.
-   Fits begin at the records without the errors that these curves find (`misfit.effect_fit`).
-4. `search.model_search.find_effects` fits effects alone, in pairs and in threes. `answers` compares
-   the likeliest, and nothing at all, each with the records that are corrected for the errors that
-   it finds in them itself, until nothing moves; with many harmonics for kinks and slip; and with
-   and without errors of levels that nobody stated, where an answer leaves more than noise or does
-   what such levels do.
-5. `evidence.weights_of` weighs every answer that was fitted, each with its own sizes of noise and
-   levels' errors, beside smooth misfits of unknown size (`unknown`) and noise stated wrong.
-6. `decide.decide` reads these probabilities and the checks that can refute them: levels left out of
-   the fit, powers of amplitude, gains that the data do not determine. It is the only place where a
-   verdict is made; all numbers that decide stand in `priors` and `identify.test_model.priors`.
-7. Where nothing of the library explains the data, `laws` draws a law from them.
+2. `identify.test_model.posterior.fit_test` draws smooth curves through the states, without any law:
+   the slopes by which an error of amplitude acts, the noise and what levels differ by, where nobody
+   stated them. `naming.phases` gives states without phases those of such curves.
+3. `naming.readings` reads of every state what its dynamic stiffness, and each other harmonic of the
+   force, has beyond the model, whitened by all errors. `explained_parts` puts both together.
+4. `naming.laws` has what every kind of effect changes there, to first order: columns
+   (`naming.columns`), one for each value of a parameter that is not linear.
+5. `naming.evidence` weighs all single laws and pairs in closed form, each with remainders of every
+   size, and refines shapes that count. `naming.parts` makes these hypotheses an answer by parts:
+   laws with their probability, the fraction of the change that they explain, what is left.
+6. `answer_by_parts` fits the named laws together by harmonic balance at the measured motions
+   (`misfit`, `fitted_effects`), makes the verdict, and completes the model with laws and remainder.
+
+All numbers that decide stand in `priors` and `identify.test_model.priors`, each with its reason.
 """
 
 import lazy_loader

@@ -1,8 +1,8 @@
-from .decide import Verdict
 from .diagnosis import diagnose_model
 from .diagnosis_result import Diagnosis
 from .location.where import EVERYWHERE, Whereabouts, locate_force
 from .response_prediction import predict_levels
+from .verdict import Verdict
 
 __all__ = [
     "EVERYWHERE",

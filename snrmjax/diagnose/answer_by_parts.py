@@ -6,42 +6,42 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 from snrmjax.diagnose import priors
-from snrmjax.diagnose.answers import Search
-from snrmjax.diagnose.decide import Verdict
 from snrmjax.diagnose.diagnosis_result import (
     CompletedStatus,
     Diagnosis,
     Estimate,
     completed_model,
 )
-from snrmjax.diagnose.evidence import Kinds, answer_of
+from snrmjax.diagnose.drawn_law import DrawnLaw
 from snrmjax.diagnose.explained_parts import NamedParts, overall
-from snrmjax.diagnose.laws.law_search import DrawnLaw
+from snrmjax.diagnose.fitted_effects import FoundEffects, TriedEffect, refined
 from snrmjax.diagnose.misfit.candidates import candidate, parameter_labels
 from snrmjax.diagnose.misfit.effect_fit import EffectFit, baseline_fit, fit_effect
 from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
 from snrmjax.diagnose.misfit.predictions import Predictions, scales_of
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit, weighted_misfit
-from snrmjax.diagnose.naming.parts import DRAWN, Naming, PartAnswer, Remainder
+from snrmjax.diagnose.naming.parts import DRAWN, Naming, Remainder
 from snrmjax.diagnose.naming.remainder_law import remainder_laws
-from snrmjax.diagnose.search.model_search import FoundEffects, TriedEffect
+from snrmjax.diagnose.verdict import Kinds, Verdict, answer_of
 from snrmjax.identify.calibrate.calibration_states import ASSUMED_ERROR
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.effect_metadata import Argument
-from snrmjax.model.effects import is_own
+from snrmjax.model.effects import EFFECTS, is_own
 from snrmjax.model.library.free_laws import StiffnessLaw
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.facts import Fact
 
+_AS_WELL = 1.5  # times the misfit, up to which two explanations are as good
 _INDEPENDENT = 0.5  # of the states that err by themselves, from which on a misfit may be noise
 
 
 def verdict_of(named: NamedParts, found: FoundEffects) -> tuple[Verdict, tuple[Fact, ...]]:
     """The verdict on a test, and why nothing is named where the readings do not say it."""
-    posterior = named.problem.readings.posterior
+    posterior, chosen = named.problem.readings.posterior, found.misfit.predictions.chosen
     noise, (low, high) = float(posterior.hyper.noise), priors.TOLERATED_NOISE
     # What neighbouring states miss alike is no noise of any standard deviation.
-    stated = found.misfit.predictions.chosen.noise_stated and posterior.share > _INDEPENDENT
+    stated = chosen.noise_stated and posterior.share > _INDEPENDENT
+    stated = stated and not chosen.phase_unknown.any()
     if stated and not low < np.log(noise) < high:
         return Verdict.NOISE_REJECTED, (Fact("noise_misstated", ratio=noise),)
     verdict = overall(named.naming)
@@ -49,7 +49,22 @@ def verdict_of(named: NamedParts, found: FoundEffects) -> tuple[Verdict, tuple[F
     by_chance = chi_square_p_value(n_rows * named.naming.misfit**2, n_rows)
     if verdict is Verdict.NOTHING_MISSING and by_chance < priors.REJECTED:
         return Verdict.UNKNOWN, (Fact("no_effect_explains"),)
-    return verdict, ()
+    missed = _missed_by_other_sensors(found)
+    if missed is None:
+        return verdict, ()
+    nothing = verdict is Verdict.NOTHING_MISSING
+    return Verdict.UNKNOWN if nothing else verdict, (Fact("other_sensors_missed", misfit=missed),)
+
+
+def _missed_by_other_sensors(found: FoundEffects) -> float | None:
+    """Misfit of the fundamentals of the other sensors over the noise, where it is no chance."""
+    misfit, noise = found.misfit, found.misfit.noise
+    others = (noise.column >= 2) & (noise.column < 2 * len(misfit.predictions.chosen.sensors))
+    left = noise.without_shared(found.fit.rows)[others]
+    if not left.size or chi_square_p_value(float(left @ left), left.size) > priors.REJECTED:
+        return None
+    missed = float(np.sqrt(np.mean(left**2)))
+    return missed if missed > _AS_WELL else None
 
 
 def answers_of(naming: Naming, verdict: Verdict) -> dict[Kinds, float]:
@@ -61,14 +76,16 @@ def answers_of(naming: Naming, verdict: Verdict) -> dict[Kinds, float]:
 
 def fitted_parts(named: NamedParts, predictions: Predictions, data: SteadyStates) -> FoundEffects:
     """The laws of a naming fitted by harmonic balance at the measured motions, all together."""
-    reference, scales = predictions.reference, scales_of(predictions)
+    reference = predictions.reference
     if not predictions.chosen.noise_stated and reference is not None:
         scale = reference.posterior.hyper.noise / ASSUMED_ERROR
         predictions = predictions.with_errors_scaled(scale / predictions.error_scale)
-    misfit = weighted_misfit(predictions)
+    own = {one.kind for one in named.problem.columns if is_own(one.kind)}
+    wanted = {kind for group in named.naming.candidates for kind in group} | own
+    misfit = weighted_misfit(predictions.with_kinds([kind for kind in EFFECTS if kind in wanted]))
     fit = _fitted(misfit, named.naming, named.naming.effects)
     if fit.kinds:
-        misfit, fit = Search(scales, (), {}, data).refined(misfit, fit)
+        misfit, fit = refined(data, misfit, fit)
     by_kind = {group[0]: group for group in named.naming.candidates}
     groups = tuple(by_kind[kind] for kind in fit.kinds)
     rivals = [
@@ -77,12 +94,11 @@ def fitted_parts(named: NamedParts, predictions: Predictions, data: SteadyStates
         for rival in group[1:]
     ]
     tried = {*fit.kinds, *(kind for one in rivals for kind in one.kinds)}
-    own = {one.kind for one in named.problem.columns if is_own(one.kind)}
     for kind in sorted(own - tried):
         rivals.append(_fitted(misfit, named.naming, [kind]))  # who brings an effect sees it fitted
     nothing = baseline_fit(misfit)
     rows = tuple(_tried(nothing, one) for one in (fit, *rivals) if one.kinds)
-    return FoundEffects(misfit, fit, nothing, (rows,), (nothing, fit, *rivals), groups)
+    return FoundEffects(misfit, fit, nothing, (rows,), groups)
 
 
 def _fitted(misfit: WeightedMisfit, naming: Naming, effects: Iterable[str]) -> EffectFit:
@@ -108,31 +124,6 @@ def _tried(nothing: EffectFit, fit: EffectFit) -> TriedEffect:
     )
 
 
-def with_parts(
-    diagnosis: Diagnosis, named: NamedParts, baseline: Mapping[str, float], model: Structure
-) -> Diagnosis:
-    """The diagnosis with its parts, and with their verdict where no exact law explains all.
-
-    Arguments: `baseline` parameters of the model at their most likely values, by name.
-    """
-    naming = named.naming
-    diagnosis = dataclasses.replace(diagnosis, parts=naming.parts)
-    if _explains_all(diagnosis, naming):
-        kept = {kind for group in diagnosis.candidates for kind in group}
-        parts = tuple(_narrowed(part, kept) for part in naming.parts)
-        return dataclasses.replace(diagnosis, parts=parts)
-    verdict = overall(naming)
-    if verdict is Verdict.NOTHING_MISSING:  # what is left shows in harmonics or at other sensors
-        return diagnosis
-    answer = diagnosis.answer._replace(
-        effects=naming.effects,
-        candidates=naming.candidates,
-        probabilities=answers_of(naming, verdict),
-    )
-    diagnosis = dataclasses.replace(diagnosis, verdict=verdict, answer=answer)
-    return completed_by_parts(diagnosis, named, baseline, model)
-
-
 def completed_by_parts(
     diagnosis: Diagnosis, named: NamedParts, baseline: Mapping[str, float], model: Structure
 ) -> Diagnosis:
@@ -149,10 +140,12 @@ def completed_by_parts(
         if part.remainder is not None and part.remainder.significant
     }
     fitted = {*naming.effects} <= {name.partition(".")[0] for name in answer.parameters}
-    if fitted and not left:
+    # A fit that leaves more than the readings do ended elsewhere.
+    ended = diagnosis.gap.after < _AS_WELL * max(naming.misfit, 1.0)
+    if fitted and ended and not left:
         return diagnosis
     parameters, checks, gap = _estimates(naming), diagnosis.checks, diagnosis.gap
-    if left:  # the linear mode is the one that the readings found together with the remainder
+    if left or not ended:  # the linear mode is the one that the readings found with the laws
         mode = f"mode_{model.modes.mode_of_interest + 1}"
         found = (naming.natural_frequency, naming.damping_ratio)
         names = (f"{mode}.natural_frequency", f"{mode}.damping_ratio")
@@ -160,14 +153,14 @@ def completed_by_parts(
         baseline = {name: value for name, value in linear.items() if name in baseline}
     whole = completed_model(model, baseline, *_structural(naming.effects, parameters))
     completed, status, reason = whole.model, whole.status, whole.reason
+    if left or not ended:  # without a level the answer would be another one
+        checks, gap = checks._replace(completed_without={}), gap._replace(after=naming.misfit)
     drawn: tuple[str, ...] = ()
     laws: tuple[DrawnLaw, ...] = ()
     if left and completed is not None:
         added = remainder_laws(named.problem, left)
         completed = dataclasses.replace(completed, effects=(*completed.effects, *added))
         status = CompletedStatus.COMPLETED
-        # Without a level the remainder would be another one.
-        checks, gap = checks._replace(completed_without={}), gap._replace(after=naming.misfit)
         if diagnosis.verdict is Verdict.DRAWN:
             laws = tuple(_drawn(named, part, one) for part, one in left.items())
             drawn = tuple(DRAWN[part] for part in left)
@@ -183,28 +176,6 @@ def completed_by_parts(
         laws=laws,
     )
     return dataclasses.replace(diagnosis, answer=answer, gap=gap, checks=checks, notes=notes)
-
-
-def _narrowed(part: PartAnswer, kept: set[str]) -> PartAnswer:
-    """A part's answer by what harmonics and further sensors leave of its candidates."""
-    groups = tuple(tuple(k for k in group if k in kept) or group for group in part.candidates)
-    single = all(len(group) == 1 for group in groups)
-    named = single and part.verdict == Verdict.AMBIGUOUS
-    return part._replace(
-        verdict=Verdict.NAMED.value if named else part.verdict,
-        effects=tuple(group[0] for group in groups),
-        candidates=groups,
-    )
-
-
-def _explains_all(diagnosis: Diagnosis, naming: Naming) -> bool:
-    """Whether an exact law explains the test to its noise, and is what most of it is by parts."""
-    if diagnosis.verdict in (Verdict.UNKNOWN, Verdict.DRAWN):
-        return False
-    if not diagnosis.verdict.is_answer or diagnosis.checks.p_value > priors.REJECTED:
-        return True
-    groups, found = naming.candidates, {*diagnosis.effects}
-    return all(found & {*group} for group in groups) and bool(groups)
 
 
 def _structural(

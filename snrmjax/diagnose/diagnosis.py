@@ -1,7 +1,7 @@
-"""The whole diagnosis: locate the misfit, find effects that explain it, and check the answer."""
+"""The whole diagnosis: name what explains the misfit, fit it, and check the answer."""
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import jax
@@ -14,17 +14,8 @@ from snrmjax.diagnose.answer_by_parts import (
     completed_by_parts,
     fitted_parts,
     verdict_of,
-    with_parts,
 )
-from snrmjax.diagnose.answers import Search, best_answer
-from snrmjax.diagnose.checks.gains import (
-    LevelGain,
-    gain_found,
-    level_gains,
-    notes_on_gains,
-    suspected_level_forces,
-    with_forces_that_acted,
-)
+from snrmjax.diagnose.checks.gains import gain_found, notes_on_gains
 from snrmjax.diagnose.checks.residuals import (
     HeldOutLevels,
     held_out_levels,
@@ -34,20 +25,11 @@ from snrmjax.diagnose.checks.residuals import (
     tolerated,
     without_level,
 )
-from snrmjax.diagnose.decide import (
-    Judgement,
-    Verdict,
-    decide,
-    imitations_of,
-    law_is_asked_for,
-    with_law,
-)
 from snrmjax.diagnose.design.discriminating_test import recommendation, recommended_test
 from snrmjax.diagnose.diagnosis_result import (
     Answer,
     Checks,
     CompletedModel,
-    CompletedStatus,
     Diagnosis,
     Estimate,
     ForceMisfit,
@@ -55,19 +37,20 @@ from snrmjax.diagnose.diagnosis_result import (
     Gap,
     completed_model,
 )
-from snrmjax.diagnose.explained_parts import NamedParts, named_parts
-from snrmjax.diagnose.laws.law_answer import LawAnswer, law_answer
-from snrmjax.diagnose.misfit.effect_fit import EffectFit, at_phases_of, at_reference, baseline_fit
+from snrmjax.diagnose.explained_parts import named_parts
+from snrmjax.diagnose.fitted_effects import FoundEffects
+from snrmjax.diagnose.misfit.effect_fit import EffectFit, at_phases_of, at_reference
+from snrmjax.diagnose.misfit.locating import Located, locate_misfit
 from snrmjax.diagnose.misfit.noise_model import notes_without_phases, unit_columns
-from snrmjax.diagnose.misfit.predictions import Predictions, predictions_of, scales_of
+from snrmjax.diagnose.misfit.predictions import Predictions, predictions_of
 from snrmjax.diagnose.misfit.reference import (
     driven_by_voltage,
     with_first_gain,
     with_reference,
 )
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit, weighted_misfit
-from snrmjax.diagnose.search.locating import Located, locate_misfit
-from snrmjax.diagnose.search.model_search import FoundEffects, detection_limits
+from snrmjax.diagnose.naming.detection import detection_limits
+from snrmjax.diagnose.verdict import Kinds, Verdict
 from snrmjax.identify.calibrate.calibration_states import ASSUMED_ERROR
 from snrmjax.measure.phase_convention import naming_wrong_phases
 from snrmjax.measure.states import SteadyStates
@@ -92,25 +75,20 @@ def diagnose_model(
 ) -> Diagnosis:
     """Find the physics that a model lacks to explain measured steady states.
 
-    Works in the force balance: the measured fundamental is prescribed, harmonic balance finds the
-    other harmonics, and the force that this motion needs is compared with the measured one. The
-    library's effects are fitted with the baseline's parameters free inside their stated errors
-    and the levels' errors inside theirs; their evidence decides. Answers that a linear mode
-    nearby could have caused are compared with one.
+    Every state reads the mode's stiffness and damping, and every other recorded harmonic, beyond
+    the model. These readings name the laws that explain most of them, by parts (`naming`); what is
+    left is drawn. The laws are then fitted together by harmonic balance at the measured motions.
 
     `force_gain_std` is the relative 1σ of a gain that all forces share: 1 where it is unknown.
-    `former` is the answer by fewer of these states: fits begin where its fits ended too, and the
-    notes say what the further states changed.
+    `former` is the answer by fewer of these states: the notes say what the further states changed.
     Where the force is known as a drive voltage only, a first value of its gain is found and the
-    gain is free. Where neither noise nor errors of levels are stated, both are estimated: the
-    noise is what the answer leaves, and the level-to-level variance what no smooth curves of
-    amplitude explain. Where no effect of the library explains the data, a law that does is drawn
-    from them (`laws.law_answer`), if their noise and their forces are known. Where gains of the
-    forces of single levels explain the data better than any effects, the answer is found beside
-    them (`checks.gains`); where they explain them as well, they are said first.
+    gain is free. Where neither noise nor errors of levels are stated, both are estimated: the noise
+    is what smooth curves leave, and the level-to-level variance what no smooth curves of amplitude
+    explain. Where phases were not recorded, they are those of smooth curves with the recorded
+    amplitudes, and the sizes alone count.
 
-    Returns a `Diagnosis`; `decide.decide` has the rules of its verdict. Raises `ValueError`
-    for too few states, an unknown force or sensors other than the model's.
+    Returns a `Diagnosis`; `diagnose.priors` has all numbers that decide its verdict.
+    Raises `ValueError` for too few states, an unknown force or sensors other than the model's.
     Validity: steady motions with the period of the force; effects that change the motion
     moderately, so that two of them add up.
     Not differentiable: differentiate the force that a motion needs:
@@ -121,114 +99,31 @@ def diagnose_model(
         data, gain, of_gain = with_first_gain(model, data)
         force_gain_std = force_gain_std or priors.FREE_GAIN_STD
         notes += of_gain
-    recorded = predictions_of(model, data, force_gain_std)
-    unknown, noise_stated = recorded.chosen.phase_unknown, recorded.chosen.noise_stated
-    excluded = excluded_kinds(model, force_gain_std, phases=not unknown[:, 0].all())
-    kinds = tuple(kind for kind in EFFECTS if kind not in excluded)
-    more_seen = bool(recorded.chosen.orders) or len(recorded.chosen.sensors) > 1
-    named = None if unknown.any() else named_parts(recorded, data, kinds)
+    recorded = predictions_of(model, data, force_gain_std, kinds=())
+    unknown = recorded.chosen.phase_unknown
     predictions = _corrected_predictions(recorded, data)
-    if named is not None and not more_seen:
-        found = fitted_parts(named, predictions, data)
-        return _by_parts(model, data, named, found, _Gain(gain, tuple(notes)), former, excluded)
-    search = Search(scales_of(predictions), kinds, former.starts if former else {}, data)
-    answered = best_answer(search, predictions)
-    as_recorded, rival, best = answered.found, None, answered
-    # Beside an unknown gain nothing says which level's force is off.
-    if noise_stated and force_gain_std == 0 and not unknown.any():
-        allowed = tolerated(neighbour_noise(as_recorded.misfit, as_recorded.fit))
-        rival = suspected_level_forces(as_recorded, allowed)
-    if rival is not None and rival.is_better:
-        recorded = as_recorded.misfit.predictions
-        best = search.answered(dataclasses.replace(recorded, free_level_forces=rival.places))
-    found = best.found
-    checked = _Checked.of(found)
-    gains = checked.level_gains
-    errors = {name: one.std for name, one in checked.parameters.items()}
-    weights = best.weights.with_imitations(len(imitations_of(found, checked.located)))
-    judgement = decide(
-        found, weights, checked.located, checked.levels, errors, None if gains else rival
-    )
-    completed = _completed(model, checked)
-    answer = _answer(judgement, checked, completed)
-    if former is not None:
-        notes.append(former.changed_to(judgement.probabilities))
-    if gain is not None and answer.effects:
-        notes.append(Fact("gain_with_effects", gain=gain * answer.force_gain, before=gain))
-    asked = [doubt.decide_by for doubt in judgement.open_questions]
-    if gains and rival is not None:
-        asked = [rival.doubt.decide_by, *asked]
-        others, lead = as_recorded.fit.kinds, rival.lead
-        notes.append(Fact("best_as_recorded", effects=others, levels=rival.levels, lead=lead))
-    # Without phases the first measurement to recommend is that of the phases.
-    phases = not unknown[:, 0].any()
-    open_classes = judgement.verdict is Verdict.AMBIGUOUS and phases
-    test = recommended_test(found) if open_classes else None
-    notes += [*judgement.reasons, *_notes_on_data(checked), *_notes_on_answer(checked, completed)]
-    misfit, fit = checked.misfit, found.fit
-    diagnosis = Diagnosis(
-        verdict=judgement.verdict,
-        answer=answer,
-        recommended=recommendation(found, test, asked, phases=phases),
-        discriminating_test=test,
-        located=checked.located,
-        gap=Gap(
-            rms_misfit(as_recorded.misfit, as_recorded.baseline),
-            rms_misfit(misfit, fit),
-            *(checked.levels or (None, None)),
-        ),
-        checks=Checks(found.p_value, float(np.sqrt(checked.neighbours)), completed.without),
-        detection_limits=detection_limits(misfit, fit, search.scales, excluded),
-        table=found.table,
-        notes=tuple(notes),
-        force_misfit=_force_misfit(misfit, found.baseline, fit),
-        data=with_forces_that_acted(data, gains),
-        level_forces=gains,
-    )
-    if named is not None:
-        return with_parts(diagnosis, named, misfit.baseline_parameters(fit.rows), model)
-    known = noise_stated and force_gain_std == 0 and phases
-    if not known or not law_is_asked_for(judgement, len(fit.kinds)):
-        return diagnosis
-    # Laws of many knots are drawn with few harmonics.
-    law = law_answer(answered.coarse or found, model)
-    return diagnosis if law is None else _with_law(diagnosis, with_law(judgement, law), law)
-
-
-class _Gain(NamedTuple):
-    """The first value of a force's gain where a drive voltage is known, and notes on it."""
-
-    value: float | None
-    notes: tuple[Fact | str, ...]
-
-
-def _by_parts(
-    model: Structure,
-    data: SteadyStates,
-    named: NamedParts,
-    found: FoundEffects,
-    gain: _Gain,
-    former: FormerAnswer | None,
-    excluded: set[str],
-) -> Diagnosis:
-    """The diagnosis whose answer the readings give, with its laws fitted by harmonic balance."""
+    phases = not unknown[:, 0].all()
+    excluded = excluded_kinds(model, force_gain_std, phases=phases)
+    named = named_parts(recorded, data, [kind for kind in EFFECTS if kind not in excluded])
+    found = fitted_parts(named, predictions, data)
     checked = _Checked.of(found)
     misfit, fit, naming = checked.misfit, found.fit, named.naming
     completed = _completed(model, checked)
     verdict, reasons = verdict_of(named, found)
-    judgement = Judgement(verdict, reasons, (), answers_of(naming, verdict))
-    notes = [*gain.notes, *reasons]
+    probabilities = answers_of(naming, verdict)
+    notes += reasons
     if former is not None:
-        notes.append(former.changed_to(judgement.probabilities))
-    answer = _answer(judgement, checked, completed)
-    if gain.value is not None and answer.effects:
-        found_gain = gain.value * answer.force_gain
-        notes.append(Fact("gain_with_effects", gain=found_gain, before=gain.value))
+        notes.append(former.changed_to(probabilities))
+    answer = _answer(verdict, probabilities, checked, completed)
+    if gain is not None and answer.effects:
+        notes.append(Fact("gain_with_effects", gain=gain * answer.force_gain, before=gain))
     notes += [*_notes_on_data(checked), *_notes_on_answer(checked, completed)]
-    test = recommended_test(found) if verdict is Verdict.AMBIGUOUS else None
-    asked = recommendation(found, test, [], phases=True) if verdict.is_answer else None
+    recorded_phases = not unknown[:, 0].any()
+    open_classes = verdict is Verdict.AMBIGUOUS and recorded_phases
+    test = recommended_test(found) if open_classes else None
+    asked = recommendation(found, test, phases=recorded_phases) if verdict.is_answer else None
     before, after = rms_misfit(misfit, found.baseline), rms_misfit(misfit, fit)
-    if verdict is Verdict.NOTHING_MISSING:  # beside errors of levels that nobody stated
+    if verdict is Verdict.NOTHING_MISSING:  # errors of levels that nobody stated are taken out
         before = after = min(after, naming.misfit)
     diagnosis = Diagnosis(
         verdict=verdict,
@@ -238,7 +133,7 @@ def _by_parts(
         located=checked.located,
         gap=Gap(before, after, *(checked.levels or (None, None))),
         checks=Checks(found.p_value, float(np.sqrt(checked.neighbours)), completed.without),
-        detection_limits=detection_limits(misfit, fit, scales_of(misfit.predictions), excluded),
+        detection_limits=detection_limits(named.problem, naming, excluded),
         table=found.table,
         notes=tuple(notes),
         force_misfit=_force_misfit(misfit, found.baseline, fit),
@@ -275,7 +170,6 @@ class _Checked(NamedTuple):
     neighbours: float  # variance over the stated one
     levels: HeldOutLevels | None
     parameters: dict[str, Estimate]
-    level_gains: dict[int, LevelGain]
 
     @classmethod
     def of(cls, found: FoundEffects) -> "_Checked":
@@ -284,8 +178,7 @@ class _Checked(NamedTuple):
         neighbours = neighbour_noise(misfit, fit)
         levels = held_out_levels(misfit, found.baseline, fit, tolerated(neighbours))
         located = locate_misfit(misfit, found.baseline)
-        estimates = _estimates(misfit, fit)
-        return cls(found, misfit, located, neighbours, levels, estimates, level_gains(misfit, fit))
+        return cls(found, misfit, located, neighbours, levels, _estimates(misfit, fit))
 
 
 class _Completed(NamedTuple):
@@ -312,45 +205,22 @@ def _completed(model: Structure, checked: _Checked) -> _Completed:
     return _Completed(model, whole, there, refused)
 
 
-def _answer(judgement: Judgement, checked: _Checked, completed: _Completed) -> Answer:
+def _answer(
+    verdict: Verdict,
+    probabilities: Mapping[Kinds, float],
+    checked: _Checked,
+    completed: _Completed,
+) -> Answer:
     fit, gain = checked.found.fit, gain_found(checked.misfit, checked.found.fit)
-    something = judgement.verdict is not Verdict.NOTHING_MISSING
     return Answer(
-        effects=fit.kinds if something else (),
-        candidates=checked.found.classes if something else (),
+        effects=fit.kinds if verdict.is_answer else (),
+        candidates=checked.found.classes if verdict.is_answer else (),
         parameters=checked.parameters,
         status=fit.status,
         completed=completed.whole.model,
         completed_status=completed.whole.status,
         force_gain=1.0 if gain is None else gain.value,
-        probabilities=dict(judgement.probabilities),
-    )
-
-
-def _with_law(diagnosis: Diagnosis, judgement: Judgement, law: LawAnswer) -> Diagnosis:
-    """A diagnosis with a drawn law in place of effects that do not explain the data."""
-    misfit, nothing = law.misfit, baseline_fit(law.misfit)
-    answer = diagnosis.answer._replace(
-        effects=law.kinds,
-        candidates=((law.kinds[0], *law.rivals), *((kind,) for kind in law.kinds[1:])),
-        parameters={},
-        status=MinimisationStatus.CONVERGED,
-        completed=law.completed,
-        completed_status=CompletedStatus.COMPLETED,
-        laws=law.laws,
-        probabilities=dict(judgement.probabilities),
-    )
-    gaps = rms_misfit(misfit, nothing), rms_misfit(misfit, law.fit), *(law.levels or (None, None))
-    return dataclasses.replace(
-        diagnosis,
-        verdict=judgement.verdict,
-        answer=answer,
-        recommended=law.decide_by,
-        discriminating_test=None,
-        gap=Gap(*gaps),
-        checks=Checks(law.p_value, float(np.sqrt(law.noise)), law.completed_without),
-        notes=(*judgement.reasons, *misfit.predictions.chosen.notes),
-        force_misfit=_force_misfit(misfit, nothing, law.fit),
+        probabilities=dict(probabilities),
     )
 
 

@@ -6,21 +6,18 @@ from collections.abc import Iterable, Mapping
 from enum import StrEnum
 from typing import ClassVar, NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
 from snrmjax.diagnose import priors
-from snrmjax.diagnose.checks.gains import LevelGain
 from snrmjax.diagnose.checks.residuals import HeldOut
-from snrmjax.diagnose.decide import Verdict
 from snrmjax.diagnose.design.discriminating_test import DiscriminatingTest
-from snrmjax.diagnose.evidence import Kinds
-from snrmjax.diagnose.laws.law_search import DrawnLaw
+from snrmjax.diagnose.drawn_law import DrawnLaw
+from snrmjax.diagnose.fitted_effects import TriedEffect
+from snrmjax.diagnose.misfit.locating import Located
 from snrmjax.diagnose.naming.parts import PartAnswer
-from snrmjax.diagnose.search.locating import Located
-from snrmjax.diagnose.search.model_search import TriedEffect
+from snrmjax.diagnose.verdict import Kinds, Verdict
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
 from snrmjax.model.parameters import parameter_rules, with_parameters
@@ -150,8 +147,6 @@ class Diagnosis(AbstractResult):
     force_misfit: ForceMisfit
     data: SteadyStates  # as they were compared: in N, where a drive voltage was given
     parts: tuple[PartAnswer, ...] = ()  # what changes stiffness and damping, and by how much
-    # Of levels whose force was recorded in a wrong scale: the acting one over it.
-    level_forces: dict[int, LevelGain] = eqx.field(default_factory=dict)
 
     @property
     def effects(self) -> tuple[str, ...]:
@@ -198,14 +193,10 @@ class Diagnosis(AbstractResult):
     @property
     def verdict_sentence(self) -> str:
         """The verdict in one plain sentence."""
-        levels = [
-            Fact("level_force", level=level, gain=gain.value, std=gain.std)
-            for level, gain in self.level_forces.items()
-        ]
         if self.parts and Verdict(self.verdict).is_answer:
             changed = [one for one in self.parts if one.verdict != "none"]
             falls = Fact("misfit_falls", before=self.gap.before, after=self.gap.after)
-            return " ".join(map(str, (*levels, *map(_fact_of, changed), falls)))
+            return " ".join(map(str, (*map(_fact_of, changed), falls)))
         verdict = Fact(
             "verdict",
             verdict=Verdict(self.verdict).value,
@@ -214,7 +205,7 @@ class Diagnosis(AbstractResult):
             misfit_before=self.gap.before,
             misfit=self.gap.after,
         )
-        return " ".join(map(str, (*levels, verdict)))
+        return str(verdict)
 
     def most_probable(self) -> Fact:
         """The answers with the largest probabilities, each once."""

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex, Float
 
-from snrmjax.diagnose.decide import Verdict
 from snrmjax.diagnose.misfit.predictions import Predictions, scales_of
 from snrmjax.diagnose.misfit.reference import test_states_of
 from snrmjax.diagnose.naming.evidence import Problem, best_hypotheses
@@ -23,6 +22,7 @@ from snrmjax.diagnose.naming.readings import (
     RecordedHarmonics,
     readings_of,
 )
+from snrmjax.diagnose.verdict import Verdict
 from snrmjax.identify.calibrate.calibration_states import ASSUMED_ERROR
 from snrmjax.identify.calibrate.inverse_force import inverse_force
 from snrmjax.measure.states import SteadyStates
@@ -74,7 +74,7 @@ def _with_likely_phases(predictions: Predictions, data: SteadyStates) -> Predict
     side = modes.mode_shape[chosen.sensors[0]] * modes.participation
     behind = np.pi if float(side[modes.mode_of_interest]) < 0 else 0.0
     found = predictions.with_phases(np.pi / 2 - np.angle(z) + behind)
-    error = np.asarray(chosen.states.error).copy()
+    error: Any = np.asarray(chosen.states.error).copy()
     error[chosen.phase_unknown[:, 0], 1 + len(chosen.sensors)] = _ANY_PHASE
     states_found = found.chosen.states._replace(error=error)
     return dataclasses.replace(found, chosen=found.chosen._replace(states=states_found))

@@ -4,9 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from snrmjax.diagnose.decide import Verdict
 from snrmjax.diagnose.diagnosis_result import Diagnosis
 from snrmjax.diagnose.misfit.programs import COMPARED
+from snrmjax.diagnose.verdict import Verdict
 from snrmjax.measure.states import PHASE_UNKNOWN, SteadyStates, relative_errors, steady_states
 
 

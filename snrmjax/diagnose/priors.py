@@ -1,67 +1,81 @@
-"""What a diagnosis takes for likely, and where it decides: every number with its reason.
-
-Priors of curves, levels and noise are those of every test (`identify.test_model.priors`).
-"""
+"""What is taken for likely before a test is seen, and numbers that decide, each with why."""
 
 import numpy as np
 
-# --- hypotheses: odds against a model that lacks nothing
+SIZES = {0: 0.25, 1: 0.5, 2: 0.25}
+"""Of no effect, one, two: who asks has seen a misfit, and one nonlinearity is the rule."""
 
-EFFECTS = (1.0, 0.44, 0.033, 0.0034)
-"""Of none, one, two, three effects of the library, all kinds together: who asks has seen a misfit,
-and structures with one nonlinearity are the rule."""
+RESONANCE, INSTRUMENT = 0.03, 0.2
+"""Of an internal resonance and of an instrument's error, over that of a law: modes seldom lie
+within 5 % of a multiple of another, and instruments are checked before a test."""
 
-DISCREPANCY = 0.1
-"""Of an answer beside a misfit that no effect of the library explains, to that answer."""
+STRENGTHS = np.geomspace(1e-5, 1.0, 11)
+"""1σ of a law's largest relative change of stiffness, or of damping over ω₀, all as likely: from
+what no test sees to a change as large as the linear stiffness."""
 
-IMITATION = 0.4
-"""Of a law outside the library that is known to act like an answer, to that answer."""
+NO_REMAINDER = 0.3
+"""Probability that laws leave nothing: structures are seldom in a library exactly."""
 
-UNNAMED = 0.004
-"""The same where no such law is known."""
+REMAINDERS = np.geomspace(1e-5, 1.0, 9)
+"""Sizes of a remainder where there is one, in the units of strengths, all as likely."""
 
-NO_CURVE = 0.15
-"""Of laws outside the library that follow a drawn curve within noise, those that are none of one
-quantity: friction with rates, contact that bounces, damping with a memory."""
+REMAINDER_LENGTH = 1.0
+"""Of ln a, over which a remainder changes: by a factor of e in amplitude."""
 
-LEVELS_APART = 0.4
-"""Of levels that differ by more than was stated, to levels that do not: temperature and clamps."""
+FLOOR = 1e-3
+"""Relative error of a state's amplitude and phase that is never undercut: what is smooth along a
+sweep and in no model. Half and twice as much give the same answers on measured structures."""
 
-WRONG_NOISE = 0.5
-"""Of noise that is stated wrong, to noise stated right."""
+HARMONIC = 0.02
+"""Relative error of a reading of another harmonic: a law's force is taken at the fundamental alone,
+whose other harmonics change it by about as much."""
 
-RIGHT_NOISE = 0.2
-"""1σ of the logarithm of noise over stated noise: deviations of ten readings are good to 20 %."""
+HARMONIC_REMAINDERS = np.array([0.0, 1e-4, 1e-3, 1e-2, 1e-1])
+"""Sizes of what laws leave of another harmonic of the force, over ω₀² and the amplitude: zero with
+`NO_REMAINDER`, the others as likely."""
+
+INSTRUMENT_PHASE = 0.1
+"""rad, 1σ of a phase that all records share where it is a hypothesis: 6°."""
+
+GAIN = 0.1
+"""Relative 1σ of a gain that is a hypothesis: a wrong range or sensitivity."""
+
+ADDED_MASS = 0.05
+"""Relative 1σ of a mass that was added. Beside a change of stiffness one of any size would follow a
+resonance wherever it goes."""
+
+FORCE_OFFSET = 0.1
+"""1σ of an offset of the force over the smallest force."""
+
+DRIFT = 0.005
+"""1σ of a relative drift of the natural frequency over a test: some 20 K in metals."""
+
+UNSTATED_MASS = 0.05
+"""Relative 1σ of a modal mass of which nobody stated one."""
+
+VISIBLE = 2.0
+"""1σ, from which on a law's strength or a remainder counts as seen: less is no answer."""
+
+NEGLIGIBLE = 0.05
+"""Of a part's change: a law that explains less of it is no part of an answer."""
+
+BELOW_BANDWIDTH = 0.03
+"""Of the damping: changes of it, and of the stiffness over it, that are smaller are no finding: a
+resonance moves by so much of its bandwidth, and describing functions leave out as much."""
+
+NAMED = 0.9
+"""Probability from which on a law is named: a wrong name costs nine times as much as none."""
+
+EXPLAINED = 0.8
+"""Of a part's change, at the lower end of its 95 % band, from which on the law is the answer and
+the remainder a correction."""
 
 TOLERATED_NOISE = (-0.38, 0.22)
 """Of that logarithm, overstated and understated: √2 (0.35) lies between the error of a phasor and
 that of its parts; of noise understated by more than a quarter effects would be named."""
 
-MOST_NOISE = float(np.log(4.0))
-"""The largest wrong statement considered: a factor of four, either way."""
-
-# --- sizes that are integrated over
-
-DISCREPANCY_SIZES = (0.3, 100.0)
-"""Root-mean-square size of a discrepancy in units of noise, between which its logarithm is flat."""
-
-# --- levels of confidence, in 1σ of a normal distribution
-
 BAND, ONE_SIDED = 1.96, 1.64
 """Of 95 % between two limits, and of 95 % beyond one."""
-
-# --- decisions
-
-NO_ANSWER = 0.9
-"""Probability of a law outside the library from which on nothing is named: a wrong name costs nine
-times as much as an open question."""
-
-NO_DOUBT = 0.1
-"""The same up to which an answer is named without a word."""
-
-AS_GOOD = 0.01
-"""Odds to the best answer down to which another one belongs to the class: of a hundred names that
-stand alone one may be wrong."""
 
 DETECTED = 10.0
 """Gain of Schwarz's criterion from which on an effect counts as detected: odds of 150 to one pay
@@ -73,21 +87,8 @@ AS_GOOD_BY_CRITERION = 6.0
 REJECTED = 1e-3
 """Probability by chance below which a check refutes: some thirty checks are made of a test."""
 
-CONTRADICTED = 4.0
-"""1σ between the power of amplitude in the data and that of a law: curves of a few knots are no
-exact powers."""
-
 PULLED = 2.0
 """1σ of a stated parameter, by which an answer may move it without a word."""
-
-MOVED_GAIN = 0.05
-"""Of the logarithm of a free gain, by which a right law moves what smooth curves gave."""
-
-FAR_GAIN = 3.0
-"""Ratio of a gain to its first value, beyond which the answer has moved it away."""
-
-FAR_MASS = 3.0
-"""1σ of a modal mass of which none is stated, beyond which it explains no gain."""
 
 LOOSE_GAIN = 0.1
 """Relative 1σ of a force's gain, beyond which no close mode is looked for: beside a force that may
@@ -109,21 +110,9 @@ states beyond, from which on a test may hold the response."""
 AS_NOISE = 1.3
 """Times the noise, up to which a misfit counts as noise; beyond it every 1σ is too small."""
 
-FAR_MISSED = 2.0
-"""Times the noise, from which on a top level that was left out proves nothing of a law."""
-
-MISSED, MISSED_BY_ONE = 0.05, 0.01
-"""Probability by chance of a level that was left out: below the first it counts against an answer
-that another law could imitate, below the second against one of several."""
-
 TOLERATED_VARIANCE = 1.7
 """Over the stated one, that neighbouring states may show: stated too small by a third, noise is no
 sign of further physics."""
-
-OPEN = 0.1
-"""Share of their probability that refuted answers keep: checks rest on approximations too."""
-
-# --- records corrected for the errors that an answer finds in them
 
 FARTHEST_ERROR = 0.5
 """Relative or rad: an answer that needs larger errors of a velocity explains nothing; published
@@ -132,43 +121,8 @@ levels differ by 15 %."""
 SETTLED_ERROR = 0.02
 """The same, that an answer's errors may move by in the last round: its square is below noise."""
 
-FAR_BEHIND = 25.0
-"""Of ln p behind an answer that fits, from which on others are not corrected for their errors: that
-moves the ln p of answers near it by ten or so. Behind one that leaves more than noise, as many
-times more as its χ² is over what noise leaves."""
-
-# --- what is unknown of gains, and of drawn laws
-
 FREE_GAIN_STD = 1.0
 """Relative 1σ of a force gain that is unknown."""
-
-FREE_LEVEL_FORCE_STD = 0.3
-"""Relative 1σ of the force of a level that is left free: far more than a calibration is off."""
-
-LAW_REACHES = (0.35, 0.7, 1.4, 2.8)
-"""Of a drawn law's process, in logarithms of displacement or velocity, all as likely."""
-
-LAW_SIZES = 2.0 ** np.arange(-7.0, 9.0)
-"""Of the same, in units of a change that is plainly seen."""
-
-# --- how far the search goes
-
-HOPELESS = 5.0
-"""Times χ² of the best fit so far, or of noise, beyond which a fit is given up on the way."""
-
-PAIRS, SIMPLE, MOST_EFFECTS = 8, 2, 3
-"""Pairs that are fitted from their own starts; parameters up to which an effect is not compared
-with two simple ones; and effects of an answer: three can follow most laws."""
-
-FEW_EFFECTS = 2
-"""Of an answer beside which no law is drawn."""
-
-REFINED, NEAREST_ANSWERS = 8, 4
-"""Likeliest answers that are corrected for their own errors; and whose effects are looked for again
-with many harmonics, which cost most."""
-
-SAME_NOISE = 0.8
-"""Share of a size of noise that is as much."""
 
 FREE_CURVE = 6
 """Knots of a free curve of amplitude: a power of it is told from others."""

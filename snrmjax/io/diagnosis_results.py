@@ -3,14 +3,14 @@
 import math
 from collections.abc import Sequence
 
-from snrmjax.diagnose.decide import Verdict
 from snrmjax.diagnose.design.discriminating_test import DiscriminatingTest
 from snrmjax.diagnose.diagnosis_result import Diagnosis
-from snrmjax.diagnose.laws.law_search import DrawnLaw
+from snrmjax.diagnose.drawn_law import DrawnLaw
 from snrmjax.diagnose.location.where import Whereabouts
+from snrmjax.diagnose.misfit.locating import Located
 from snrmjax.diagnose.naming.parts import PartAnswer
 from snrmjax.diagnose.response_prediction import LevelResponse
-from snrmjax.diagnose.search.locating import Located
+from snrmjax.diagnose.verdict import Verdict
 from snrmjax.model.effect_metadata import Argument
 
 _ALIKE = 0.05  # of the best law's probability: those that the sensors cannot tell from it
@@ -30,8 +30,7 @@ def summarise_diagnosis(diagnosis: Diagnosis, predicted: Sequence[LevelResponse]
     `measured_up_to` (m or m/s) it is extrapolated, and `further` laws that were needed beside it
     have tables of their own. `probability` is that of the answer given: of its verdict, or of
     the members of its classes; `probabilities` are those of all answers considered. `tried` has
-    every fit that was compared with its `status`. `level_forces` are the forces that acted over the
-    recorded ones, of levels whose force was found to be recorded in a wrong scale.
+    every fit that was compared with its `status`.
     """
     gap = diagnosis.gap
     inner, outer = gap.interpolated, gap.extrapolated
@@ -63,10 +62,6 @@ def summarise_diagnosis(diagnosis: Diagnosis, predicted: Sequence[LevelResponse]
             "top_level": outer.level if outer else None,
             "top_level_before": outer.before if outer else None,
             "top_level_after": outer.after if outer else None,
-        },
-        "level_forces": {
-            str(level): {"value": gain.value, "std": gain.std}
-            for level, gain in diagnosis.level_forces.items()
         },
         "detection_limits": diagnosis.detection_limits,
         "p_value": diagnosis.checks.p_value,

@@ -13,7 +13,6 @@ from .effect_base import (
 from .effect_metadata import (
     Argument,
     Confusion,
-    Imitation,
     MotionScales,
     Parameter,
     Part,
@@ -54,7 +53,6 @@ __all__ = [
     "Argument",
     "BaseMotion",
     "Confusion",
-    "Imitation",
     "LinearModes",
     "LinearModesStd",
     "Matrices",

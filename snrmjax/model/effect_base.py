@@ -21,7 +21,6 @@ from jaxtyping import Array, Complex, Float
 
 from snrmjax.model.effect_metadata import (
     Confusion,
-    Imitation,
     MotionScales,
     Parameter,
     Part,
@@ -62,9 +61,6 @@ class AbstractEffect(eqx.Module):
       of a force that states none it is computed (see `shape_of`);
     - `confusions`: other effects that the same data may show, and the measurement that separates
       them;
-    - `imitations`: what outside the library does the same;
-    - `acts_like`: two effects of one answer with the same entry may be one law that the library
-      lacks; forces without an entry act like others that change the same part;
     - `is_linear`: a linear structure remains linear with it;
     - `like_force_gain`: a gain of all forces does the same;
     - `follows_force`: it adds a linear motion that the force drives, which beside a force of any
@@ -78,8 +74,6 @@ class AbstractEffect(eqx.Module):
     description: ClassVar[str] = ""
     shape: ClassVar[Shape | None] = None
     confusions: ClassVar[tuple[Confusion, ...]] = ()
-    imitations: ClassVar[tuple[Imitation, ...]] = ()
-    acts_like: ClassVar[str | None] = None
     is_linear: ClassVar[bool] = False
     like_force_gain: ClassVar[bool] = False
     follows_force: ClassVar[bool] = False

@@ -175,18 +175,3 @@ class Confusion(NamedTuple):
     separated_by: str
     by_itself: bool = False
     by_calibration: bool = False
-
-
-class Imitation(NamedTuple):
-    """What outside the library could do the same as an effect, and what would tell.
-
-    With `identical` it does the same to all that was measured. `unless_harmonic` is the harmonic
-    that excludes it where it was measured. `near_power` is the power of amplitude that the other
-    law has: it is a rival only where the measured power agrees with it.
-    """
-
-    reason: str
-    separated_by: str
-    identical: bool = False
-    unless_harmonic: int | None = None
-    near_power: float | None = None

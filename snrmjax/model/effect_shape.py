@@ -118,14 +118,3 @@ def starts_of(effect: type[AbstractEffect], scales: MotionScales) -> Starts:
     change = averaged_effect(typical_effect, *at)
     size = float(jnp.hypot(change.stiffness, scales.frequency * change.damping))
     return [(first * (scales.change / size if size > 0 else 1.0), *others)]
-
-
-def acts_like(effect: type[AbstractEffect]) -> str | None:
-    """What an effect acts like: two effects alike may stand for one law that the library lacks.
-
-    As its class states; forces that state nothing act like those that change the same part.
-    """
-    if effect.acts_like is not None or not issubclass(effect, AbstractForce):
-        return effect.acts_like
-    shape = shape_of(effect)
-    return None if shape is None else shape.part

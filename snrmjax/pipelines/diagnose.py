@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from snrmjax.diagnose.decide import Verdict
 from snrmjax.diagnose.diagnosis import diagnose_model
 from snrmjax.diagnose.diagnosis_result import Diagnosis, FormerAnswer
 from snrmjax.diagnose.location.where import Whereabouts, few_places, locate_force
@@ -19,6 +18,7 @@ from snrmjax.diagnose.response_prediction import (
     holds_response,
     predict_levels,
 )
+from snrmjax.diagnose.verdict import Verdict
 from snrmjax.io.diagnosis_results import placed_answer
 from snrmjax.io.files import FilePath
 from snrmjax.io.measurement_plans import read_further_states

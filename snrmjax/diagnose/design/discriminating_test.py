@@ -1,6 +1,6 @@
 """Which further test is expected to separate competing models (optimal design)."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from functools import cached_property
 from typing import NamedTuple
 
@@ -19,12 +19,12 @@ from snrmjax.diagnose.design.design_points import (
     refitted_chi_square,
     separation,
 )
+from snrmjax.diagnose.fitted_effects import FoundEffects
 from snrmjax.diagnose.misfit.candidates import decide_by, only_by_calibration
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
 from snrmjax.diagnose.misfit.predictions import Predicted
 from snrmjax.diagnose.misfit.programs import COMPARED
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
-from snrmjax.diagnose.search.model_search import FoundEffects
 from snrmjax.numerics.facts import Fact
 
 STATES = 12
@@ -374,14 +374,12 @@ def recommended_test(found: FoundEffects) -> DiscriminatingTest | None:
 def recommendation(
     found: FoundEffects,
     test: DiscriminatingTest | None,
-    open_questions: Sequence[Fact | str],
     *,
     phases: bool,
 ) -> Fact | None:
     """What would decide, each measurement once; None if nothing is open.
 
-    Arguments: `open_questions` are the measurements that would resolve doubts; `phases` says
-    whether any phase of the velocity is known.
+    Arguments: `phases` says whether the phases of the velocity are known.
     """
     groups = [set(group) for group in found.classes if len(group) > 1]
     asked: list[Fact | str] = []
@@ -395,5 +393,5 @@ def recommendation(
             asked += decide_by(static, harmonics=True) if static else []
         asked += [] if test.settles else [Fact("no_test_settles")]
         asked.append(test.measurement)
-    asked = list(dict.fromkeys([*asked, *open_questions]))
+    asked = list(dict.fromkeys(asked))
     return Fact("recommendation", measurements=tuple(asked)) if asked else None

@@ -1,7 +1,7 @@
 """The force and the harmonics that measured motions need by a model with further effects.
 
-The structure has all effects with zero strength, so that one compiled program serves every
-candidate: a candidate is a vector of parameters.
+The structure has the effects of all candidates with zero strength, so that one compiled program
+serves them: a candidate is a vector of parameters.
 """
 
 import dataclasses
@@ -37,7 +37,7 @@ _DIRECTIONS = 8  # derivatives that a call gives, at most
 
 
 class Group(NamedTuple):
-    """A structure with all known effects at zero strength."""
+    """A structure with further effects at zero strength."""
 
     model: Structure
     names: tuple[str, ...]
@@ -104,12 +104,15 @@ class Predictions:
     # What is added to the columns for that: errors that the records were corrected for still count.
     offset: Float[np.ndarray, "state column"] | None = None
     error_scale: float = 1.0  # of errors over those that were stated or assumed
-    free_level_forces: tuple[int, ...] = ()  # places of levels whose force has a gain of its own
 
     @property
     def n_baseline_errors(self) -> int:
         """How many shared errors are the baseline's: they come first, then those of levels."""
         return len(self.stated) + (self.force_gain_std > 0)
+
+    def with_kinds(self, kinds: Iterable[str]) -> "Predictions":
+        """The same for candidates of some kinds of effects."""
+        return dataclasses.replace(self, group=_with_effects(self.model, scales_of(self), kinds))
 
     def carried_back(self, by_error: Float[np.ndarray, "state column input"]) -> "Predictions":
         """The same as the records have it, by what errors do to the columns."""
@@ -272,11 +275,13 @@ def predictions_of(
     force_gain_std: float = 0.0,
     *,
     harmonics: int = programs.HARMONICS,
+    kinds: Iterable[str] | None = None,
 ) -> Predictions:
     """Predictions of a model for measured states, ready to be evaluated.
 
     The baseline's motions are found here. `force_gain_std` is the relative 1σ of a gain that all
-    forces share; `harmonics` are those of the motions.
+    forces share; `harmonics` are those of the motions; `kinds` the effects that candidates may
+    have, all that are known if None: their programs are the larger, the more they are.
     """
     model = dataclasses.replace(model, name="")  # its name would be a part of the programs
     records = _records(model, data, harmonics)
@@ -292,7 +297,9 @@ def predictions_of(
             name: (numbers[name], std)
             for name, std in (stated_stds(model) | _of_modal_mass(model, force_gain_std)).items()
         },
-        group=_all_effects(model, motion_scales(model, records["chosen"])),
+        group=_with_effects(
+            model, motion_scales(model, records["chosen"]), EFFECTS if kinds is None else kinds
+        ),
     )
 
 
@@ -340,10 +347,10 @@ def _of_modal_mass(model: Structure, force_gain_std: float) -> dict[str, float]:
     return {f"mode_{j + 1}.participation": std} if std > 0 else {}
 
 
-def _all_effects(baseline: Structure, scales: MotionScales) -> Group:
-    """The structure with every registered kind of effect that the baseline does not have."""
+def _with_effects(baseline: Structure, scales: MotionScales, kinds: Iterable[str]) -> Group:
+    """The structure with some kinds of effects that the baseline does not have."""
     present = [effect.kind for effect in baseline.effects]
-    model = with_idle_effects(baseline, [kind for kind in EFFECTS if kind not in present])
+    model = with_idle_effects(baseline, [kind for kind in kinds if kind not in present])
     added = model.effects[len(present) :]
     numbers, stds = parameter_values(model), stated_stds(model)
     names, values = tuple(numbers), np.array(list(numbers.values()))

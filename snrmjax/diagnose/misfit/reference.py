@@ -176,7 +176,7 @@ def with_first_gain(
     def driven(gain: float) -> SteadyStates:
         return eqx.tree_at(lambda d: d.force, data, gain * data.drive)
 
-    predictions = predictions_of(model, driven(1.0), priors.FREE_GAIN_STD)
+    predictions = predictions_of(model, driven(1.0), priors.FREE_GAIN_STD, kinds=())
     needed, unknown = weighted_misfit(predictions).baseline.force, predictions.chosen.phase_unknown
     phase = np.angle(np.asarray(predictions.chosen.states.velocity)[:, 0])
     # With known phases the part against damping, which no error of the stiffness changes.
@@ -187,7 +187,9 @@ def with_first_gain(
     gain, doubt, from_curves = float(np.median(gains[np.isfinite(gains)])), None, False
     # Twice: the first curves' prior lies about what the model as given needs.
     for _ in range(0 if unknown.any() else 2):
-        reference = reference_of(predictions_of(model, driven(gain), priors.FREE_GAIN_STD))
+        reference = reference_of(
+            predictions_of(model, driven(gain), priors.FREE_GAIN_STD, kinds=())
+        )
         if reference is None:
             break
         mass, std = reference.posterior.modal_mass

@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from snrmjax.diagnose import priors
 from snrmjax.diagnose.misfit.candidates import EffectCandidate, parameter_labels
 from snrmjax.diagnose.misfit.noise_model import NoiseModel, shared_covariance
 from snrmjax.diagnose.misfit.predictions import Predicted, Predictions
@@ -244,11 +243,9 @@ def _noise(predictions: Predictions, passed_on: ErrorPropagation) -> NoiseModel:
     base, by_linear = passed_on.slopes[:, :, :-2], passed_on.slopes[:, :, -2:]
     by_error, force = passed_on.by_error, passed_on.by_error[:, :, :1]
     gain = predictions.force_gain_std * force
-    free = level[:, None, None] == np.array(predictions.free_level_forces, dtype=int)
     shared = [
         base,
         *([gain] if np.any(gain) else []),
-        priors.FREE_LEVEL_FORCE_STD * force * free,
     ]
     of_no_level = sum(part.shape[2] for part in shared)
     member = (level[:, None] == np.arange(n_levels)).astype(float)

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Complex
 
 from snrmjax.diagnose.naming.laws import LAWS
 from snrmjax.diagnose.naming.readings import Readings
@@ -138,7 +138,7 @@ def parameters_of(readings: Readings, column: Column, strength: float) -> dict[s
     elif law is None or law.parameters is None:
         return None
     else:
-        values = law.parameters(readings.natural_frequency, readings.largest, own, *column.shape)
+        values = law.parameters(readings, own, *column.shape)
     return dict(zip(EFFECTS[column.kind].parameters(), map(float, values), strict=True))
 
 

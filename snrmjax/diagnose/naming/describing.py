@@ -120,11 +120,11 @@ def quadratic(
 def resonant(
     x: Amplitudes, frequency: Float[np.ndarray, " state"], order: int, detuning: float, ratio: float
 ) -> Complex[np.ndarray, " state"]:
-    """Dynamic stiffness that a mode at n (1 + detuning) ω₀ with V = b qⁿ p adds, over its largest.
+    """Dynamic stiffness that a mode at n (1 + detuning) ω₀ with V = b qⁿ p adds.
 
+    For n b² a²ⁿ⁻²/4ⁿ⁻¹ = ω₀⁴ x²ⁿ⁻².
     Arguments: `frequency` Ω/ω₀; `order` n, 2 or 3; `ratio` the damping ratio of that mode.
     """
     own = order * (1 + detuning)
     driven = order * frequency
-    change = -(x ** (2 * order - 2)) / (own**2 - driven**2 + 2j * ratio * own * driven)
-    return change / np.max(np.abs(change))
+    return -(x ** (2 * order - 2)) / (own**2 - driven**2 + 2j * ratio * own * driven)

@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 from scipy.linalg import block_diag, cholesky, solve_triangular
 from scipy.special import log_ndtr, logsumexp
 
-from snrmjax.diagnose.naming import priors
+from snrmjax.diagnose import priors
 from snrmjax.diagnose.naming.columns import Column, hypothesis_columns, odds_of
 from snrmjax.diagnose.naming.readings import Readings
 from snrmjax.model.library.measurement_chain import ForceHarmonics
@@ -201,7 +201,7 @@ def _weighed(problem: Problem) -> tuple[list[Cell], Float[np.ndarray, " column"]
             places = np.nonzero((most if bound is None else most + bound) > best - _LEAST)
             if places[0].size:
                 whole = normal if other is None else normal.with_rows_of(other)
-                some = whole.pairs(*places, best - _LEAST)
+                some = whole.pairs(places[0], places[1], best - _LEAST)
                 best = max([best, *(cell.log_evidence for cell in some)])
                 cells += some
     kept = [cell for cell in cells if cell.log_evidence > best - _LEAST]
@@ -372,6 +372,20 @@ class _Diagonals(NamedTuple):
 def _log_half(sign: np.ndarray, standardised: np.ndarray) -> np.ndarray:
     """ln of what a law of one sign gains: the posterior's part of that sign, over the prior's."""
     return np.where(sign == 0, 0.0, np.log(2) + log_ndtr(sign * standardised))
+
+
+def seen_strengths(problem: Problem, cell: Cell, nats: float) -> Float[np.ndarray, " column"]:
+    """Of every column the strength that would raise the evidence of a hypothesis by some nats."""
+    normal = _Normal.of(problem.columns, problem.blocks[0], cell.sizes[:2])
+    for block, size in zip(problem.blocks[1:], cell.sizes[2:], strict=True):
+        normal = normal.with_rows_of(_Normal.of(problem.columns, block, (size,)))
+    some, n_rows = list(cell.columns), sum(len(block.rows) for block in problem.blocks)
+    across = normal.gram[:, some]
+    known = across @ np.linalg.pinv(normal.gram[np.ix_(some, some)], hermitian=True)
+    precision = np.diag(normal.gram) - np.sum(known * across, axis=1)
+    # Half the fall of χ² has to pay for the choice, and for one number more.
+    need = nats + np.log(n_rows)
+    return np.sqrt(need / np.maximum(precision, 1e-12))
 
 
 class Solved(NamedTuple):

@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Complex
 
-from snrmjax.diagnose.naming import describing, priors
+from snrmjax.diagnose import priors
+from snrmjax.diagnose.naming import describing
 from snrmjax.diagnose.naming.readings import HarmonicReading, Readings
 from snrmjax.model.library.damping import (
     CubicDamping,
@@ -51,6 +52,7 @@ from snrmjax.model.library.stiffness import (
     QuadraticStiffness,
     QuinticStiffness,
 )
+from snrmjax.numerics.units import HERTZ
 
 _GAPS = np.linspace(0.05, 0.95, 19)  # over the largest amplitude
 _STIFFNESSES = np.log([0.1, 1.0, 10.0, 100.0])  # ln, of a stop, over ω₀²
@@ -78,7 +80,7 @@ class Law(NamedTuple):
     std: float | None = None  # 1σ of the strength; None: any size
     odds: float = 1.0  # over those of a law
     of_instrument: bool = False
-    # Parameters of the effect by ω₀, the largest modal amplitude, strength and shape.
+    # Parameters of the effect, in modal units, by the readings, strength and shape.
     parameters: Callable[..., tuple[float, ...]] | None = None
 
 
@@ -164,6 +166,18 @@ def _third_of_resonance(order: int) -> Change:
     return higher
 
 
+def _of_resonance(order: int) -> Callable[..., tuple[float, ...]]:
+    """Of the coupling b by n b² a²ⁿ⁻²/4ⁿ⁻¹, the change over that of a mode of stiffness ω₀²."""
+
+    def parameters(r: Readings, s: float, detuning: float, log_times: float) -> tuple[float, ...]:
+        square = max(s, 0.0) * 4 ** (order - 1) / order
+        coupling = np.sqrt(square) * r.natural_frequency**2 / r.largest ** (order - 1)
+        hz = order * (1 + detuning) * r.natural_frequency / HERTZ
+        return float(coupling), hz, float(np.exp(log_times)) * max(r.damping_ratio, 1e-4)
+
+    return parameters
+
+
 def _close_mode(r: Readings, apart: float, log_times: float) -> np.ndarray:
     """Of a mode at (1 + `apart`) ω₀ that the force drives too."""
     own, omega = 1 + apart, r.relative_frequency
@@ -189,23 +203,23 @@ _OF_GAIN: dict[str, Any] = {"std": 1.0, **_INSTRUMENT}
 
 LAWS: dict[str, Law] = {
     LinearFrequencyShift.kind: Law(
-        _stiffness(0), parameters=lambda _, b, s: (float(np.sqrt(max(1 + s, 0.0))) - 1,)
+        _stiffness(0), parameters=lambda r, s: (float(np.sqrt(max(1 + s, 0.0))) - 1,)
     ),
     CubicStiffness.kind: Law(
         *(_stiffness(2), _of_force(lambda q, _: 4 / 3 * q**3)),
-        parameters=lambda w, b, s: (s * w**2 / (0.75 * b**2),),
+        parameters=lambda r, s: (s * r.natural_frequency**2 / (0.75 * r.largest**2),),
     ),
     QuinticStiffness.kind: Law(
         *(_stiffness(4), _of_force(lambda q, _: 1.6 * q**5)),
-        parameters=lambda w, b, s: (s * w**2 / (0.625 * b**4),),
+        parameters=lambda r, s: (s * r.natural_frequency**2 / (0.625 * r.largest**4),),
     ),
     QuadraticStiffness.kind: Law(
         *(lambda r, log_s, _: _quadratic(r, log_s)[0], _second_of(_quadratic)),
         axes=(_QUADRATICS,),
         choices=(1.0, -1.0),
         sign=1,
-        parameters=lambda w, b, s, log_s, side: (
-            side * float(np.exp(log_s) * np.sqrt(max(s, 0.0))) * w**2 / b,
+        parameters=lambda r, s, log_s, side: (
+            side * float(np.exp(log_s) * np.sqrt(max(s, 0.0))) * r.natural_frequency**2 / r.largest,
         ),
     ),
     BilinearStiffness.kind: Law(
@@ -213,8 +227,8 @@ LAWS: dict[str, Law] = {
         axes=(_BILINEARS,),
         choices=(1.0, -1.0),
         sign=-1,
-        parameters=lambda w, b, s, log_k, side: (
-            side * float(np.exp(log_k) * np.sqrt(max(-s, 0.0))) * w**2,
+        parameters=lambda r, s, log_k, side: (
+            side * float(np.exp(log_k) * np.sqrt(max(-s, 0.0))) * r.natural_frequency**2,
         ),
     ),
     GapStiffness.kind: Law(
@@ -222,93 +236,117 @@ LAWS: dict[str, Law] = {
         _of_force(lambda q, _, width: np.sign(q) * np.maximum(np.abs(q) - width, 0.0)),
         (_GAPS,),
         sign=1,
-        parameters=lambda w, b, s, width: (s * w**2, width * b),
+        parameters=lambda r, s, width: (s * r.natural_frequency**2, width * r.largest),
     ),
     OneSidedStop.kind: Law(
         lambda r, width, log_k: describing.stop(r.relative_amplitude, width, np.exp(log_k)) + 0j,
         _at_stop,
         (_GAPS[::3], _STIFFNESSES),
         sign=1,
-        parameters=lambda w, b, s, width, _: (s * w**2, width * b),
+        parameters=lambda r, s, width, _: (s * r.natural_frequency**2, width * r.largest),
     ),
-    LinearDampingChange.kind: Law(_damping(0, 1), parameters=lambda w, b, s: (s / 2,)),
+    LinearDampingChange.kind: Law(_damping(0, 1), parameters=lambda r, s: (s / 2,)),
     QuadraticDamping.kind: Law(
         *(_damping(1, 2), _of_force(lambda _, v: 3 * np.pi / 8 * v * np.abs(v))),
         sign=1,
-        parameters=lambda w, b, s: (s * 3 * np.pi / (8 * b),),
+        parameters=lambda r, s: (s * 3 * np.pi / (8 * r.largest),),
     ),
     CubicDamping.kind: Law(
         *(_damping(2, 3), _of_force(lambda _, v: 4 / 3 * v**3)),
-        parameters=lambda w, b, s: (s / (0.75 * b**2 * w),),
+        parameters=lambda r, s: (s / (0.75 * r.largest**2 * r.natural_frequency),),
     ),
     VanDerPolDamping.kind: Law(
         *(_damping(2, 1), _of_force(lambda q, v: 4 * q**2 * v)),
-        parameters=lambda w, b, s: (4 * s * w / b**2,),
+        parameters=lambda r, s: (4 * s * r.natural_frequency / r.largest**2,),
     ),
     CoulombFriction.kind: Law(
         *(_damping(-1, 0), _of_force(lambda _, v: np.pi / 4 * np.sign(v))),
         sign=1,
-        parameters=lambda w, b, s: (s * w**2 * np.pi * b / 4,),
+        parameters=lambda r, s: (s * r.natural_frequency**2 * np.pi * r.largest / 4,),
     ),
     JenkinsSlider.kind: Law(
         _slider,
         _of_force(lambda q, v, log_slip: describing.slipping(q, v, np.exp(log_slip))),
         (_SLIPS,),
         sign=1,
-        parameters=lambda w, b, s, log_slip: (s * w**2, float(np.exp(log_slip)) * b),
+        parameters=lambda r, s, log_slip: (
+            s * r.natural_frequency**2,
+            float(np.exp(log_slip)) * r.largest,
+        ),
     ),
     IwanMicroslip.kind: Law(
         *(_iwan, _of_force(describing.microslip), (_EXPONENTS,)),
         sign=1,
-        parameters=lambda w, b, s, p: (s * w**2 / b ** (p - 1), p),
+        parameters=lambda r, s, p: (s * r.natural_frequency**2 / r.largest ** (p - 1), p),
     ),
     InternalResonanceOneToTwo.kind: Law(
         *(_resonance(2), _third_of_resonance(2), (_DETUNINGS, _DAMPINGS)),
         sign=1,
         odds=priors.RESONANCE,
+        parameters=_of_resonance(2),
     ),
     InternalResonanceOneToThree.kind: Law(
         *(_resonance(3), _third_of_resonance(3), (_DETUNINGS, _DAMPINGS)),
         sign=1,
         odds=priors.RESONANCE,
+        parameters=_of_resonance(3),
     ),
     AddedMass.kind: Law(
         lambda r: -(r.relative_frequency**2) * priors.ADDED_MASS + 0j,
         std=1.0,
         odds=priors.INSTRUMENT,
+        parameters=lambda r, s: (s * priors.ADDED_MASS,),
     ),
     ForceHarmonics.kind: Law(
-        lambda r, _: np.zeros_like(r.dynamic_stiffness), _forced, choices=(2.0, 3.0), **_INSTRUMENT
+        *(lambda r, _: np.zeros_like(r.dynamic_stiffness), _forced),
+        choices=(2.0, 3.0),
+        parameters=lambda r, s, order: (s * (order == 2), s * (order == 3)),
+        **_INSTRUMENT,
     ),
     ForceGainError.kind: Law(
         lambda r: _relative(r) * priors.GAIN,
-        parameters=lambda w, b, s: (-s * priors.GAIN,),
+        parameters=lambda r, s: (-s * priors.GAIN,),
         **_OF_GAIN,
     ),
     SensorGainError.kind: Law(
         lambda r: _larger_motion(r) * priors.GAIN,
-        parameters=lambda w, b, s: (s * priors.GAIN,),
+        parameters=lambda r, s: (s * priors.GAIN,),
         **_OF_GAIN,
     ),
     ModeShapeChange.kind: Law(
         lambda r: _larger_motion(r) * priors.GAIN * r.relative_amplitude**2,
         std=1.0,
         odds=priors.INSTRUMENT,
-        parameters=lambda w, b, s: (s * priors.GAIN / b**2,),
+        parameters=lambda r, s: (s * priors.GAIN / r.largest**2,),
     ),
-    CloseMode.kind: Law(_close_mode, axes=(_APART, _DAMPINGS), **_INSTRUMENT),
-    ResidualMode.kind: Law(lambda r: _relative(r) ** 2, **_INSTRUMENT),
+    CloseMode.kind: Law(
+        _close_mode,
+        axes=(_APART, _DAMPINGS),
+        parameters=lambda r, s, apart, log_times: (
+            -s * r.constant,
+            (1 + apart) * r.natural_frequency / HERTZ,
+            float(np.exp(log_times)) * max(r.damping_ratio, 1e-4),
+        ),
+        **_INSTRUMENT,
+    ),
+    ResidualMode.kind: Law(
+        lambda r: _relative(r) ** 2,
+        parameters=lambda r, s: (-s * r.constant / r.natural_frequency**2,),
+        **_INSTRUMENT,
+    ),
     SensorPhaseError.kind: Law(
         lambda r: -1j * _relative(r) * priors.INSTRUMENT_PHASE,
-        parameters=lambda w, b, s: (float(np.rad2deg(s * priors.INSTRUMENT_PHASE)),),
+        parameters=lambda r, s: (float(np.rad2deg(s * priors.INSTRUMENT_PHASE)),),
         **_OF_GAIN,
     ),
     ForceOffsetError.kind: Law(
-        lambda r: _relative(r) * np.min(r.force) / r.force * priors.FORCE_OFFSET, **_OF_GAIN
+        lambda r: _relative(r) * np.min(r.force) / r.force * priors.FORCE_OFFSET,
+        parameters=lambda r, s: (-s * priors.FORCE_OFFSET * float(np.min(r.force)),),
+        **_OF_GAIN,
     ),
     FrequencyDrift.kind: Law(
         lambda r: 2 * r.order * priors.DRIFT + 0j,
-        parameters=lambda w, b, s: (s * priors.DRIFT,),
+        parameters=lambda r, s: (s * priors.DRIFT,),
         **_OF_GAIN,
     ),
 }

@@ -1,12 +1,12 @@
 """The answer by parts: laws that change stiffness and damping, their fraction, what is left."""
 
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from snrmjax.diagnose.naming import priors
+from snrmjax.diagnose import priors
 from snrmjax.diagnose.naming.columns import is_instrument, parameters_of
 from snrmjax.diagnose.naming.evidence import Cell, Problem, Solved, solved
 from snrmjax.model.library.free_laws import DisplacementDampingLaw, StiffnessLaw
@@ -67,6 +67,7 @@ class Naming(NamedTuple):
     answers: Mapping[Laws, float]  # probabilities of sets of laws, the likeliest first
     parameters: Mapping[str, Strength]  # of the laws in the most probable hypothesis with them all
     misfit: float  # root-mean-square residual of that hypothesis, over the noise
+    cell: Cell
     natural_frequency: float  # rad/s, of the linear mode in that hypothesis
     damping_ratio: float
 
@@ -85,6 +86,9 @@ class Naming(NamedTuple):
         return tuple(found[kind] for kind in self.effects)
 
 
+_Least = tuple[np.ndarray, Callable[[np.ndarray], bool]]
+
+
 class _Read(NamedTuple):
     """One hypothesis, with what it says of every part."""
 
@@ -100,7 +104,8 @@ def naming_of(problem: Problem, cells: list[Cell]) -> Naming:
     cells = cells[:_CELLS]
     weight = np.exp([cell.log_evidence - cells[0].log_evidence for cell in cells])
     weight = weight / weight.sum()
-    reads = [_read(problem, cell, float(w)) for cell, w in zip(cells, weight, strict=True)]
+    least = {part: _smallest(problem, part) for part in problem.parts}
+    reads = [_read(problem, cell, float(w), least) for cell, w in zip(cells, weight, strict=True)]
     answers: dict[Laws, float] = {}
     for one in reads:
         drawn = (kind for part, kind in DRAWN.items() if one.left[part])
@@ -115,6 +120,7 @@ def naming_of(problem: Problem, cells: list[Cell]) -> Naming:
     linear, (softer, lossier) = problem.readings.linear, best.solved.linear
     return Naming(
         *(tuple(parts), answers, _parameters(problem, best, wanted), best.solved.misfit),
+        cell=best.cell,
         natural_frequency=linear.natural_frequency + softer * linear.frequency_std,
         damping_ratio=linear.damping_ratio + lossier * linear.damping_std,
     )
@@ -131,7 +137,9 @@ def _parameters(problem: Problem, one: _Read, wanted: set[str]) -> dict[str, Str
         values = parameters_of(problem.readings, column, strength) or {}
         moved = parameters_of(problem.readings, column, strength + float(std[place])) or {}
         for name, value in values.items():
-            found[f"{column.kind}.{name}"] = Strength(value, abs(moved[name] - value))
+            label = f"{column.kind}.{name}"
+            if value or label not in found:  # of force harmonics each column has one
+                found[label] = Strength(value, abs(moved[name] - value))
     return found
 
 
@@ -188,7 +196,7 @@ def _rest(problem: Problem, cell: Cell, part: str) -> slice:
     return slice(first, first + (n if k < 2 else 2 * n))
 
 
-def _read(problem: Problem, cell: Cell, weight: float) -> _Read:
+def _read(problem: Problem, cell: Cell, weight: float, least: dict[str, _Least]) -> _Read:
     solution = solved(problem, cell)
     k = len(cell.columns)
     std = np.sqrt(np.diag(solution.covariance))[:k]
@@ -196,7 +204,7 @@ def _read(problem: Problem, cell: Cell, weight: float) -> _Read:
     laws: dict[str, Laws] = {"instrument": ()}
     left = {"instrument": False}
     for part in problem.parts:
-        small, visible = _smallest(problem, part)
+        small, visible = least[part]
         change = _changes(problem, cell, solution, part)
         rest, each = change.left, change.of_law * change.strength
         whole = _size(np.sum(each, axis=1) + rest)
@@ -223,7 +231,7 @@ def _read(problem: Problem, cell: Cell, weight: float) -> _Read:
     return _Read(weight, cell, solution, laws, left)
 
 
-def _smallest(problem: Problem, part: str) -> tuple[np.ndarray, Callable[[np.ndarray], bool]]:
+def _smallest(problem: Problem, part: str) -> _Least:
     """Changes that are no finding at every state, and whether rows show a change."""
     if part in DRAWN:
         return priors.BELOW_BANDWIDTH * problem.readings.relative_damping, lambda _: True
@@ -348,15 +356,16 @@ def _size_of(curves: np.ndarray) -> np.ndarray:
 def _remainder(problem: Problem, reads: list[_Read], part: str, best: _Read) -> Remainder:
     readings = problem.readings
     x = np.geomspace(np.min(readings.relative_amplitude), 1.0, _POINTS)
-    natural, velocity = readings.natural_frequency, np.max(readings.amplitude)
-    velocity = x * velocity * natural
+    natural = readings.natural_frequency
+    velocity = x * np.max(readings.amplitude) * natural
     change = _changes(problem, best.cell, best.solved, part)
     functions = problem.remainders(x)
     order = np.argsort(readings.relative_amplitude)
     at_states = change.of_law @ change.strength
     laws = np.interp(x, readings.relative_amplitude[order], at_states[order])
     if part in DRAWN:
-        unit = unit_of_state = 1.0 if part == "stiffness" else 0.5
+        unit: Any = 1.0 if part == "stiffness" else 0.5
+        unit_of_state = unit
         beyond = np.real(readings.beyond) / natural**2
         if part == "damping":
             beyond = np.imag(readings.beyond) / (2 * natural * readings.frequency)

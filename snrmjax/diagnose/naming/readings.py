@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
-from snrmjax.diagnose.naming import priors
+from snrmjax.diagnose import priors
 from snrmjax.identify.test_model.balance import Balance, whitening
 from snrmjax.identify.test_model.hyper import MASS, PHASE
 from snrmjax.identify.test_model.posterior import TestPosterior, fit_test
@@ -90,6 +90,11 @@ class Readings(NamedTuple):
     def natural_frequency(self) -> float:
         """ω₀ of the model, rad/s."""
         return self.linear.natural_frequency
+
+    @property
+    def constant(self) -> float:
+        """A, the product of the mode's shapes at sensor and force, 1/kg."""
+        return self.linear.side * float(self.posterior.states.constant)
 
     @property
     def scales(self) -> MotionScales:

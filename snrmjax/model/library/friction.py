@@ -31,7 +31,6 @@ from snrmjax.model.effect_metadata import (
     NOT_BELOW_ZERO,
     Argument,
     Confusion,
-    Imitation,
     MotionScales,
     Part,
     Prior,
@@ -222,13 +221,6 @@ class IwanMicroslip(AbstractSliders):
         "with a power of the amplitude."
     )
     shape: ClassVar[Shape] = _SLIP
-    imitations: ClassVar[tuple[Imitation, ...]] = (
-        Imitation(
-            "other laws of friction with the same backbone, such as Bouc and Wen's, fit as well.",
-            "measure a hysteresis loop, or levels over two decades",
-            identical=True,
-        ),
-    )
     coefficient: Scalar = parameter(
         *("(kg^1/2 m)^(1-exponent)/s²", "stiffness that slip takes away at unit amplitude"),
         rules=(NOT_NEGATIVE,),
@@ -330,13 +322,6 @@ class CoulombFriction(AbstractHysteresis):
         *(Part.DAMPING, Symmetry.ODD, Argument.VELOCITY), power=-1, factor=4 / np.pi
     )
     confusions: ClassVar[tuple[Confusion, ...]] = (FRICTION_OR_FORCE_OFFSET,)
-    imitations: ClassVar[tuple[Imitation, ...]] = (
-        Imitation(
-            "damping that goes with the square root of the velocity fits as well.",
-            "measure smaller amplitudes, or a free decay",
-            near_power=-0.5,
-        ),
-    )
     force: Scalar = parameter(
         "kg^1/2 m/s²", "friction force", rules=(NOT_NEGATIVE,), prior=NOT_BELOW_ZERO
     )

@@ -82,7 +82,6 @@ class LinearDampingChange(AbstractLinearChange):
     kind: ClassVar[str] = "linear_damping_change"
     description: ClassVar[str] = "The linear damping differs from the one stated."
     shape: ClassVar[Shape] = Shape(Part.DAMPING, power=0)
-    acts_like: ClassVar[str | None] = Part.DAMPING
     damping_ratio_change: Scalar = parameter(
         *("1", "change of the damping ratio"),
         start=lambda scales: 0.5 * scales.change / scales.frequency**2,

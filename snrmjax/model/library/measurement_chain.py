@@ -18,7 +18,6 @@ from snrmjax.model.effect_metadata import (
     MORE_THAN_NOTHING,
     VISIBLE_CHANGE,
     Confusion,
-    Imitation,
     MotionScales,
     Part,
     Prior,
@@ -76,7 +75,6 @@ class ForceGainError(AbstractMeasurementEffect):
         "The force is recorded in a wrong scale: the calibration factor of the force sensor, or a "
         "mass between it and the structure."
     )
-    acts_like: ClassVar[str | None] = _SIZE
     confusions: ClassVar[tuple[Confusion, ...]] = (SIZE_OF_RESPONSE, FORCE_OR_SENSOR_GAIN)
     is_linear: ClassVar[bool] = True
     like_force_gain: ClassVar[bool] = True
@@ -116,7 +114,6 @@ class SensorGainError(AbstractMeasurementEffect):
         "The velocity is recorded in a wrong scale: the calibration factor of the sensor, or peak "
         "values taken for amplitudes."
     )
-    acts_like: ClassVar[str | None] = _SIZE
     confusions: ClassVar[tuple[Confusion, ...]] = (SIZE_OF_RESPONSE, FORCE_OR_SENSOR_GAIN)
     is_linear: ClassVar[bool] = True
     like_force_gain: ClassVar[bool] = True
@@ -165,7 +162,6 @@ class ResidualMode(AbstractMeasurementEffect):
         "Modes far from the measured frequencies, which the model lacks, add a displacement that "
         "is proportional to the force."
     )
-    acts_like: ClassVar[str | None] = _SIZE
     confusions: ClassVar[tuple[Confusion, ...]] = (FAR_MODE_OR_PHASE_ERROR,)
     is_linear: ClassVar[bool] = True
     follows_force: ClassVar[bool] = True
@@ -196,15 +192,6 @@ class CloseMode(AbstractMeasurementEffect):
         "response."
     )
     confusions: ClassVar[tuple[Confusion, ...]] = (FURTHER_MODE,)
-    imitations: ClassVar[tuple[Imitation, ...]] = (
-        Imitation(
-            "a mode close by has three numbers of its own: to one sensor a clearance beside a "
-            "cubic stiffness, or several small errors, can look like it.",
-            "measure with a second sensor, where a further mode has another shape, or sweep "
-            "through the frequency at which it is said to be",
-            identical=True,
-        ),
-    )
     is_linear: ClassVar[bool] = True
     searched: ClassVar[bool] = False
     follows_force: ClassVar[bool] = True
@@ -258,15 +245,7 @@ class ModeShapeChange(AbstractMeasurementEffect):
         "The mode shape changes with the amplitude: the sensor's share of the motion is not "
         "constant."
     )
-    acts_like: ClassVar[str | None] = _SIZE
     confusions: ClassVar[tuple[Confusion, ...]] = (SIZE_OF_RESPONSE,)
-    imitations: ClassVar[tuple[Imitation, ...]] = (
-        Imitation(
-            "a sensor that saturates can do what mode_shape_change does.",
-            "record harmonic 3 at the largest level, or use a second sensor",
-            unless_harmonic=3,
-        ),
-    )
     stage: ClassVar[int] = 0
     coefficient: Scalar = parameter(
         *("1/(kg m²)", "relative change per squared amplitude"),

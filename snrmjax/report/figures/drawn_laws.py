@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from snrmjax.diagnose import priors
-from snrmjax.diagnose.laws.law_search import DrawnLaw
+from snrmjax.diagnose.drawn_law import DrawnLaw
 from snrmjax.model.effect_metadata import Argument
 from snrmjax.report.html import ReportTable, number, with_error
 from snrmjax.report.style import (

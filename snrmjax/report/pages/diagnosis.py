@@ -7,18 +7,18 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-from snrmjax.diagnose.decide import Verdict
 from snrmjax.diagnose.diagnosis_result import Diagnosis
-from snrmjax.diagnose.evidence import NOISE_REJECTED, NONE, UNKNOWN
+from snrmjax.diagnose.fitted_effects import TriedEffect
 from snrmjax.diagnose.location.where import PlacedForce, Whereabouts
 from snrmjax.diagnose.misfit.candidates import scales_of_motions
+from snrmjax.diagnose.misfit.locating import Located
+from snrmjax.diagnose.naming.detection import beyond_data
 from snrmjax.diagnose.priors import AS_NOISE
 from snrmjax.diagnose.response_prediction import (
     LevelResponse,
     holds_response,
 )
-from snrmjax.diagnose.search.locating import Located
-from snrmjax.diagnose.search.model_search import TriedEffect, beyond_data
+from snrmjax.diagnose.verdict import NOISE_REJECTED, NONE, UNKNOWN, Verdict
 from snrmjax.io import diagnosis_results as written
 from snrmjax.io.files import write_summary
 from snrmjax.io.models import write_model

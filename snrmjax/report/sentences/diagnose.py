@@ -18,11 +18,6 @@ _LAWS = {
     ),
     "slip": ("friction with a memory", "gaining stiffness", "losing stiffness", "m"),
 }
-_CURVES = {
-    "stiffness": "the stiffness as a free function of the amplitude",
-    "damping": "the damping as a free function of the amplitude",
-    "order": "a natural frequency that moves freely in the order of the test",
-}
 _COMPLETED = {
     "completed": "",
     "nothing_added": "nothing was added to the model",
@@ -196,14 +191,6 @@ def _law_class(*, law: str, symmetries: Sequence[str], onsets: Sequence) -> str:
     return text
 
 
-def _level_force(*, level: int, gain: float, std: float) -> str:
-    digits = max(0, 1 - int(np.floor(np.log10(max(std, 1e-9)))))
-    return (
-        f"The force at level {level} was {gain:.{digits}f} ± {std:.{digits}f} times the recorded "
-        "one."
-    )
-
-
 def _placed(place: str, probability: float, other: str, misfit: float, sensor: str | None) -> str:
     where = "on the mode as a whole" if place == "everywhere" else f"at {place}"
     return f"the missing force acts {where} ({probability_in_words(probability)})."
@@ -244,7 +231,6 @@ SENTENCES: dict[str, Wording] = {
     "misfit_falls": lambda *, before, after: (
         f"With that the misfit falls from {_times(before)} to {_times(after)} times the noise."
     ),
-    "level_force": _level_force,
     "most_probable": _most_probable,
     "probability_of_verdict": "probability: {probability}",
     "parameter_found": lambda *, name, unit, value, std: (
@@ -268,83 +254,10 @@ SENTENCES: dict[str, Wording] = {
         f"{'overstated' if ratio < 1 else 'understated'}."
     ),
     "no_effect_explains": "no effect of the library explains what is left.",
-    "unknown_law": lambda *, probability, left: (
-        f"a law outside the library has a probability of {100 * probability:.0f} %: "
-        + ("what is left is small, but smoother than noise." if left is None else str(left))
-    ),
-    "curve_left": lambda *, curve, chance: (
-        f"{_CURVES[curve]} still explains a part of the misfit that is left (probability by chance "
-        f"{chance:.0e}): the law is not the true one."
-    ),
-    "level_worse": lambda *, level, of_force, ratio: (
-        (f"level {level} is" if of_force else f"the harmonics of level {level} are")
-        + f" fitted {ratio:.2g} times worse than the others: something is missing there."
-    ),
-    "states_wander": (
-        "the misfit that is left is {ratio:.2g} times as large in the direction of a change of the "
-        "natural frequency as across it, which noise is not: were the states of a level measured "
-        "at different temperatures?"
-    ),
-    "neighbours_alike": lambda *, correlation, of_test: (
-        "the misfits of neighbouring states "
-        f"{'in the order of the test' if of_test else 'along the resonance'} are correlated "
-        f"({correlation:.2f}): those of noise are not."
-    ),
-    "level_missed": (
-        "level {level}, left out of the fit, is missed by {misfit:.2g} times the noise: the law is "
-        "not the true one."
-    ),
-    "top_level_missed": (
-        "level {level}, left out of the fit, is missed by {misfit:.2g} times the noise, within the "
-        "uncertainty of the parameters: nothing proves the law there."
-    ),
-    "one_direction_alike": lambda *, effect: (
-        "a damping that acts in one direction only has the same fundamental as "
-        f"{effect_name(effect)}."
-    ),
-    "adds_energy": lambda *, effect: (
-        f"{effect_name(effect)} with a negative coefficient adds energy: a feedback, or a force "
-        "that lags behind the displacement, does the same."
-    ),
-    "wider_than_measured": lambda *, effect: (
-        f"{effect_name(effect)} is wider than the range of frequencies measured: it was not "
-        "observed as a resonance, and many laws of amplitude look like one side of it."
-    ),
-    "three_effects": lambda *, effects: "three effects together can fit most laws.",
-    "same_part_twice": lambda *, effects: (
-        f"{effect_names(effects)} change the same part of the force balance: together they may "
-        "stand for one law that the library does not have."
-    ),
-    "further_mode_beside": (
-        "a further mode beside another effect can fit a law that the library does not have."
-    ),
-    "other_power": lambda *, effect, part, exponent, exponent_std, expected: (
-        f"the {part} changes with the power {exponent:.2f} ± {exponent_std:.2f} of the amplitude, "
-        f"not with the power {expected:.3g} of {effect_name(effect)}."
-    ),
-    "level_forces_alike": lambda *, levels, effects: (
-        f"a force of {level_names(levels)} that is recorded in a wrong scale"
-        f"{f' beside {effect_names(effects)}' if effects else ''} explains these data as well."
-    ),
-    "strength_unknown": lambda *, effect, strength, std: (
-        f"these data do not determine {effect_name(effect)}: its strength is {strength:.2g} with a "
-        f"1σ of {std:.2g}, larger than itself."
-    ),
-    "gain_or_modal_mass": lambda *, effect, gain, mass, mass_of_model: (
-        f"{effect_name(effect)} of {gain:+.2g} may be the modal mass: with {mass:.4g} kg in place "
-        f"of the model's {mass_of_model:.4g} kg, of which no error is stated (`modal_mass_std`), "
-        "the model needs no such effect."
-    ),
-    "force_gain_far": (
-        "the answer needs {gain:.2g} times the force that smooth curves need: with a force of any "
-        "size almost any law fits, so the force gain cannot be determined beside it."
-    ),
-    "force_gain_moved": lambda *, change: (
-        f"the answer moves the force gain by {100 * change:+.2g} %: smooth curves of amplitude "
-        "need the former one, and beside a free gain these data hardly determine the law."
-    ),
-    "force_gain_in_answer": (
-        "the force gain, which these data hardly determine, may be a part of the answer."
+    "other_sensors_missed": (
+        "the answer follows from the reference sensor; at the other sensors it leaves {misfit:.2g} "
+        "times the noise: the mode shape may change with amplitude, or the force acts elsewhere "
+        "(`--where`)."
     ),
     # Notes on data and model.
     "answer_before": _before,
@@ -355,11 +268,6 @@ SENTENCES: dict[str, Wording] = {
     ),
     "gain_with_effects": (
         "with the effects found the gain becomes {gain:.3g} N/V (before: {before:.3g})."
-    ),
-    "best_as_recorded": lambda *, effects, levels, lead: (
-        f"with the forces as recorded the best answer is {kinds_in_words(effects) or 'none'}, "
-        f"and it fits worse than a gain of the force of {level_names(levels)} (Schwarz's "
-        f"criterion: by {lead:.0f})."
     ),
     "noise_not_stated": lambda *, size: (
         f"no noise is stated: what is left ({100 * size:.2g} % of velocity, "
@@ -423,16 +331,4 @@ SENTENCES: dict[str, Wording] = {
     ),
     # Drawn laws.
     "law_class": _law_class,
-    "law_is_drawn": lambda *, freedom, largest, argument: (
-        "no effect of the library explains the data; the law is drawn from them with "
-        f"{freedom:.1f} effective parameters. It was measured up to {largest:.3g} "
-        f"{_UNITS[argument]}: beyond, it goes on straight, which nothing proves."
-    ),
-    "law_left_out": (
-        "level {inner[0]}, left out, is predicted by interpolation: {inner[2]:.2g} times the noise "
-        "({inner[1]:.2g} before); the top level {outer[0]} by extrapolation: {outer[2]:.2g} "
-        "({outer[1]:.2g} before)."
-    ),
-    "odd_part_alone": "without harmonics the odd part of the force alone is seen.",
-    "laws_as_good": lambda *, effects: f"{effect_names(effects, 'or')} would do about as well.",
 }

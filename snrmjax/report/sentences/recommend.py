@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from snrmjax.report.sentences import Wording, enumerated
-from snrmjax.report.sentences.diagnose import effect_names, level_names
+from snrmjax.report.sentences.diagnose import effect_names
 
 _UNITS = {"velocity": "m/s", "frequency": "Hz"}
 
@@ -95,42 +95,9 @@ SENTENCES: dict[str, Wording] = {
         f"{100 * share:.2g} %"
     ),
     "resonances_apart": _resonances_apart,
-    "widen_levels": (
-        "widen the range of levels at both ends and record the second and third harmonics"
-    ),
     "widen_range": ("widen the range of levels and measure farther off resonance on both sides"),
     "record_harmonics": (
         "record the second and third harmonics of the velocity (with their noise floor) at the "
         "largest level"
-    ),
-    "record_second_harmonic": lambda *, closer: (
-        f"record harmonic 2 at the largest level{' with less noise' if closer else ''}"
-    ),
-    "record_harmonics_of_law": lambda *, kind_is_open: (
-        "record harmonics 2 and 3 of the velocity (with their noise floor) at the largest level: "
-        "their sign and size tell a force of the velocity from one of the displacement."
-        if kind_is_open
-        else "record harmonic 2 of the velocity (with its noise floor) at the largest level: it "
-        "shows whether the force is the same in both directions."
-    ),
-    "measure_without_feedback": ("measure with every feedback off, or record the feedback's force"),
-    "step_wider": "step through a wider range of frequencies at the largest level",
-    "step_through_mode": (
-        "step finely through the frequency of the further mode, or widen the range of levels at "
-        "both ends and record the second and third harmonics"
-    ),
-    "measure_level_again": "measure level {level} again, and further levels around it",
-    "measure_beside_level": (
-        "measure levels between level {level} and the one below it, or above it"
-    ),
-    "measure_more": "measure at more amplitudes and frequencies",
-    "check_level_forces": lambda *, levels: (
-        f"check the force's range setting and calibration at {level_names(levels)}, or measure "
-        f"{level_names(levels)} again"
-    ),
-    "determine_force_gain": (
-        "measure the force, or calibrate the drive (a force transducer at one state, or a known "
-        "added mass); or add states 30° to 70° from resonance on both sides, where the inertia of "
-        "the modal mass is known"
     ),
 }

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from snrmjax.diagnose.diagnosis import diagnose_model
-from snrmjax.diagnose.evidence import answer_of
+from snrmjax.diagnose.verdict import answer_of
 from snrmjax.identify.inference.identification import Identification, identify_backbone
 from snrmjax.identify.pointwise.inversion_result import PointStatus
 from snrmjax.measure.states import SteadyStates

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import snrmjax.identify.test_model.states as test_states
-from snrmjax.diagnose.naming import evidence, priors
+from snrmjax.diagnose import priors
+from snrmjax.diagnose.naming import evidence
 from snrmjax.diagnose.naming.columns import hypothesis_columns
 from snrmjax.diagnose.naming.evidence import (
     Cell,

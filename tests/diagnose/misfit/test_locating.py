@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from truths.made_up_misfits import noise_of
 
-from snrmjax.diagnose.checks.alternative_laws import doubts
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
-from snrmjax.diagnose.search.locating import locate_misfit, power_of_amplitude, power_of_answer
+from snrmjax.diagnose.misfit.locating import locate_misfit, power_of_amplitude, power_of_answer
 
 AMPLITUDE = np.log(np.array([0.12, 0.3, 0.5, 0.7, 0.85, 1.0]))
 OWN, SHARED = 0.05, 0.3  # 1σ of every knot, and of an offset that all have in common

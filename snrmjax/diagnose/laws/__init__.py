@@ -1,1 +1,0 @@
-"""Laws drawn from the force balance where no effect of the library explains it."""

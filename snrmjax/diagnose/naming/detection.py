@@ -1,0 +1,56 @@
+"""How large a further effect would have to be to be seen, by the rows of the same problem."""
+
+from collections.abc import Collection
+
+import numpy as np
+
+from snrmjax.diagnose import priors
+from snrmjax.diagnose.naming.columns import parameters_of
+from snrmjax.diagnose.naming.evidence import Problem, seen_strengths
+from snrmjax.diagnose.naming.parts import Naming
+from snrmjax.model.effect_base import AbstractEffect
+from snrmjax.model.effect_metadata import VISIBLE_CHANGE, MotionScales
+from snrmjax.model.effect_shape import shape_of, starts_of
+from snrmjax.model.effects import EFFECTS, effect_parameters
+
+
+def detection_limits(
+    problem: Problem, naming: Naming, excluded: Collection[str]
+) -> dict[str, float]:
+    """The least strength of every further effect that would have been detected, in its own unit.
+
+    By parameter, with the shape that shows best. Not given for the effects of the answer, for those
+    `excluded`, and for what the data do not show at all.
+    """
+    strength = seen_strengths(problem, naming.cell, priors.DETECTED)
+    limits: dict[str, float] = {}
+    for column, seen in zip(problem.columns, strength.tolist(), strict=True):
+        kind = column.kind
+        if kind in excluded or kind in naming.effects or not EFFECTS[kind].searched:
+            continue
+        sign = column.sign or 1
+        values = parameters_of(problem.readings, column, sign * seen)
+        if values is None or not np.isfinite(seen):
+            continue
+        first = effect_parameters(kind)[0]
+        name, value = f"{kind}.{first}", abs(values[first])
+        if value > 0:
+            limits[name] = min(value, limits.get(name, np.inf))
+    return limits
+
+
+def beyond_data(effect: type[AbstractEffect], limit: float, scales: MotionScales | None) -> bool:
+    """Whether an effect at its detection limit would exceed all that was measured ten times.
+
+    Arguments: `limit` of its strength, in its own unit; `scales` of the measured motions, without
+    which relative strengths alone are judged.
+    """
+    unit = next(iter(effect.parameters().values())).unit
+    if not np.isfinite(limit) or (unit == "1" and limit > priors.BEYOND_DATA):
+        return True
+    starts = [] if scales is None else starts_of(effect, scales)
+    if not starts or not starts[0][0]:
+        return False
+    shape = shape_of(effect)
+    order = 1 if shape is None else shape.strength_order
+    return bool(VISIBLE_CHANGE * (limit / abs(starts[0][0])) ** order > priors.BEYOND_DATA)

@@ -1,1 +1,0 @@
-"""Which part of the force balance disagrees, and which effects explain it."""
