@@ -95,3 +95,11 @@ def test_the_sign_of_a_residue_is_kept(tmp_path):
         == 0
     )
     assert json.loads((tmp_path / "c" / "check.json").read_text()) == []
+
+
+def test_a_force_gain_that_fits_with_negative_damping_only_is_refused_in_one_sentence(tmp_path):
+    folder, out = CASES / "drive_negative_gain", tmp_path / "o"
+    words = ["--fit", "auto", "--free", "force_gain,instrument_phase", "--out", out]
+    found = run("identify", folder / "measured.csv", "--model", folder / "model.toml", *words)
+    assert "the force gain cannot be determined from these data" in str(found.exception)
+    assert not out.exists()

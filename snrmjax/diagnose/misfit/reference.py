@@ -191,6 +191,9 @@ def with_first_gain(
         if reference is None:
             break
         mass, std = reference.posterior.modal_mass
+        if not mass > 0:  # no passive structure's: the first value stays
+            doubt = force_gain_undetermined(np.inf, 0.0)
+            break
         gain, from_curves = gain / mass, True
         doubt = force_gain_undetermined(std / mass, float(np.max(np.abs(phase))))
     note = Fact("gain_of_drive", gain=gain, from_curves=from_curves)
