@@ -16,6 +16,7 @@ from snrmjax.diagnose.naming.evidence import Problem, best_hypotheses
 from snrmjax.diagnose.naming.parts import Naming, naming_of
 from snrmjax.diagnose.naming.readings import LinearTest, ModelStiffness, Readings, readings_of
 from snrmjax.identify.calibrate.inverse_force import inverse_force
+from snrmjax.identify.pointwise.snrm import linear_mode, participation_of, sensed_mode
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.effect_base import AbstractAddedMode
 from snrmjax.model.effects import EFFECTS
@@ -69,8 +70,7 @@ def _readings(predictions: Predictions, data: SteadyStates, rows: np.ndarray) ->
     order = np.asarray(data.order)[predictions.chosen.rows[rows]]
     order = np.where(np.isfinite(order), order, np.linspace(0.0, 1.0, len(rows)))
     linear = LinearTest(
-        modes.natural_frequency.item(j),
-        modes.damping_ratio.item(j),
+        *map(float, linear_mode(modes)),
         modes.natural_frequency_std.item(j),
         modes.damping_ratio_std.item(j),
         states.mass_std,
@@ -87,11 +87,10 @@ def _model_stiffness(
     model = predictions.given
     modes, sensor = model.modes, predictions.chosen.sensors[0]
     j = modes.mode_of_interest
-    natural, ratio = modes.natural_frequency.item(j), modes.damping_ratio.item(j)
-    plain = not (model.effects or model.potential.monomials)
-    if plain and modes.damping_coupling is None and modes.participation_lag is None:
+    natural, ratio = map(float, linear_mode(modes))
+    if not (model.effects or model.potential.monomials):
         return lambda _, omega: (natural**2 - omega**2 + 2j * ratio * natural * omega)[None]
-    constant = modes.mode_shape.item(sensor, j) * modes.participation.item(j)
+    constant = modes.mode_shape.item(sensor, j) * float(participation_of(modes))
     used = predictions.chosen.rows[rows]
     uncertain = [
         with_parameters(model, (name,), jnp.asarray([value + std]))
@@ -102,7 +101,9 @@ def _model_stiffness(
     def balanced(
         velocity: Complex[np.ndarray, " state"], omega: Float[np.ndarray, " state"]
     ) -> Complex[np.ndarray, " state"]:
-        own = np.sign(constant) * velocity
+        sensed = sensed_mode(modes, omega)
+        to_mode, driven = np.asarray(sensed.to_mode(sensor)), constant * np.asarray(sensed.ratio)
+        own = np.sign(constant) * velocity / to_mode
         force = jnp.asarray(np.asarray(data.force)[used])
         rest = np.asarray(residual_velocity(modes, jnp.asarray(omega), jnp.ones_like(force)))
         recorded = np.asarray(data.velocity).copy()
@@ -113,7 +114,7 @@ def _model_stiffness(
             needed = np.asarray(inverse_force(one, moved).force)[used]
             # The rest of the motion at the force that the model needs, and not the measured one.
             mode = own + rest[:, sensor] * (np.asarray(force) - needed)
-            found.append(1j * omega * constant * needed / mode)
+            found.append(1j * omega * driven * needed / (mode * to_mode))
         return np.array(found)
 
     return balanced

@@ -157,7 +157,7 @@ def _test_states(
         velocity=sign * velocity,
         errors=np.asarray(data.std)[:, :3],
         stated=stated,
-        constant=abs(constant),
+        constant=abs(constant) * np.asarray(data.participation),
         level_std=tuple(np.asarray(prior.level).tolist()),
         mass_std=_FREE if "force_gain" in free else float(spread[-1]),
         force_is_free="force_gain" in free,
@@ -320,7 +320,7 @@ def _complex_gain(problem: BalanceProblem) -> complex:
     omega, velocity, force = (
         np.asarray(part) for part in (data.frequency, data.velocity, data.force)
     )
-    x = velocity / (1j * omega) / constant
+    x = velocity / (1j * omega) / (constant * np.asarray(data.participation))
     a = np.abs(x) / np.abs(x).max()
     columns = [x, x * a**2, x * a**4, 1j * omega * x, 1j * omega * x * a, 1j * omega * x * a**2]
     columns += [-force + 0j, -1j * force]

@@ -89,11 +89,7 @@ def upper_branch(turned=1.0):
 def test_no_fit_that_frees_an_instrument_ends_with_damping_below_zero(free, turned):
     """Of one side of resonance force and damping turned by 180° fit as well: the truth is 0.1 %."""
     one = sj.model.linear_modes([900.0], [0.001], [[1.0]], [1.0])
-    try:
-        fit = sj.fit_jointly(upper_branch(turned), one, free=free)
-    except ValueError as refused:
-        assert "cannot" in str(refused)
-        return
+    fit = sj.fit_jointly(upper_branch(turned), one, free=free)
     curve = fit.unknowns.modal_damping
     found = np.asarray(curve(fit.motion().amplitude(curve)))
     np.testing.assert_allclose(found, 1.8, rtol=0.05)  # 2ζω of the states, to what no noise leaves
@@ -104,7 +100,7 @@ def test_no_fit_that_frees_an_instrument_ends_with_damping_below_zero(free, turn
 
 def test_a_known_force_against_the_motion_is_refused():
     one = sj.model.linear_modes([900.0], [0.001], [[1.0]], [1.0])
-    with pytest.raises(ValueError, match="against the force|negative at every state"):
+    with pytest.raises(ValueError, match=r"against the force|negative at every state"):
         sj.fit_jointly(upper_branch(-1.0), one)
 
 
