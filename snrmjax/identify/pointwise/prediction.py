@@ -43,7 +43,9 @@ def resonances(
 
     Arguments: `force` in N; solutions are looked for up to `largest_amplitude_ratio` times the
     largest measured amplitude. Beyond the measured amplitudes the backbone is extrapolated along
-    its end slopes, which no measurement supports: see `Resonance.continued`.
+    its end slopes, which no measurement supports: see `Resonance.continued`. Solutions there at
+    which damping falls faster than amplitude grows, on its way to nothing, are none of the
+    structure's and are left out.
     Returns the solutions in order of amplitude; an empty list when none lies there.
     Raises `ValueError` for a force or a ratio that is not positive.
     Not differentiable: differentiate `Backbone` itself, or `snrm_velocity`.
@@ -59,6 +61,8 @@ def resonances(
     weak = too_weak(_on_backbone(backbone, amplitude))
     tips = []
     for k in np.flatnonzero(weak[:-1] != weak[1:]):
+        if not weak[k] and amplitude[k] >= backbone.largest:
+            continue  # extrapolated damping on its way to nothing
         root = np.mean(_change(backbone, too_weak, amplitude[k], amplitude[k + 1]))
         tips.append(_resonance(backbone, modes, force, float(root)))
     return tips
@@ -113,6 +117,8 @@ def predict_response(
     curves = []
     for number, (low, high) in enumerate(zip(starts, ends, strict=True)):
         main = number == 0 and bool(inside[0])
+        if not main and low >= backbone.largest:
+            continue  # it starts where extrapolated damping goes to nothing
         curve = _one_curve(
             backbone,
             modes,
@@ -135,11 +141,16 @@ def _require_force(force: float) -> None:
 
 
 def _scan(backbone: Backbone, ratio: float) -> Float[np.ndarray, " point"]:
-    """Amplitudes from zero to `ratio` times the largest measured one."""
+    """Amplitudes from zero to `ratio` times the largest measured one.
+
+    Not beyond where extrapolated damping ends: a passive structure has none below zero.
+    """
     if not ratio > 0 or not np.isfinite(ratio):
         raise ValueError(f"`largest_amplitude_ratio` must be positive, but is {ratio!r}.")
     n = int(np.ceil(_SCAN * max(ratio / LARGEST_AMPLITUDE_RATIO, 1.0)))
-    return ratio * float(backbone.largest) * np.linspace(0.0, 1.0, n + 1)
+    scan = ratio * float(backbone.largest) * np.linspace(0.0, 1.0, n + 1)
+    none_left = (scan > float(backbone.largest)) & (_on_backbone(backbone, scan).damping <= 0)
+    return scan[: np.append(none_left, True).argmax()]
 
 
 class _OnBackbone(NamedTuple):

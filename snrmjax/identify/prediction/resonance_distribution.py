@@ -42,6 +42,16 @@ class ResonanceDistribution(AbstractResult):
     another_day: bool  # whether the errors are another day's too
 
     @property
+    def frequency_std(self) -> float:
+        """1σ of the frequency (rad/s) of those draws: half of the range that holds 68 %."""
+        return float(self.frequency[3] - self.frequency[1]) / 2
+
+    @property
+    def velocity_std(self) -> float:
+        """The same of the velocity, m/s."""
+        return float(self.velocity[3] - self.velocity[1]) / 2
+
+    @property
     def holds(self) -> Fact:
         """Which errors the quantiles hold."""
         return Fact("errors_of_a_level", another_day=self.another_day)

@@ -250,19 +250,18 @@ def _resonance_range(
     another_day: bool,
     sure: bool,
 ) -> str:
-    words = []
-    if not sure:
-        words = [
-            f"it lies within {ratio:g} times the largest measured amplitude with probability "
-            f"{probability:.2g}, else beyond (a larger `--extrapolate` looks farther)"
-        ]
     (low, high), (slow, fast) = frequency_hz, velocity
-    if np.isfinite(low) and np.isfinite(high):
-        words.append(
-            f"with 95 % probability it lies between {low:.6g} and {high:.6g} Hz, its velocity "
-            f"between {slow:.3g} and {fast:.3g} m/s ({_errors_of_a_level(another_day)} included)"
-        )
-    return "; ".join(words)
+    reach = f"within {ratio:g} times the largest measured amplitude"
+    beyond = "else it lies beyond (a larger `--extrapolate` looks farther)"
+    where = (
+        f"with 95 % probability it lies between {low:.6g} and {high:.6g} Hz, its velocity "
+        f"between {slow:.3g} and {fast:.3g} m/s ({_errors_of_a_level(another_day)} included)"
+    )
+    if sure:
+        return where
+    if not (np.isfinite(low) and np.isfinite(high)):
+        return f"it lies {reach} with probability {probability:.2g}, {beyond}"
+    return f"if it lies {reach}, which has probability {probability:.2g}, {where}; {beyond}"
 
 
 def _not_located(points: Sequence[tuple[str, float]], force: float) -> str:

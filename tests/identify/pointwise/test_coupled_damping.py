@@ -59,7 +59,9 @@ def pole_of(damping: np.ndarray) -> complex:
 def solved(case: Case, omega: np.ndarray, force: np.ndarray) -> np.ndarray:
     """Velocities (state, sensor) by direct solution at every frequency."""
     load = np.array([case.force.get(point, 0.0) for point in POINTS], dtype=complex)
-    dynamic = STIFFNESS - omega[:, None, None] ** 2 * MASS + 1j * omega[:, None, None] * case.damping
+    dynamic = (
+        STIFFNESS - omega[:, None, None] ** 2 * MASS + 1j * omega[:, None, None] * case.damping
+    )
     moved = np.linalg.solve(dynamic, np.broadcast_to(load, (len(omega), 3))[..., None])[..., 0]
     at = [POINTS.index(name) for name in case.sensors]
     return 1j * omega[:, None] * moved[:, at] * force[:, None]
@@ -171,7 +173,9 @@ def test_what_a_nonlinear_spring_adds_is_right_to_first_order_in_the_coupling():
         dynamic = np.diag(natural**2 - w**2) + 1j * w * modal_damping
         dynamic[0, 0] += n
         modal = np.linalg.solve(dynamic, np.asarray(linear.participation))
-        data = sj.measure.steady_states([1], [w], [1.0], [1j * w * (shape @ modal)[0]], sensors=("a",))
+        data = sj.measure.steady_states(
+            [1], [w], [1.0], [1j * w * (shape @ modal)[0]], sensors=("a",)
+        )
         point = sj.identify.identify_points(data, linear)
         sensed = sensed_mode(linear, jnp.array([w]))
         assert abs(complex(sensed.seen[0, 0]) - 1) > 1e-4  # there is a coupling to leave out
