@@ -125,8 +125,8 @@ def diagnose_model(
     unknown, noise_stated = recorded.chosen.phase_unknown, recorded.chosen.noise_stated
     excluded = excluded_kinds(model, force_gain_std, phases=not unknown[:, 0].all())
     kinds = tuple(kind for kind in EFFECTS if kind not in excluded)
-    others = np.asarray(recorded.chosen.states.known)[:, 2:]  # a sensor may have measured nothing
-    more_seen = bool(recorded.chosen.orders) or bool(others.any())
+    further = np.asarray(recorded.chosen.states.known)[:, 2:]  # a sensor may have measured nothing
+    more_seen = bool(recorded.chosen.orders) or bool(further.any())
     named = None if unknown.any() else named_parts(recorded, data, kinds)
     predictions = _corrected_predictions(recorded, data)
     if named is not None and not more_seen:

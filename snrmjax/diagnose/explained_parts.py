@@ -69,8 +69,10 @@ def _readings(predictions: Predictions, data: SteadyStates, rows: np.ndarray) ->
     j = modes.mode_of_interest
     order = np.asarray(data.order)[predictions.chosen.rows[rows]]
     order = np.where(np.isfinite(order), order, np.linspace(0.0, 1.0, len(rows)))
+    natural, ratio = map(float, linear_mode(modes))
     linear = LinearTest(
-        *map(float, linear_mode(modes)),
+        natural,
+        ratio,
         modes.natural_frequency_std.item(j),
         modes.damping_ratio_std.item(j),
         states.mass_std,

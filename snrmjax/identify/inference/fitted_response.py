@@ -1,5 +1,7 @@
 """Responses of fitted curves under a force, with their resonances and folds, all with bands."""
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float
 
@@ -180,7 +182,8 @@ def predicted_resonance(
 
     values, slopes, *_ = values_at_displacement(fit, amplitude)
     root = covariance_root(fit.covariance)
-    load, names = force, fit.names()
+    load: Any = force
+    names = fit.names()
     by_load = -float(fit.prior.linear[-1]) * root[-1]
     if new.drive is not None:
         load = float(fit.force_of_drive(np.array(new.drive)))

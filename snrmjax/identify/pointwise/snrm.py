@@ -83,7 +83,9 @@ def linear_mode(modes: LinearModes) -> tuple[Any, Any]:
     return _eigenvalue(modes)
 
 
-def sensed_mode(modes: LinearModes, frequency: Float[Array, "*batch"]) -> SensedMode:
+def sensed_mode(
+    modes: LinearModes, frequency: Float[Array | np.ndarray, "*batch"] | float
+) -> SensedMode:
     """What the module's equations make of the mode of interest at frequencies in rad/s."""
     return SensedMode(1.0, 1.0) if is_single(modes) else SensedMode(*_sensed(modes, frequency))
 
@@ -185,7 +187,7 @@ def snrm_velocity(
     constant = modes.mode_shape[:, j] * (participation_of(modes) * jnp.asarray(force)[..., None])
     sensed = sensed_mode(modes, frequency)
     if not is_single(modes):
-        constant = constant * sensed.seen * sensed.driven[..., None]
+        constant = constant * sensed.seen * jnp.asarray(sensed.driven)[..., None]
     of_mode = nonlinear_mode_velocity(
         constant,
         jnp.asarray(natural_frequency)[..., None],
