@@ -235,7 +235,7 @@ def _candidates(fit: JointFit, forces: list[float], ends: tuple[float, float]) -
         curves = fitted_response(fit, force, from_frequency=ends[0], to_frequency=ends[1])
         for curve in curves[:1]:
             drawn.append(curve)
-            keep = _measurable(curve)
+            keep = _measurable(fit, curve)
             at = np.flatnonzero(keep)
             if at.size > _PER_FORCE:
                 at = at[np.linspace(0, at.size - 1, _PER_FORCE).astype(int)]
@@ -251,8 +251,12 @@ def _candidates(fit: JointFit, forces: list[float], ends: tuple[float, float]) -
     return _States(level, load, frequency, velocity, tuple(drawn))
 
 
-def _measurable(curve: FittedResponse) -> np.ndarray:
-    keep = curve.stable & ~curve.continued & (np.abs(np.angle(curve.velocity)) < _FARTHEST)
+def _measurable(fit: JointFit, curve: FittedResponse) -> np.ndarray:
+    # The phase counts from that in which the mode is driven.
+    sensor, sign = fit.data.sensor, np.sign(float(fit.problem.modal_constant))
+    to_mode = np.asarray(sensed_mode(fit.modes, curve.frequency).to_mode(sensor))
+    phase = np.angle(sign * curve.velocity * to_mode)
+    keep = curve.stable & ~curve.continued & (np.abs(phase) < _FARTHEST)
     for fold in curve.folds:
         keep &= np.abs(curve.frequency / fold.frequency - 1) > _FROM_FOLD
     return keep & np.isfinite(curve.frequency)

@@ -154,6 +154,25 @@ def test_the_force_of_a_measured_motion_is_the_measured_one(name):
     np.testing.assert_allclose(found.force, np.repeat([0.5, 1.0, 2.0], 15), rtol=1e-7)
 
 
+def test_a_describing_function_at_the_sensor_is_zero():
+    """Of a linear structure, so that its modes are the eigenvalue's."""
+    case, pole = CASES["both"], pole_of(CASES["both"].damping)
+    found = sj.methods.arslan_ozguven(states_of(case), structure_of(case).modes)
+    table = found.to_pandas()
+    np.testing.assert_allclose(table["frequency_hz"], abs(pole) / (2 * np.pi), rtol=1e-9)
+    np.testing.assert_allclose(table["damping_ratio"], -pole.real / abs(pole), rtol=1e-7)
+
+
+def test_advice_of_a_force_against_the_sensor_is_near_resonance():
+    """A phase counts from that in which the mode is driven, at 180° here."""
+    case, pole = CASES["behind the force"], pole_of(CASES["behind the force"].damping)
+    fit = sj.fit_jointly(states_of(case), structure_of(case))
+    advised = sj.identify.next_measurements(fit, 2)
+    assert len(advised) == 2
+    for one in advised:  # 70° are 2.7 half bandwidths
+        assert abs(one.frequency / abs(pole) - 1) < 3 * -pole.real / abs(pole)
+
+
 def test_a_check_has_nothing_against_such_states():
     case = CASES["both"]
     assert not sj.doctor.check_test(states_of(case), structure_of(case)).findings
