@@ -25,6 +25,12 @@ from snrmjax.diagnose.naming.readings import (
 from snrmjax.diagnose.verdict import Verdict
 from snrmjax.identify.calibrate.calibration_states import ASSUMED_ERROR
 from snrmjax.identify.calibrate.inverse_force import inverse_force
+from snrmjax.identify.pointwise.snrm import (
+    is_single,
+    linear_mode,
+    participation_of,
+    sensed_mode,
+)
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.effect_base import AbstractAddedMode
 from snrmjax.model.effects import EFFECTS
@@ -67,12 +73,12 @@ def _with_likely_phases(predictions: Predictions, data: SteadyStates) -> Predict
     states = test_states_of(predictions, rows)
     amplitude = np.abs(states.velocity) / states.frequency
     model = _motion_of_model(predictions, data, rows, ())(states.velocity, states.frequency)
-    natural = modes.natural_frequency.item(modes.mode_of_interest)
+    natural = float(linear_mode(modes)[0])
     z = likely_dynamic_stiffness(
         states.force * states.constant / amplitude, model.dynamic_stiffness[0], amplitude, natural
     )
-    side = modes.mode_shape[chosen.sensors[0]] * modes.participation
-    behind = np.pi if float(side[modes.mode_of_interest]) < 0 else 0.0
+    shape = modes.mode_shape[chosen.sensors[0], modes.mode_of_interest]
+    behind = np.pi if float(shape * participation_of(modes)) < 0 else 0.0
     found = predictions.with_phases(np.pi / 2 - np.angle(z) + behind)
     error: Any = np.asarray(chosen.states.error).copy()
     error[chosen.phase_unknown[:, 0], 1 + len(chosen.sensors)] = _ANY_PHASE
@@ -98,18 +104,22 @@ def _readings(predictions: Predictions, data: SteadyStates, unknown: np.ndarray)
     j = modes.mode_of_interest
     order = np.asarray(data.order)[predictions.chosen.rows[rows]]
     order = np.where(np.isfinite(order), order, np.linspace(0.0, 1.0, len(rows)))
+    natural, ratio = map(float, linear_mode(modes))
     linear = LinearTest(
-        modes.natural_frequency.item(j),
-        modes.damping_ratio.item(j),
+        natural,
+        ratio,
         modes.natural_frequency_std.item(j),
         modes.damping_ratio_std.item(j),
         states.mass_std,
         modes.mode_shape.item(predictions.chosen.sensors[0], j),
-        np.sign(modes.mode_shape.item(predictions.chosen.sensors[0], j) * modes.participation[j]),
+        float(
+            np.sign(modes.mode_shape[predictions.chosen.sensors[0], j] * participation_of(modes))
+        ),
         scales_of(predictions),
     )
     # The other harmonics of a state turn with its fundamental, whose phase must be known.
-    recorded = _recorded_harmonics(predictions, rows, none=bool(unknown.any()))
+    not_read = bool(unknown.any()) or not is_single(modes)
+    recorded = _recorded_harmonics(predictions, rows, none=not_read)
     model = _motion_of_model(predictions, data, rows, recorded.order)
     alike = not unknown.any()  # likely phases are smooth by themselves
     return readings_of(states, order, model, linear, recorded, tempered=alike)
@@ -144,16 +154,15 @@ def _motion_of_model(
     model = predictions.given
     modes, sensor = model.modes, predictions.chosen.sensors[0]
     j = modes.mode_of_interest
-    natural, ratio = modes.natural_frequency.item(j), modes.damping_ratio.item(j)
-    plain = not (model.effects or model.potential.monomials)
-    if plain and modes.damping_coupling is None and modes.participation_lag is None:
+    natural, ratio = map(float, linear_mode(modes))
+    if not (model.effects or model.potential.monomials):
 
         def linear(velocity: Complex[np.ndarray, " state"], omega: np.ndarray) -> ModelMotion:
             none = np.zeros((1, len(omega), len(orders)), complex)
             return ModelMotion((natural**2 - omega**2 + 2j * ratio * natural * omega)[None], none)
 
         return linear
-    constant = modes.mode_shape.item(sensor, j) * modes.participation.item(j)
+    constant = modes.mode_shape.item(sensor, j) * float(participation_of(modes))
     used = predictions.chosen.rows[rows]
     uncertain = [
         with_parameters(model, (name,), jnp.asarray([value + std]))
@@ -164,7 +173,9 @@ def _motion_of_model(
     def balanced(
         velocity: Complex[np.ndarray, " state"], omega: Float[np.ndarray, " state"]
     ) -> ModelMotion:
-        own = np.sign(constant) * velocity
+        sensed = sensed_mode(modes, omega)
+        to_mode, driven = np.asarray(sensed.to_mode(sensor)), constant * np.asarray(sensed.ratio)
+        own = np.sign(constant) * velocity / to_mode
         force = jnp.asarray(np.asarray(data.force)[used])
         rest = np.asarray(residual_velocity(modes, jnp.asarray(omega), jnp.ones_like(force)))
         recorded = np.asarray(data.velocity).copy()
@@ -178,7 +189,7 @@ def _motion_of_model(
             higher.append(np.asarray(solved.velocity)[used][:, list(orders), sensor])
             # The rest of the motion at the force that the model needs, and not the measured one.
             mode = own + rest[:, sensor] * (np.asarray(force) - needed)
-            found.append(1j * omega * constant * needed / mode)
+            found.append(1j * omega * driven * needed / (mode * to_mode))
         return ModelMotion(np.array(found), np.array(higher))
 
     return balanced

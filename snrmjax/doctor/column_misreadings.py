@@ -11,6 +11,7 @@ from snrmjax.doctor.scale_findings import is_other_scale, scale_findings
 from snrmjax.identify.inference.fitted_curves import fitted_values
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.pointwise.backbone_points import BackbonePoints
+from snrmjax.identify.pointwise.snrm import linear_mode
 from snrmjax.measure.phase_convention import wrong_phases
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.structures import Structure
@@ -64,9 +65,7 @@ def _far(points: BackbonePoints, model: Structure) -> tuple[Fact, ...]:
     medians = [np.median(rows[good & (level == k)], axis=0) for k in np.unique(level[good])]
     # Of each level, the smallest amplitude first.
     found = np.array(sorted(map(tuple, medians))).reshape(-1, 3)[:, 1:]
-    modes = model.modes
-    j = modes.mode_of_interest
-    linear = np.array([modes.natural_frequency.item(j), modes.damping_ratio.item(j)])
+    linear = np.array(linear_mode(model.modes), dtype=float)
     if not len(found) or linear[1] <= 0 or found[:, 1].min() <= 0:
         return ()
     off = np.log(found / linear)
@@ -86,7 +85,7 @@ def linear_damping_note(fit: JointFit, model: Structure) -> tuple[Fact, ...]:
     """
     modes = model.modes
     j = modes.mode_of_interest
-    linear, linear_std = modes.damping_ratio.item(j), modes.damping_ratio_std.item(j)
+    linear, linear_std = float(linear_mode(modes)[1]), modes.damping_ratio_std.item(j)
     at_rest = fitted_values(fit, displacement=np.zeros(1))
     fitted, std = float(at_rest.damping_ratio[0]), float(at_rest.damping_ratio_std[0])
     both = float(np.hypot(std, linear_std))

@@ -112,7 +112,7 @@ def _of_force(
         one = modes.mode_of_interest
         natural_square = modes.natural_frequency.item(one) ** 2
         rate = 2 * modes.damping_ratio.item(one) * natural_square**0.5
-        constant = states.constant
+        constant = float(np.median(states.constant))
     mobility = 1j * w * constant / (natural_square - w**2 + 1j * rate * w)
     size = np.abs(seen.recorded[good])
     turn = np.exp(1j * order * np.angle(seen.recorded[good]))

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Complex, Float, Int
 
 from snrmjax.doctor.priors import ANY_MASS, CLEARLY, FITS_WELL, MODAL_MASS, NO_MODE, SCATTER
 from snrmjax.identify.checks.residual_autocorrelation import share_told_by
+from snrmjax.identify.pointwise.snrm import participation_of, sensed_mode
 from snrmjax.identify.test_model.posterior import TestPosterior, fit_test
 from snrmjax.identify.test_model.priors import LEAST_SHARE
 from snrmjax.identify.test_model.states import TestStates, state_errors
@@ -226,20 +227,21 @@ class CheckedStates(NamedTuple):
     files: tuple[tuple[int, ...], ...]  # levels of each table, where there are several
     # m/s, of a base itself, and whether velocities are as recorded: its motion may be in them.
     own: tuple[Complex[np.ndarray, " state"], bool] | None = None
+    to_mode: Complex[np.ndarray, " state"] | float = 1.0  # `SensedMode.to_mode`
 
     @property
     def recorded(self) -> Complex[np.ndarray, " state"]:
         """Phasors as they stand in the table, with the sign of the mode."""
-        return self.test.velocity + self.beside
+        return self.test.velocity / self.to_mode + self.beside
 
     @property
     def mobility(self) -> Float[np.ndarray, " state"]:
         """|V|/F."""
-        return np.abs(self.test.velocity) / self.test.force
+        return np.abs(self.test.velocity / self.to_mode) / self.test.force
 
     def read(self, velocity: Complex[np.ndarray, " state"]) -> TestStates:
         """The states with other phasors in the place of the recorded ones."""
-        return self.test._replace(velocity=velocity - self.beside)
+        return self.test._replace(velocity=self.to_mode * (velocity - self.beside))
 
 
 def checked_states(
@@ -262,11 +264,15 @@ def checked_states(
     omega = np.asarray(some.frequency)
     velocity = np.asarray(some.velocity)[:, sensor]
     constant, beside = 1.0, np.zeros(len(at), dtype=complex)
+    to_mode: np.ndarray | float = 1.0
+    ratio_of_drive: np.ndarray | float = 1.0
     stds = (0.0, 0.0, 0.0, 0.0)
     if model is not None:
         modes = model.modes
         one = modes.mode_of_interest
-        constant = modes.mode_shape.item(sensor, one) * modes.participation.item(one)
+        constant = modes.mode_shape.item(sensor, one) * float(participation_of(modes))
+        sensed = sensed_mode(modes, omega)
+        to_mode, ratio_of_drive = np.asarray(sensed.to_mode(sensor)), np.asarray(sensed.ratio)
         if not drive.any() and (modes.n_modes > 1 or modes.rigid_body_participation.size):
             beside = np.asarray(residual_velocity(modes, omega, force))[:, sensor]
         gain, phase, frequency, damping = model.level_stds
@@ -284,14 +290,14 @@ def checked_states(
         order = np.linspace(0.0, 1.0, len(at))
     level = np.unique(np.asarray(some.level), return_inverse=True)[1]
     test = TestStates(
-        *(level, omega, force, sign * (velocity - beside), errors, False),
-        *(abs(constant) or 1.0, stds, MODAL_MASS),
+        *(level, omega, force, sign * to_mode * (velocity - beside), errors, False),
+        *((abs(constant) or 1.0) * ratio_of_drive, stds, MODAL_MASS),
     )
     own = None
     if data.base is not None and model is not None:
         moving = data.base._replace(motion="absolute").own_velocity(data.sensors, omega, force)
         own = sign * moving[:, sensor], data.base.motion == "relative"
-    return CheckedStates(test, at, sign * beside, order, noise, files, own)
+    return CheckedStates(test, at, sign * beside, order, noise, files, own, to_mode)
 
 
 def usable_rows(data: SteadyStates, sensor: int) -> Bool[np.ndarray, " state"]:

@@ -8,6 +8,7 @@ import numpy as np
 from snrmjax.doctor.findings import Finding, ImportCorrection
 from snrmjax.doctor.judgement import Judged, Scale, judge
 from snrmjax.doctor.priors import BAND, CERTAIN, MODAL_MASS, MORE_DAMPING, OTHER_SCALE
+from snrmjax.identify.pointwise.snrm import linear_mode
 from snrmjax.identify.test_model.states import TestStates
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.facts import Fact
@@ -112,7 +113,7 @@ def _signs(fit: Judged, model: Structure, bend: float | None, *, agrees: bool) -
     j = modes.mode_of_interest
     column = np.abs(np.asarray(modes.mode_shape)[:, j])
     plain = abs(column.max() - 1) < 1e-6 or abs(np.linalg.norm(column) - 1) < 1e-6
-    rate = 2 * float(modes.natural_frequency[j] * modes.damping_ratio[j])
+    rate = 2 * float(np.prod(linear_mode(modes)))
     damped = rate > 0 and float(np.min(fit.damping)) > (1 + MORE_DAMPING) * rate
     return int(agrees) + int(damped), int(plain) + int(bend is not None and not agrees)
 
@@ -135,7 +136,7 @@ def _bend(states: TestStates, stiffness: np.ndarray, model: Structure) -> float 
     beta = 2 * np.pi * (np.arange(64) + 0.5) / 64
     x = q[:, None] * np.cos(beta)
     force = sum(degree * c * x ** (degree - 1) for degree, c in terms)
-    natural_square = modes.natural_frequency.item(one) ** 2
+    natural_square = float(linear_mode(modes)[0]) ** 2
     predicted = 2 * np.mean(force * np.cos(beta), axis=1) / q / natural_square
     measured = stiffness / natural_square - 1
     if np.ptp(measured) < 0.01 or np.ptp(predicted) < 1e-6:
@@ -153,7 +154,7 @@ def shaker_damping(fit: Judged, model: Structure, where: str) -> list[Finding]:
     """
     modes = model.modes
     one = modes.mode_of_interest
-    natural, ratio = modes.natural_frequency.item(one), modes.damping_ratio.item(one)
+    natural, ratio = map(float, linear_mode(modes))
     std = modes.damping_ratio_std.item(one)
     amplitude = fit.states.amplitude
     if not std > 0 or not ratio > 0 or np.ptp(np.log(amplitude)) < 1.0:

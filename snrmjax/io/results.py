@@ -366,7 +366,9 @@ def summarise_distribution(distribution: "ResonanceDistribution") -> dict:
         "probability": distribution.probability,
         "quantiles": list(QUANTILES),
         "frequency_hz": (distribution.frequency / HERTZ).tolist(),
+        "frequency_std_hz": distribution.frequency_std / HERTZ,
         "velocity_m_s": distribution.velocity.tolist(),
+        "velocity_std_m_s": distribution.velocity_std,
         "negative_damping": distribution.negative_damping,
         "holds": distribution.holds,
     }

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Float, Shaped
+from jaxtyping import Array, Bool, Complex, Float, Int, Shaped
 
 from snrmjax.model.moving_base import BaseMotion, drive_unit
 from snrmjax.numerics.compiled import compiled
@@ -351,20 +351,16 @@ def residual_velocity(
     """Velocity of the linear modes other than the mode of interest and of rigid-body modes.
 
     V_lin + V_RB of Eq. (10b), as phasors e^{+iΩt} relative to the force: a flexible mode gives
-    iΩ Φ ΦᵀF / (ω² − Ω² + 2iζωΩ), a rigid-body mode −iΦ ΦᵀF / Ω.
+    iΩ Φ ΦᵀF / (ω² − Ω² + 2iζωΩ), a rigid-body mode −iΦ ΦᵀF / Ω. Of a force with phases ΦᵀF is
+    complex; modes that damping couples respond together, with the mode of interest at rest
+    (`identify.pointwise.snrm.sensed_mode` has what its own motion adds).
 
     Arguments: `frequency` Ω in rad/s, `force` in N. Returns m/s at every sensor.
     Reference: Kwarta & Allen, Eqs. (10b), (23), turned by +90° (the paper forces with a sine).
     """
     keep = np.asarray(modes.residual_modes, dtype=int)
-    return _modal_sum(
-        modes.mode_shape[:, keep],
-        modes.participation[keep],
-        modes.natural_frequency[keep],
-        modes.damping_ratio[keep],
-        frequency,
-        force,
-    ) + _rigid_body_velocity(modes, frequency, force)
+    flexible = _flexible_velocity(modes, keep, frequency, force)
+    return flexible + _rigid_body_velocity(modes, frequency, force)
 
 
 @compiled
@@ -383,20 +379,9 @@ def linear_response(
     >>> linear_response(modes, jnp.array(500.0), jnp.array(1.0)).real.round(6)
     Array([0.6], dtype=float64)
     """
-    omega = jnp.asarray(frequency)[..., None]
-    terms = modes.natural_frequency, modes.damping_ratio
-    stiffness = _dynamic_stiffness(*terms, omega)
-    load = phasor_of_load(modes)
-    if modes.damping_coupling is None:
-        modal = load / stiffness
-    else:
-        coupled = 1j * omega[..., None] * modes.damping_coupling
-        matrix = stiffness[..., None] * jnp.eye(modes.n_modes) + coupled
-        modal = jnp.linalg.solve(matrix, jnp.broadcast_to(load, stiffness.shape)[..., None])[..., 0]
-    modal = 1j * omega * modal * jnp.asarray(force)[..., None]
-    return jnp.einsum("...m,sm->...s", modal, modes.mode_shape) + _rigid_body_velocity(
-        modes, frequency, force
-    )
+    keep = np.arange(modes.n_modes)
+    flexible = _flexible_velocity(modes, keep, frequency, force)
+    return flexible + _rigid_body_velocity(modes, frequency, force)
 
 
 def phasor_of_load(modes: LinearModes) -> Complex[Array, " mode"]:
@@ -418,22 +403,37 @@ def reference_sensor(modes: LinearModes) -> int:
     return int(np.argmax(np.abs(np.asarray(shape)[:, modes.mode_of_interest])))
 
 
-def _modal_sum(
-    shape: Float[Array, "sensor mode"],
-    participation: Float[Array, " mode"],
-    natural_frequency: Float[Array, " mode"],
-    damping_ratio: Float[Array, " mode"],
+def _flexible_velocity(
+    modes: LinearModes,
+    keep: Int[np.ndarray, " kept"],
     frequency: Float[Array, "*batch"],
     force: Float[Array, "*batch"],
 ) -> Complex[Array, "*batch sensor"]:
+    """Of some flexible modes, while the others stand still."""
     omega = jnp.asarray(frequency)[..., None]
-    dynamic_stiffness = _dynamic_stiffness(natural_frequency, damping_ratio, omega)
-    modal = 1j * omega * participation * jnp.asarray(force)[..., None] / dynamic_stiffness
-    return jnp.einsum("...m,sm->...s", modal, shape)
+    load = modes.participation[keep]
+    if modes.participation_lag is not None:
+        load = phasor_of_load(modes)[keep]
+    if modes.damping_coupling is None:
+        natural, ratio = modes.natural_frequency[keep], modes.damping_ratio[keep]
+        modal = load / (natural**2 - omega**2 + 2j * ratio * natural * omega)
+    else:
+        matrix = dynamic_stiffness(modes, keep, 1j * omega[..., 0])
+        modal = jnp.linalg.solve(matrix, jnp.broadcast_to(load, matrix.shape[:-1])[..., None])
+        modal = modal[..., 0]
+    modal = 1j * omega * modal * jnp.asarray(force)[..., None]
+    return jnp.einsum("...m,sm->...s", modal, modes.mode_shape[:, keep])
 
 
-def _dynamic_stiffness(natural_frequency: Array, damping_ratio: Array, omega: Array) -> Array:
-    return natural_frequency**2 - omega**2 + 2j * damping_ratio * natural_frequency * omega
+def dynamic_stiffness(
+    modes: LinearModes, keep: Int[np.ndarray, " kept"], s: Complex[Array, "*batch"]
+) -> Complex[Array, "*batch kept kept"]:
+    """Φᵀ(s²M + sC + K)Φ of some flexible modes at a complex frequency s (rad/s), 1/s²."""
+    natural, ratio = modes.natural_frequency[keep], modes.damping_ratio[keep]
+    s = jnp.asarray(s)[..., None]
+    own = (natural**2 + s**2 + 2 * ratio * natural * s)[..., None] * jnp.eye(len(keep))
+    coupling = modes.damping_coupling
+    return own if coupling is None else own + s[..., None] * coupling[np.ix_(keep, keep)]
 
 
 def _rigid_body_velocity(

@@ -1,5 +1,6 @@
 """Responses and resonances that identified curves predict under forces that were asked for."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -108,13 +109,34 @@ def predictions_of_fit(
                 at=options.predict_at,
             ),
         }
-        banded = fitted_response(fit, force, **settings)
         further = predicted_resonance(fit, force, self_excited=options.self_excited, **settings)
+        banded = _of_distribution(fitted_response(fit, force, **settings), further)
         tips = sorted((tip for one in banded for tip in one.resonances), key=lambda t: t.amplitude)
         place, unit = options.predict_at, fit.modes.force_unit
         predictions.append(Prediction(force, tips, banded, further, record, place, unit))
         notes += notes_on_trends(settings["of"].trends, predictions[-1].load)
     return tuple(predictions), tuple(notes)
+
+
+def _of_distribution(
+    responses: list[FittedResponse], further: ResonanceDistribution
+) -> list[FittedResponse]:
+    """The responses, whose first resonance has 1σ of the distribution that quantiles are of.
+
+    What a straight line makes of the errors is no distribution where curves end or fall to nothing.
+    """
+    tips = [tip for one in responses for tip in one.resonances]
+    first = min(tips, key=lambda tip: tip.amplitude, default=None)
+    if first is None or not np.isfinite(further.frequency_std):
+        return responses
+    spread = (further.frequency_std, further.velocity_std)
+    changed = dataclasses.replace(first, frequency_std=spread[0], velocity_std=spread[1])
+    return [
+        dataclasses.replace(
+            one, resonances=tuple(changed if tip is first else tip for tip in one.resonances)
+        )
+        for one in responses
+    ]
 
 
 def require_drive(data: SteadyStates) -> None:

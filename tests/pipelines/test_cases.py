@@ -95,3 +95,50 @@ def test_the_sign_of_a_residue_is_kept(tmp_path):
         == 0
     )
     assert json.loads((tmp_path / "c" / "check.json").read_text()) == []
+
+
+def test_a_force_gain_that_fits_with_negative_damping_only_is_refused_in_one_sentence(tmp_path):
+    folder, out = CASES / "drive_negative_gain", tmp_path / "o"
+    words = ["--fit", "auto", "--free", "force_gain,instrument_phase", "--out", out]
+    found = run("identify", folder / "measured.csv", "--model", folder / "model.toml", *words)
+    assert "the force gain cannot be determined from these data" in str(found.exception)
+    assert not out.exists()
+
+
+def test_forces_with_phases_and_coupled_damping_are_the_models_own(tmp_path):
+    """1.75757 Hz and 0.47434 % are the eigenvalue of the matrices, at every amplitude."""
+    folder = CASES / "force_with_phases"
+    words = [folder / "measured.csv", "--model", folder / "model.toml", "--out", tmp_path / "o"]
+    found = run("identify", *words)
+    assert found.exit_code == 0
+    assert "instrument's phase" not in found.output
+    points = np.genfromtxt(tmp_path / "o" / "points.csv", delimiter=",", names=True, dtype=None)
+    assert set(points["status"]) == {"ok"}
+    # The table has eleven digits of Hz, and was solved to 1e-8.
+    np.testing.assert_allclose(points["natural_frequency_hz"], 1.75757, rtol=5e-6)
+    np.testing.assert_allclose(points["damping_ratio"], 0.0047434, rtol=2e-5)
+    run("diagnose", *words[:-1], tmp_path / "d")
+    diagnosis = json.loads((tmp_path / "d" / "diagnosis.json").read_text())
+    assert (diagnosis["verdict"], diagnosis["effects"]) == ("none", [])
+
+
+@pytest.mark.parametrize(
+    ("name", "force", "ratio", "frequency", "velocity"),
+    [("", 0.980665, 2, 188.61, 1.2597), ("tank", 17.302, 2, 1.1703, 38.9)],
+)
+def test_a_left_out_level_is_predicted_with_its_probability(
+    tmp_path, name, force, ratio, frequency, velocity
+):
+    folder, table = CASES / "prediction_no_resonance", name or "measured"
+    words = ["--predict-force", force, "--extrapolate", ratio, "--out", tmp_path / "o"]
+    model = folder / f"{name or 'model'}.toml"
+    run("identify", folder / f"{table}.csv", "--model", model, "--fit", "auto", *words)
+    summary = json.loads((tmp_path / "o" / "summary.json").read_text())
+    (one,) = summary["resonance_distributions"]
+    assert 0.5 < one["probability"] < 0.95  # not as a fact, and never denied
+    assert one["frequency_hz"][0] < frequency < one["frequency_hz"][-1]
+    assert one["velocity_m_s"][0] < velocity < one["velocity_m_s"][-1]
+    (tip,) = summary["joint_fit"]["resonances"]
+    assert tip["frequency_std_hz"] == one["frequency_std_hz"]
+    assert tip["velocity_std_m_s"] == one["velocity_std_m_s"]
+    assert all(each["damping_ratio"] > 0 for each in summary["resonances"])

@@ -19,6 +19,7 @@ from snrmjax.diagnose import priors
 from snrmjax.diagnose.misfit.predictions import Predictions, predictions_of
 from snrmjax.diagnose.misfit.weighted_misfit import weighted_misfit
 from snrmjax.identify.checks.instruments import force_gain_undetermined
+from snrmjax.identify.pointwise.snrm import participation_of, sensed_mode
 from snrmjax.identify.test_model.posterior import TestPosterior, fit_test
 from snrmjax.identify.test_model.priors import INSTRUMENT_PHASE, LEVELS
 from snrmjax.identify.test_model.states import TestStates, state_errors
@@ -71,7 +72,12 @@ def test_states_of(predictions: Predictions, rows: np.ndarray) -> TestStates:
     # Of few sizes: operations of JAX compile for every one.
     load: list[Any] = [padded(np.asarray(a)) for a in (states.frequency, states.force)]
     beside: Array = residual_velocity(modes, *load)
-    constant = modes.mode_shape.item(sensor, j) * modes.participation.item(j)
+    sensed = sensed_mode(modes, load[0])
+    to_mode, ratio_of_drive = (
+        np.broadcast_to(np.asarray(part), len(load[0]))[: len(rows)]
+        for part in (sensed.to_mode(sensor), sensed.ratio)
+    )
+    constant = modes.mode_shape.item(sensor, j) * float(participation_of(modes))
     n_sensors = states.velocity.shape[1]
     stated = np.asarray(states.error)[:, [0, 1, 1 + n_sensors]]
     errors, _ = state_errors(stated)
@@ -86,10 +92,11 @@ def test_states_of(predictions: Predictions, rows: np.ndarray) -> TestStates:
         frequency=np.asarray(states.frequency),
         force=np.asarray(states.force),
         velocity=np.sign(constant)
+        * to_mode
         * (np.asarray(states.velocity)[:, 0] - np.asarray(beside)[: len(rows), sensor]),
         errors=errors,
         stated=chosen.noise_stated,
-        constant=abs(constant),
+        constant=abs(constant) * ratio_of_drive,
         level_std=(gain, phase, 2 * frequency / natural, damping / ratio if ratio > 0 else 0.0),
         mass_std=float(np.hypot(mass_std or 0.05, predictions.force_gain_std)),
         force_is_free=predictions.force_gain_std > 0,
@@ -193,6 +200,9 @@ def with_first_gain(
         if reference is None:
             break
         mass, std = reference.posterior.modal_mass
+        if not mass > 0:  # no passive structure's: the first value stays
+            doubt = force_gain_undetermined(np.inf, 0.0)
+            break
         gain, from_curves = gain / mass, True
         doubt = force_gain_undetermined(std / mass, float(np.max(np.abs(phase))))
     note = Fact("gain_of_drive", gain=gain, from_curves=from_curves)

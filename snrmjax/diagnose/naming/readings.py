@@ -94,7 +94,7 @@ class Readings(NamedTuple):
     @property
     def constant(self) -> float:
         """A, the product of the mode's shapes at sensor and force, 1/kg."""
-        return self.linear.side * float(self.posterior.states.constant)
+        return self.linear.side * float(np.mean(self.posterior.states.constant))
 
     @property
     def scales(self) -> MotionScales:

@@ -5,6 +5,7 @@ from enum import StrEnum
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from snrmjax.numerics.facts import Fact
 
@@ -54,6 +55,26 @@ def force_gain_undetermined(std: float, farthest: float) -> Fact | None:
     if farthest > _BESIDE_RESONANCE:
         return None
     return Fact("force_gain_near_resonance", farthest_deg=float(np.degrees(farthest)))
+
+
+def require_passive(
+    free: Sequence[str], mass: float, damping: Float[np.ndarray, " state"] | None = None
+) -> None:
+    """Raise `ValueError` for a fit that no passive structure has.
+
+    With a gain or a phase that nobody knows, force and damping below zero fit states of one side of
+    resonance as well: damping must then be positive at every state. Where the force is known it
+    may be negative over a part of the amplitudes, as of a self-excited structure.
+
+    Arguments: `free` what of the instruments is unknown; `mass` the modal mass over the model's;
+    `damping` that of the states, 1/s, once it is known.
+    """
+    turned = tuple(name for name in free if name != "force_offset")
+    if not mass > 0:
+        raise ValueError(str(Fact("fit_not_passive", what="modal mass", free=turned)))
+    some = damping is not None and not bool((np.all if turned else np.any)(damping > 0))
+    if some:
+        raise ValueError(str(Fact("fit_not_passive", what="damping", free=turned)))
 
 
 def notes_on_instruments(fit: Any, level_errors: Sequence[str]) -> list[Fact]:

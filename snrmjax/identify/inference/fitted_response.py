@@ -1,5 +1,7 @@
 """Responses of fitted curves under a force, with their resonances and folds, all with bands."""
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float
 
@@ -19,6 +21,7 @@ from snrmjax.identify.pointwise.prediction import (
     resonances,
 )
 from snrmjax.identify.pointwise.prediction_result import PredictedResponse
+from snrmjax.identify.pointwise.snrm import is_single, sensed_mode
 from snrmjax.identify.prediction.new_level import NewLevel, new_level
 from snrmjax.identify.prediction.resonance_distribution import (
     KnownCurves,
@@ -179,7 +182,8 @@ def predicted_resonance(
 
     values, slopes, *_ = values_at_displacement(fit, amplitude)
     root = covariance_root(fit.covariance)
-    load, names = force, fit.names()
+    load: Any = force
+    names = fit.names()
     by_load = -float(fit.prior.linear[-1]) * root[-1]
     if new.drive is not None:
         load = float(fit.force_of_drive(np.array(new.drive)))
@@ -189,6 +193,9 @@ def predicted_resonance(
         by_load = by_load + sum(by[n] * root[names.index(n)] for n in by if n in names)
     constant = abs(float(fit.problem.constant_of(fit.unknowns)) * new.over_test(fit))
     modes = with_deviations(new.modes(fit), fit.unknowns.linear, fit.prior.linear)
+    natural = np.sqrt(np.maximum(np.asarray(values)[:, 0], 0.0))
+    if not is_single(modes):
+        load = load * np.asarray(sensed_mode(modes, natural).ratio)
     return resonance_distribution(
         *(force, amplitude),
         KnownCurves(values, slopes @ root, constant * load, by_load),

@@ -14,6 +14,7 @@ from snrmjax.identify.joint.force_balance import (
 )
 from snrmjax.identify.joint.free_unknowns import Unravel
 from snrmjax.identify.joint.joint_fit import JointFit
+from snrmjax.identify.pointwise.snrm import is_single, sensed_mode
 from snrmjax.identify.prediction.new_level import ON_THE_CURVES, NewLevel
 from snrmjax.identify.test_model.states import LEVEL_ERRORS
 from snrmjax.model.modes import LinearModes, residual_velocity
@@ -70,11 +71,12 @@ class ForcedMotion(eqx.Module):
         """|(ω̃² − Ω²) + iΩδ|² X²/load² − 1."""
         squared, damping = self.curves(vector, x, omega)
         size = (squared - omega**2) ** 2 + (omega * damping) ** 2
-        return size * (x / self.load_of(vector)) ** 2 - 1.0
+        return size * (x / self.load_of(vector, omega)) ** 2 - 1.0
 
-    def load_of(self, vector: Array) -> Float[Array, ""]:
-        """|A|F in m/s², with the fit's modal mass."""
-        return jnp.abs(self._constant_of(self.split(vector)[0])) * self.force_of(vector)
+    def load_of(self, vector: Array, omega: Array) -> Float[Array, "*batch"]:
+        """|A|F in m/s² at a frequency, with the fit's modal mass."""
+        constant = jnp.abs(self._constant_of(self.split(vector)[0]))
+        return constant * sensed_mode(self.modes, omega).ratio * self.force_of(vector)
 
     def force_of(self, vector: Array) -> Float[Array, ""]:
         """The force in N."""
@@ -102,7 +104,10 @@ class ForcedMotion(eqx.Module):
         (unknowns, level), force = self.split(vector), self.force_of(vector)
         squared, damping = self.curves(vector, x, omega)
         constant = self._constant_of(unknowns)
+        sensed = sensed_mode(self.modes, omega)
         own = 1j * omega * constant * force / (squared - omega**2 + 1j * omega * damping)
+        if not is_single(self.modes):
+            own = own * sensed.ratio / sensed.to_mode(self.sensor)
         linear = with_deviations(self.modes, unknowns.linear, self.linear_std)
         rest = residual_velocity(linear, omega, jnp.broadcast_to(force, omega.shape))
         return (own + rest[..., self.sensor]) * jnp.exp((1 - self.gain_of_force) * level[0])

@@ -10,6 +10,7 @@ from jaxtyping import Array
 from snrmjax.identify.inference.forced_motion import ForcedMotion
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.pointwise.prediction_result import Resonance
+from snrmjax.identify.pointwise.snrm import sensed_mode
 from snrmjax.identify.prediction.new_level import ON_THE_CURVES, NewLevel
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.result import quantity, setting
@@ -73,7 +74,7 @@ def located(
     omega, speed, x = map(float, values)
     if solved is not None and place.kind == "resonance":
         constant = float(fit.problem.constant_of(fit.unknowns)) * new.over_test(fit)
-        load = abs(constant) * force
+        load = abs(constant) * force * float(sensed_mode(new.modes(fit), omega).ratio)
         ratio = load / (2 * omega**2 * x)
     return FittedPoint(
         force=force,
@@ -123,7 +124,7 @@ def _point_with_slopes(
         phase = motion.split(vector)[1][1]
         resonance = [
             squared / omega**2 - 1 + damping / omega * jnp.tan(phase),
-            omega * damping * x / (jnp.cos(phase) * motion.load_of(vector)) - 1,
+            omega * damping * x / (jnp.cos(phase) * motion.load_of(vector, omega)) - 1,
         ]
         return jnp.where(is_fold, jnp.stack([excess, slope * x]), jnp.stack(resonance))
 

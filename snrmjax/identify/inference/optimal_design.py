@@ -19,10 +19,12 @@ from snrmjax.identify.joint.force_balance import (
     Unknowns,
     filled,
     no_errors,
+    relative_participation,
     weighting_at,
 )
 from snrmjax.identify.joint.free_unknowns import Unravel, padded_levels, whitened
 from snrmjax.identify.joint.joint_fit import JointFit
+from snrmjax.identify.pointwise.snrm import sensed_mode
 from snrmjax.identify.test_model.states import LEVEL_ERRORS
 from snrmjax.numerics.blocks import padded
 from snrmjax.numerics.compiled import compiled, on_numbers
@@ -233,7 +235,7 @@ def _candidates(fit: JointFit, forces: list[float], ends: tuple[float, float]) -
         curves = fitted_response(fit, force, from_frequency=ends[0], to_frequency=ends[1])
         for curve in curves[:1]:
             drawn.append(curve)
-            keep = _measurable(curve)
+            keep = _measurable(fit, curve)
             at = np.flatnonzero(keep)
             if at.size > _PER_FORCE:
                 at = at[np.linspace(0, at.size - 1, _PER_FORCE).astype(int)]
@@ -249,8 +251,12 @@ def _candidates(fit: JointFit, forces: list[float], ends: tuple[float, float]) -
     return _States(level, load, frequency, velocity, tuple(drawn))
 
 
-def _measurable(curve: FittedResponse) -> np.ndarray:
-    keep = curve.stable & ~curve.continued & (np.abs(np.angle(curve.velocity)) < _FARTHEST)
+def _measurable(fit: JointFit, curve: FittedResponse) -> np.ndarray:
+    # The phase counts from that in which the mode is driven.
+    sensor, sign = fit.data.sensor, np.sign(float(fit.problem.modal_constant))
+    to_mode = np.asarray(sensed_mode(fit.modes, curve.frequency).to_mode(sensor))
+    phase = np.angle(sign * curve.velocity * to_mode)
+    keep = curve.stable & ~curve.continued & (np.abs(phase) < _FARTHEST)
     for fold in curve.folds:
         keep &= np.abs(curve.frequency / fold.frequency - 1) > _FROM_FOLD
     return keep & np.isfinite(curve.frequency)
@@ -272,14 +278,17 @@ def _information(fit: JointFit, states: _States) -> Float[np.ndarray, "state par
     """Whitened slopes of every candidate's balance, by the unknowns and by new levels' errors."""
     n, n_levels = len(states.force), int(states.level.max()) + 1
     std = np.median(np.asarray(fit.data.std), axis=0)
-    share = np.zeros((n, fit.data.share.shape[1]))
-    share[:, fit.data.sensor] = 1.0
+    sensor, sensed = fit.data.sensor, sensed_mode(fit.modes, states.frequency)
+    share = np.zeros((n, fit.data.share.shape[1]), dtype=fit.data.share.dtype)
+    share[:, sensor] = sensed.to_mode(sensor) if np.iscomplexobj(share) else 1.0
+    phase = np.exp(1j * float(fit.unknowns.instrument_phase))
     data = BalanceData(
         level=jnp.asarray(states.level),
         frequency=jnp.asarray(states.frequency),
         force=jnp.asarray(fit.recorded_force(states.force)),
-        velocity=jnp.asarray(states.velocity * np.exp(1j * float(fit.unknowns.instrument_phase))),
+        velocity=jnp.asarray(states.velocity * share[:, sensor] * phase),
         share=jnp.asarray(share),
+        participation=jnp.asarray(relative_participation(fit.modes, states.frequency)),
         std=jnp.broadcast_to(jnp.asarray(std), (n, len(std))),
         weight=jnp.ones(n),
         correction=jax.device_put(no_errors(n)),

@@ -13,11 +13,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float, Int
+from jaxtyping import Array, Complex, Float, Int, Shaped
 
 from snrmjax.identify.curves.family_base import AbstractFamily, PackedCurve
 from snrmjax.identify.pointwise.backbone_points import modal_filter, off_resonance_error_factor
-from snrmjax.identify.pointwise.snrm import reference_sensor
+from snrmjax.identify.pointwise.snrm import participation_of, reference_sensor, sensed_mode
 from snrmjax.identify.test_model.priors import FORCE_TO_VELOCITY
 from snrmjax.identify.test_model.states import LEVEL_ERRORS
 from snrmjax.measure.states import SteadyStates, check_phases, relative_errors
@@ -41,7 +41,8 @@ class BalanceData(eqx.Module):
     frequency: Float[Array, " state"]  # rad/s
     force: Float[Array, " state"]  # N, or V where only the drive is known
     velocity: Complex[Array, " state"]  # m/s, what the sensors together say of one of them
-    share: Float[Array, "state sensor"]  # of the sensors in it
+    share: Shaped[Array, "state sensor"]  # of the sensors in it; complex as `modal_filter` has them
+    participation: Float[Array, " state"]  # `SensedMode.ratio`: over that of the mode alone
     std: Float[Array, "state input"]  # of `STATE_ERRORS`
     weight: Float[Array, " state"]  # 1, or less for an outlier under the robust loss
     correction: Float[Array, "state input"]  # of `STATE_ERRORS`, what a fit adds to every record
@@ -91,7 +92,7 @@ class BalanceProblem(eqx.Module):
     def modal_constant(self) -> Float[Array, ""]:
         """A = Φ_r Φᵀb in 1/kg of the model: 1/|A| is its modal mass, seen from force and sensor."""
         r, j = self.data.sensor, self.modes.mode_of_interest
-        return as_numpy(self.modes.mode_shape)[r, j] * as_numpy(self.modes.participation)[j]
+        return as_numpy(self.modes.mode_shape)[r, j] * as_numpy(participation_of(self.modes))
 
     def modal_mass_of(self, unknowns: Unknowns) -> float:
         """The modal mass in kg, seen from force and sensor, that the fit found."""
@@ -174,12 +175,14 @@ def balance_data(
     of_force = np.where(errors[:, 0] > 0, errors[:, 0], FORCE_TO_VELOCITY * errors[:, 1])
     errors = np.column_stack([of_force, errors[:, 1:], np.zeros(len(errors))])  # no stiffness yet
     levels, index = np.unique(np.asarray(data.level)[keep], return_inverse=True)
+    frequency = np.asarray(data.frequency)[keep]
     columns: dict[str, Any] = {
         "level": index,
-        "frequency": np.asarray(data.frequency)[keep],
+        "frequency": frequency,
         "force": force[keep],
         "velocity": velocity[keep],
         "share": share[keep],
+        "participation": relative_participation(modes, frequency),
         "std": errors[keep],
         "weight": np.ones(int(keep.sum())),
         "correction": no_errors(int(keep.sum())),
@@ -190,6 +193,13 @@ def balance_data(
 
 
 _one_sensor = compiled(modal_filter)
+
+
+def relative_participation(
+    modes: LinearModes, frequency: Float[np.ndarray, " state"]
+) -> Float[np.ndarray, " state"]:
+    """`SensedMode.ratio` of states at frequencies in rad/s."""
+    return np.broadcast_to(np.asarray(sensed_mode(modes, frequency).ratio), frequency.shape)
 
 
 def with_deviations(modes: LinearModes, deviation: Array, spread: Array) -> LinearModes:
@@ -297,7 +307,8 @@ def force_balance(
     damping = damping * (1 + level[:, 3])
     omega = data.frequency
     stiffness = squared - omega**2 + 1j * omega * damping
-    needed = stiffness * motion.velocity / (1j * omega * problem.constant_of(unknowns))
+    constant = problem.constant_of(unknowns) * data.participation
+    needed = stiffness * motion.velocity / (1j * omega * constant)
     # Relative to the recorded force, but with no advantage from a larger gain.
     unit = jax.lax.stop_gradient(motion.force * jnp.exp(-error[:, 0])) * jnp.exp(error[:, 0])
     excess = (needed - motion.force) / unit

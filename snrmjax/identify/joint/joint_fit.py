@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from snrmjax.identify.checks.instruments import notes_on_instruments
+from snrmjax.identify.checks.instruments import notes_on_instruments, require_passive
 from snrmjax.identify.checks.residual_autocorrelation import (
     along_resonance,
     residual_autocorrelation,
@@ -128,9 +128,13 @@ class JointFit(AbstractResult):
         """
         share = self.problem.constant_of(self.unknowns) / self.problem.modal_constant
         j, modes = self.modes.mode_of_interest, self.modes
-        participation = np.array(modes.participation)
-        participation[j] *= share
-        scaled = eqx.tree_at(lambda m: m.participation, modes, jax.device_put(participation))
+        factor = np.ones(modes.n_modes)
+        factor[j] = share
+        of_force = jax.device_put(modes.participation * factor)
+        scaled = dataclasses.replace(modes, participation=of_force)
+        if modes.participation_lag is not None:
+            lag = jax.device_put(modes.participation_lag * factor)
+            scaled = dataclasses.replace(scaled, participation_lag=lag)
         if modes.modal_mass_std is None:
             return scaled
         std = np.array(modes.modal_mass_std)
@@ -266,8 +270,9 @@ def fit_jointly(
     first two.
     Returns a `JointFit`, whose `status` says whether it converged.
     Raises `ValueError` for too few states, an unknown family or name, a family with more parameters
-    than there are data, a gain, an offset or a phase that the data do not determine, and a fit
-    whose residuals become infinite or undefined.
+    than there are data, a gain, an offset or a phase that the data do not determine, a fit that
+    needs a modal mass or a damping below zero, and one whose residuals become infinite or
+    undefined.
     Validity: one nonlinear mode whose ω̃ and 2ζ̃ω̃ are functions of amplitude alone.
     Not differentiable: differentiate `snrmjax.identify.identify_points`, or the fitted curves
     themselves (`fit.unknowns`).
@@ -334,6 +339,12 @@ def fit_jointly(
         level_numbers=numbers,
     )
     notes = notes_on_instruments(fit, LEVEL_ERRORS)
+    curve, mass = fit.unknowns.modal_damping, fit.problem.constant_of(fit.unknowns)
+    require_passive(
+        released,
+        float(fit.problem.modal_constant / mass),
+        np.asarray(curve(fit.motion().amplitude(curve))),
+    )
     named = any(choice.kind != SmoothingSpline.kind for choice in choices)
     notes += _notes(fit, 0.5 * view.stiffness_jitter_std, level_std, named)
     return dataclasses.replace(fit, notes=tuple(notes))

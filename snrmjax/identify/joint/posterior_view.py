@@ -7,8 +7,9 @@ from typing import NamedTuple
 import jax
 import numpy as np
 from jaxtyping import Complex, Float
-from scipy.optimize import minimize
+from scipy.optimize import minimize, nnls
 
+from snrmjax.identify.checks.instruments import require_passive
 from snrmjax.identify.curves.families import ARGUMENTS, FAMILIES, Choice
 from snrmjax.identify.curves.family_base import AbstractFamily, Argument
 from snrmjax.identify.curves.splines import SmoothingSpline
@@ -90,6 +91,7 @@ def view_of(
         wander_std = np.full(len(states.level), stiffness_jitter_std / posterior.hyper.noise)
         states = states._replace(errors=np.column_stack([states.errors, wander_std]))
     posterior = fit(states, over_sizes=True, rounds=rounds._replace(start=posterior))
+    require_passive(free, posterior.modal_mass[0])
     if "force_gain" in free:
         posterior = _with_common_gain_in_the_force(posterior)
     noise = _noise_of(posterior, stated)
@@ -155,7 +157,7 @@ def _test_states(
         velocity=sign * velocity,
         errors=np.asarray(data.std)[:, :3],
         stated=stated,
-        constant=abs(constant),
+        constant=abs(constant) * np.asarray(data.participation),
         level_std=tuple(np.asarray(prior.level).tolist()),
         mass_std=_FREE if "force_gain" in free else float(spread[-1]),
         force_is_free="force_gain" in free,
@@ -310,12 +312,15 @@ def _smooth(posterior: TestPosterior, argument: Argument, which: int) -> Smoothi
 
 
 def _complex_gain(problem: BalanceProblem) -> complex:
-    """G of K X/A = G F with K polynomial in the amplitude, by linear least squares."""
+    """G of K X/A = G F with K polynomial in the amplitude, by linear least squares.
+
+    Where these make the damping negative, the phase is that of a passive structure, to 180°.
+    """
     data, constant = problem.data, float(problem.modal_constant)
     omega, velocity, force = (
         np.asarray(part) for part in (data.frequency, data.velocity, data.force)
     )
-    x = velocity / (1j * omega) / constant
+    x = velocity / (1j * omega) / (constant * np.asarray(data.participation))
     a = np.abs(x) / np.abs(x).max()
     columns = [x, x * a**2, x * a**4, 1j * omega * x, 1j * omega * x * a, 1j * omega * x * a**2]
     columns += [-force + 0j, -1j * force]
@@ -324,6 +329,16 @@ def _complex_gain(problem: BalanceProblem) -> complex:
     target = np.concatenate([right.real, right.imag])
     weight = np.tile(1.0 / np.maximum(np.abs(x), 1e-300), 2)
     size = np.linalg.norm(matrix * weight[:, None], axis=0)
-    answer = np.linalg.lstsq(matrix * weight[:, None] / size, target * weight, rcond=1e-13)[0]
+    weighted, goal = matrix * weight[:, None] / size, target * weight
+    answer = np.linalg.lstsq(weighted, goal, rcond=1e-13)[0]
     gain = complex(*(answer / size)[6:])
-    return gain if gain != 0 else 1.0 + 0.0j
+    damping = np.stack([np.ones_like(a), a, a**2], axis=1) @ (answer / size)[3:6]
+    if gain != 0 and np.median(damping) > 0:
+        return gain
+    # Turned by 180° states of one side of resonance are fitted as well, with damping below zero.
+    # The power that the force gives a passive structure has the sign of its gain.
+    sign = np.sign(np.sum(np.sign(np.real(velocity * constant)))) or 1.0
+    weighted[:, 6] *= sign
+    answer = np.append(nnls(weighted[:, :7], goal)[0], 0.0)
+    gain = sign * float((answer / size)[6])
+    return complex(gain if gain != 0 else sign)

@@ -13,7 +13,13 @@ from snrmjax.identify.curves.family_base import Argument
 from snrmjax.identify.pointwise.inversion import closed_form, invert_phasor
 from snrmjax.identify.pointwise.inversion_result import PointStatus, SnrmPoints
 from snrmjax.identify.pointwise.points_result import BackbonePoints
-from snrmjax.identify.pointwise.snrm import reference_sensor
+from snrmjax.identify.pointwise.snrm import (
+    SensedMode,
+    is_single,
+    participation_of,
+    reference_sensor,
+    sensed_mode,
+)
 from snrmjax.measure.indicators import appropriation_of
 from snrmjax.measure.signals import peak_amplitude
 from snrmjax.measure.states import SteadyStates, check_force, check_phases, relative_errors
@@ -107,8 +113,9 @@ def _identify(
     usable = sound & moving
     phasor = jnp.where(moving, combined, 1.0)
     inputs = jnp.stack([jnp.log(data.force), jnp.log(jnp.abs(phasor)), jnp.angle(phasor)], axis=1)
+    sensed = sensed_mode(modes, data.frequency)
     solved, mode_velocity, argument, sensitivity, linear_variance = _solve(
-        modes, r, amplitude, data.frequency, inputs, share, usable
+        modes, r, amplitude, data.frequency, inputs, share, usable, sensed
     )
     natural, damping = solved.natural_frequency, solved.damping_ratio
     solved_well = jnp.isfinite(natural)
@@ -124,7 +131,8 @@ def _identify(
     on_backbone = jnp.abs(mode_velocity)
     if amplitude == "displacement":
         on_backbone = on_backbone * jnp.where(solved_well, natural, 1.0) / data.frequency
-    measured = mode_velocity + residual_velocity(modes, data.frequency, data.force)[:, r]
+    of_mode = mode_velocity if is_single(modes) else mode_velocity / sensed.to_mode(r)
+    measured = of_mode + residual_velocity(modes, data.frequency, data.force)[:, r]
     # Nothing is subtracted where nothing drives the other modes, or nothing moves.
     bare = jnp.where(sound | (raw.force == 0), combined, jnp.nan)
     status = jnp.where(
@@ -226,10 +234,15 @@ def modal_filter(
     """The combination of the sensors' velocities that sees the mode of interest best.
 
     Least squares of Φ_s η = V_s − V_res,s over the sensors, weighted with their stated errors
-    when all have them, is Φ_r η = Σ_s share_s (V_s − V_res,s). Returns Σ share_s V_s, the shares,
-    the relative errors of the sum and the relative residual of the least squares.
+    when all have them, is Φ_r η = Σ_s share_s (V_s − V_res,s). Where damping couples modes, Φ_s is
+    what a sensor then sees of the mode; of a force with phases the sum is relative to that of the
+    mode's own force (`SensedMode`). Returns Σ share_s V_s, the shares, the relative errors of the
+    sum and the relative residual of the least squares.
     """
-    shape = modes.mode_shape[:, modes.mode_of_interest]
+    sensed, shape = sensed_mode(modes, data.frequency), modes.mode_shape[:, modes.mode_of_interest]
+    own = shape[r]
+    if not is_single(modes):
+        shape = shape * sensed.seen
     measured = data.measured & jnp.isfinite(velocity)
     velocity = jnp.where(measured, velocity, 0.0)
     residual = residual_velocity(modes, data.frequency, data.force)
@@ -241,16 +254,18 @@ def modal_filter(
     along = jnp.where(measured, absolute[..., 0], 1.0)
     known = jnp.all(stated[..., 0] & (along > 0) | ~measured, axis=1, keepdims=True)
     weight = jnp.where(measured, 1 / jnp.where(known, along, 1.0) ** 2, 0.0)
-    norm = jnp.sum(weight * shape**2, axis=1, keepdims=True)
+    norm = jnp.sum(weight * (shape.real**2 + shape.imag**2), axis=1, keepdims=True)
     seen = norm > 0
-    share = jnp.where(seen, weight * shape * shape[r] / jnp.where(seen, norm, 1.0), 0.0)
-    modal = jnp.sum(share * of_mode, axis=1, keepdims=True) / shape[r]
+    share = jnp.where(seen, weight * shape.conj() * own / jnp.where(seen, norm, 1.0), 0.0)
+    modal = jnp.sum(share * of_mode, axis=1, keepdims=True) / own
     misfit = jnp.where(measured, of_mode - shape * modal, 0.0)
 
     def size_of(parts: Complex[Array, "state sensor"]) -> Float[Array, " state"]:
         return _root(jnp.sum(weight * (parts.real**2 + parts.imag**2), axis=1))
 
     relative_misfit = _ratio(size_of(misfit), size_of(of_mode))
+    if not is_single(modes):
+        share = share * sensed.turn[:, None]
     combined = jnp.sum(share * velocity, axis=1)
     length = jnp.abs(combined)
 
@@ -258,7 +273,8 @@ def modal_filter(
     def error(component: int) -> Array:
         each = jnp.where(measured, share * absolute[..., component], 0.0)
         known_all = jnp.all(stated[..., component] | ~measured, axis=1)
-        return jnp.where(known_all, _ratio(_root(jnp.sum(each**2, axis=1)), length), jnp.nan)
+        square = jnp.sum(each.real**2 + each.imag**2, axis=1)
+        return jnp.where(known_all, _ratio(_root(square), length), jnp.nan)
 
     std = jnp.stack([relative_std[:, 0, 0], error(0), error(1)], axis=1)
     return jnp.where(seen[:, 0], combined, jnp.nan), share, std, relative_misfit
@@ -278,6 +294,7 @@ def _solve(
     inputs: Float[Array, "state input"],
     share: Float[Array, "state sensor"],
     sound: Bool[Array, " state"],
+    sensed: SensedMode,
 ) -> tuple[SnrmPoints, Array, Array, Array, Array]:
     """Points, mode's velocity, amplitude, derivatives, the linear modes' share of the variance."""
     j = modes.mode_of_interest
@@ -292,21 +309,31 @@ def _solve(
         )
         return eqx.tree_at(lambda m: (m.natural_frequency, m.damping_ratio), modes, changed)
 
-    def measured(inputs: Array, parameters: Array, frequency: Array, share: Array) -> tuple:
+    ratio = jnp.broadcast_to(sensed.ratio, frequency.shape)
+
+    def measured(
+        inputs: Array, parameters: Array, frequency: Array, share: Array, ratio: Array
+    ) -> tuple:
         """Modal constant at the reference sensor, velocity and residual of the sensors' sum."""
         force = jnp.exp(inputs[..., 0])
         velocity = jnp.exp(inputs[..., 1]) * jnp.exp(1j * inputs[..., 2])
         everywhere = residual_velocity(with_parameters(parameters), frequency, force)
         residual = jnp.sum(share * everywhere, axis=-1)
-        return modes.mode_shape[r, j] * modes.participation[j] * force, velocity, residual
+        constant = modes.mode_shape[r, j] * participation_of(modes) * ratio * force
+        return constant, velocity, residual
 
     def argument_of(own: Array, frequency: Array) -> Array:
         return jnp.abs(own) / frequency if amplitude == "displacement" else jnp.abs(own)
 
     def outputs(
-        inputs: Array, parameters: Array, frequency: Array, share: Array, solved: Array
+        inputs: Array,
+        parameters: Array,
+        frequency: Array,
+        share: Array,
+        ratio: Array,
+        solved: Array,
     ) -> Array:
-        constant, velocity, residual = measured(inputs, parameters, frequency, share)
+        constant, velocity, residual = measured(inputs, parameters, frequency, share, ratio)
         # What is not finite would pass to the whole batch: unsolved states get a harmless one.
         constant, frequency, velocity, residual = (
             jnp.where(solved, value, stand_in)
@@ -320,14 +347,14 @@ def _solve(
         argument = argument_of(own, frequency)
         return jnp.stack([natural**2, 2 * damping * natural, jnp.log(argument)])
 
-    constant, velocity, residual = measured(inputs, parameters, frequency, share)
+    constant, velocity, residual = measured(inputs, parameters, frequency, share, ratio)
     points = invert_phasor(constant, frequency, velocity, residual)
     points = jax.tree.map(
         lambda value: jnp.where(sound, value, jnp.nan) if value.dtype.kind == "f" else value, points
     )
     solved = jnp.isfinite(points.natural_frequency)
-    slopes = jax.vmap(jax.jacfwd(outputs, argnums=(0, 1)), in_axes=(0, None, 0, 0, 0))
-    by_input, by_parameter = slopes(inputs, parameters, frequency, share, solved)
+    slopes = jax.vmap(jax.jacfwd(outputs, argnums=(0, 1)), in_axes=(0, None, 0, 0, 0, 0))
+    by_input, by_parameter = slopes(inputs, parameters, frequency, share, ratio, solved)
     spread = jnp.concatenate([modes.natural_frequency_std[keep], modes.damping_ratio_std[keep]])
     variance = jnp.sum((by_parameter * spread) ** 2, axis=-1)
     by_input = jnp.where(solved[:, None, None], by_input, jnp.nan)

@@ -13,8 +13,9 @@ from jaxtyping import Array, Bool, Complex, Float
 from snrmjax.identify.curves.family_base import Argument
 from snrmjax.identify.pointwise.backbone import Backbone
 from snrmjax.identify.pointwise.prediction_result import PredictedResponse, Resonance
-from snrmjax.identify.pointwise.snrm import nonlinear_mode_velocity
+from snrmjax.identify.pointwise.snrm import is_single, nonlinear_mode_velocity, sensed_mode
 from snrmjax.model.modes import LinearModes, residual_velocity
+from snrmjax.numerics.blocks import padded
 from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.facts import Fact
 
@@ -22,6 +23,7 @@ LARGEST_AMPLITUDE_RATIO = 1.5
 """Predictions end, unless asked for more, at this multiple of the largest measured amplitude."""
 
 _SCAN = 4096  # amplitudes
+_ONTO_THE_SIDE = 4  # rounds of frequency and what depends on it
 _SMALLEST = 0.02  # of its largest amplitude: where the main curve starts
 
 
@@ -41,7 +43,9 @@ def resonances(
 
     Arguments: `force` in N; solutions are looked for up to `largest_amplitude_ratio` times the
     largest measured amplitude. Beyond the measured amplitudes the backbone is extrapolated along
-    its end slopes, which no measurement supports: see `Resonance.continued`.
+    its end slopes, which no measurement supports: see `Resonance.continued`. Solutions there at
+    which damping falls faster than amplitude grows, on its way to nothing, are none of the
+    structure's and are left out.
     Returns the solutions in order of amplitude; an empty list when none lies there.
     Raises `ValueError` for a force or a ratio that is not positive.
     Not differentiable: differentiate `Backbone` itself, or `snrm_velocity`.
@@ -52,11 +56,13 @@ def resonances(
     load = abs(float(backbone.modal_constant)) * force
 
     def too_weak(at: _OnBackbone) -> Bool[np.ndarray, " point"]:
-        return np.signbit(at.excess(load))
+        return np.signbit(at.excess(load * at.participation(modes)))
 
     weak = too_weak(_on_backbone(backbone, amplitude))
     tips = []
     for k in np.flatnonzero(weak[:-1] != weak[1:]):
+        if not weak[k] and amplitude[k] >= backbone.largest:
+            continue  # extrapolated damping on its way to nothing
         root = np.mean(_change(backbone, too_weak, amplitude[k], amplitude[k + 1]))
         tips.append(_resonance(backbone, modes, force, float(root)))
     return tips
@@ -95,7 +101,7 @@ def predict_response(
     load = abs(float(backbone.modal_constant)) * force
 
     def responds(at: _OnBackbone) -> Bool[np.ndarray, " point"]:
-        return at.frequencies(load)[2] >= 0
+        return at.frequencies(load * at.participation(modes))[2] >= 0
 
     inside = responds(_on_backbone(backbone, scan))
     starts = [scan[0]] if inside[0] else []
@@ -111,6 +117,8 @@ def predict_response(
     curves = []
     for number, (low, high) in enumerate(zip(starts, ends, strict=True)):
         main = number == 0 and bool(inside[0])
+        if not main and low >= backbone.largest:
+            continue  # it starts where extrapolated damping goes to nothing
         curve = _one_curve(
             backbone,
             modes,
@@ -133,11 +141,16 @@ def _require_force(force: float) -> None:
 
 
 def _scan(backbone: Backbone, ratio: float) -> Float[np.ndarray, " point"]:
-    """Amplitudes from zero to `ratio` times the largest measured one."""
+    """Amplitudes from zero to `ratio` times the largest measured one.
+
+    Not beyond where extrapolated damping ends: a passive structure has none below zero.
+    """
     if not ratio > 0 or not np.isfinite(ratio):
         raise ValueError(f"`largest_amplitude_ratio` must be positive, but is {ratio!r}.")
     n = int(np.ceil(_SCAN * max(ratio / LARGEST_AMPLITUDE_RATIO, 1.0)))
-    return ratio * float(backbone.largest) * np.linspace(0.0, 1.0, n + 1)
+    scan = ratio * float(backbone.largest) * np.linspace(0.0, 1.0, n + 1)
+    none_left = (scan > float(backbone.largest)) & (_on_backbone(backbone, scan).damping <= 0)
+    return scan[: np.append(none_left, True).argmax()]
 
 
 class _OnBackbone(NamedTuple):
@@ -150,14 +163,20 @@ class _OnBackbone(NamedTuple):
     damping_slope: Float[np.ndarray, " point"]
     argument: Argument
 
-    def excess(self, load: float) -> Float[np.ndarray, " point"]:
+    def participation(self, modes: LinearModes) -> Float[np.ndarray, " point"] | float:
+        """`SensedMode.ratio` at the natural frequency."""
+        if is_single(modes):
+            return 1.0
+        return _participation(modes, np.sqrt(np.maximum(self.squared, 0.0)))
+
+    def excess(self, load: float | np.ndarray) -> Float[np.ndarray, " point"]:
         """v·2ζ̃ω̃ − |A|F: zero at a phase resonance."""
         displacement = self.argument == "displacement"
         with np.errstate(invalid="ignore"):
             velocity = self.amplitude * (np.sqrt(self.squared) if displacement else 1.0)
         return velocity * self.damping - load
 
-    def frequencies(self, load: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def frequencies(self, load: float | np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Ω² below and above resonance, and the margin, negative where there is no Ω."""
         with np.errstate(divide="ignore"):
             ratio = (load / self.amplitude) ** 2
@@ -242,8 +261,21 @@ def _velocity(
     own = nonlinear_mode_velocity(
         backbone.modal_constant * force, natural_frequency, damping_ratio, frequency
     )
+    if not is_single(modes):
+        sensed = sensed_mode(modes, frequency)
+        own = own * sensed.ratio / sensed.to_mode(r)
     load = jnp.broadcast_to(force, frequency.shape)
     return own + residual_velocity(modes, frequency, load)[..., r]
+
+
+def _participation(
+    modes: LinearModes, frequency: Float[np.ndarray, " point"]
+) -> Float[np.ndarray, " point"]:
+    """`SensedMode.ratio` at frequencies in rad/s; where there is none, that of the linear mode."""
+    known = np.isfinite(frequency) & (frequency > 0)
+    linear = modes.natural_frequency.item(modes.mode_of_interest)
+    rows = padded(np.where(known, frequency, linear))
+    return np.asarray(sensed_mode(modes, rows).ratio)[: len(frequency)]
 
 
 def _one_curve(
@@ -262,16 +294,21 @@ def _one_curve(
     share = 0.5 * (1 - np.cos(np.pi * angle)) if closed else np.sin(0.5 * np.pi * angle)
     amplitude = low + (high - low) * share
     both = _on_backbone(backbone, np.concatenate([amplitude, amplitude[::-1]]))
-    below, above, _ = both.frequencies(load)
-    squared = np.concatenate([below[:points_per_side], above[points_per_side:]])
+    side, ratio = np.arange(2 * points_per_side) < points_per_side, both.participation(modes)
+    # How strongly the force moves a mode that damping couples to others depends on the frequency.
+    for _ in range(1 if is_single(modes) else _ONTO_THE_SIDE):
+        below, above, _ = both.frequencies(load * ratio)
+        squared = np.where(side, below, above)
+        if not is_single(modes):
+            ratio = _participation(modes, np.sqrt(np.maximum(squared, 0.0)))
     # Points without a real frequency are dropped at the end: every force has the same shapes,
     # and the functions below are compiled once.
     keep = squared > 0
     frequency = np.sqrt(np.where(keep, squared, 1.0))
     with np.errstate(invalid="ignore", divide="ignore"):
         natural = np.sqrt(both.squared)
-        ratio = both.damping / (2 * natural)
-    arrays = (jnp.asarray(v) for v in (force, frequency, natural, ratio))
+        damping = both.damping / (2 * natural)
+    arrays = (jnp.asarray(v) for v in (force, frequency, natural, damping))
     velocity = np.asarray(_velocity(backbone, modes, *arrays))
     curve = PredictedResponse(
         force=force,

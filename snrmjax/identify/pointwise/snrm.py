@@ -1,10 +1,147 @@
-"""The single nonlinear resonant mode function: one mode with amplitude-dependent properties."""
+"""The single nonlinear resonant mode function: one mode with amplitude-dependent properties.
 
+Damping that couples modes, with the coupling C between them, leaves the equation of the mode j
+with all others o eliminated, at iΩ = s:
+
+  (f(s) + N) q_j = (p_j − s C_jo D_oo⁻¹ p_o) F,   f = D_jj − s² C_jo D_oo⁻¹ C_oj,
+  V_s = s (Φ_sj − s Φ_so D_oo⁻¹ C_oj) q_j + s Φ_so D_oo⁻¹ p_o F,
+
+where D is the modal dynamic stiffness, N what the nonlinear elements add to it, and p the
+participations, complex for a force with phases. With f = κ(s)·(s² + 2ζ̃₀ω̃₀s + ω̃₀²), of which ω̃₀
+and ζ̃₀ are those of the eigenvalue of the linear structure, the left side divided by κ is that of
+one mode again. Its ω̃ and ζ̃ are those of the complex mode: exact for a linear structure at every
+frequency, and to the first order in the coupling for what nonlinear elements add.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from snrmjax.model.modes import LinearModes, residual_velocity
+from snrmjax.model.modes import LinearModes, dynamic_stiffness, phasor_of_load, residual_velocity
 from snrmjax.model.modes import reference_sensor as reference_sensor
+from snrmjax.numerics.compiled import compiled
+
+_STEPS = 20  # of Newton's method, from the mode without the others
+_AT_THE_POLE = 1e-6  # relative distance of Ω from a pole, within which κ is taken beside it
+
+
+class SensedMode(NamedTuple):
+    """How the mode of interest, with others that damping couples to it, is seen and driven.
+
+    All one for modal damping and a force without phases. A sensor sees the mode's own motion as
+    Φ q, times `seen`, and the force moves it as its participation, times `driven`, says.
+    """
+
+    seen: Complex[Array, "*batch sensor"] | float
+    driven: Complex[Array, "*batch"] | float
+
+    @property
+    def turn(self) -> Any:
+        """What a velocity is multiplied by, to be relative to the phase in which it is driven."""
+        return jnp.conj(self.driven) / jnp.abs(self.driven)
+
+    @property
+    def ratio(self) -> Any:
+        """Of the participation's size to that of `participation_of`."""
+        return jnp.abs(self.driven)
+
+    def to_mode(self, sensor: int) -> Any:
+        """What a sensor's velocity is multiplied by to be the mode's own, in phase with its drive.
+
+        Without that of the residual modes.
+        """
+        return self.turn / (self.seen if isinstance(self.seen, float) else self.seen[..., sensor])
+
+
+def is_single(modes: LinearModes) -> bool:
+    """Whether neither damping couples the modes nor a force has phases."""
+    return modes.damping_coupling is None and modes.participation_lag is None
+
+
+def participation_of(modes: LinearModes) -> Float[Array, ""]:
+    """Φᵀb of the mode of interest in kg^-1/2; of a force with phases its size, and the sign of the
+    part in phase.
+    """
+    own = modes.participation[modes.mode_of_interest]
+    if modes.participation_lag is None:
+        return own
+    sine = modes.participation_lag[modes.mode_of_interest]
+    return jnp.where(own < 0, -1.0, 1.0) * jnp.hypot(own, sine)
+
+
+def linear_mode(modes: LinearModes) -> tuple[Any, Any]:
+    """Natural frequency (rad/s) and damping ratio of the mode of interest of the linear structure.
+
+    Those of the eigenvalue λ, |λ| and −Re λ/|λ|, where damping couples the modes.
+    """
+    j = modes.mode_of_interest
+    if modes.damping_coupling is None:
+        return modes.natural_frequency[j], modes.damping_ratio[j]
+    return _eigenvalue(modes)
+
+
+def sensed_mode(
+    modes: LinearModes, frequency: Float[Array | np.ndarray, "*batch"] | float
+) -> SensedMode:
+    """What the module's equations make of the mode of interest at frequencies in rad/s."""
+    return SensedMode(1.0, 1.0) if is_single(modes) else SensedMode(*_sensed(modes, frequency))
+
+
+class _Eliminated(NamedTuple):
+    """f(s), and what the others move and pass on, for one s."""
+
+    stiffness: Complex[Array, ""]
+    shape: Complex[Array, " sensor"]
+    participation: Complex[Array, ""]
+
+
+def _eliminated(modes: LinearModes, s: Complex[Array, ""]) -> _Eliminated:
+    j, keep = modes.mode_of_interest, np.asarray(modes.residual_modes, dtype=int)
+    load, shape = phasor_of_load(modes), modes.mode_shape
+    whole = dynamic_stiffness(modes, np.arange(modes.n_modes), s)
+    if not keep.size or modes.damping_coupling is None:
+        return _Eliminated(whole[j, j], shape[:, j] + 0j, load[j])
+    right = jnp.stack([whole[keep, j], load[keep]], axis=1)
+    moved, driven = jnp.linalg.solve(whole[np.ix_(keep, keep)], right).T
+    return _Eliminated(
+        whole[j, j] - whole[j, keep] @ moved,
+        shape[:, j] - shape[:, keep] @ moved,
+        load[j] - whole[j, keep] @ driven,
+    )
+
+
+@compiled
+def _eigenvalue(modes: LinearModes) -> tuple[Array, Array]:
+    j = modes.mode_of_interest
+    natural, ratio = modes.natural_frequency[j], modes.damping_ratio[j]
+
+    def step(_: int, s: Array) -> Array:
+        value, slope = jax.jvp(lambda s: _eliminated(modes, s).stiffness, (s,), (s,))
+        return s - s * value / slope
+
+    start = natural * (-ratio + 1j * jnp.sqrt(1 - ratio**2))
+    pole = jax.lax.fori_loop(0, _STEPS, step, start)
+    return jnp.abs(pole), -pole.real / jnp.abs(pole)
+
+
+@compiled
+def _sensed(modes: LinearModes, frequency: Array) -> tuple[Array, Array]:
+    omega = jnp.asarray(frequency)
+    natural, ratio = linear_mode(modes)
+    near = jnp.abs(omega**2 - natural**2) + ratio * natural * omega < _AT_THE_POLE * omega**2
+    # κ is smooth: where both its parts vanish it is taken a little farther on.
+    s = 1j * omega * jnp.where(near, 1 + 2 * _AT_THE_POLE, 1.0)
+    one = jnp.vectorize(lambda s: tuple(_eliminated(modes, s)), signature="()->(),(s),()")
+    stiffness, shape, participation = one(s)
+    kappa = stiffness / (s**2 + 2 * ratio * natural * s + natural**2)
+    own = modes.mode_shape[:, modes.mode_of_interest]
+    # A sensor at a node of the mode sees what the others move alone.
+    still = own == 0
+    seen = jnp.where(still, 1.0, shape / jnp.where(still, 1.0, own))
+    return seen, participation / (kappa * participation_of(modes))
 
 
 def nonlinear_mode_velocity(
@@ -41,13 +178,16 @@ def snrm_velocity(
 
     Arguments: `natural_frequency` ω̃ and `damping_ratio` ζ̃ of the mode of interest at the
     amplitude of motion, `frequency` Ω in rad/s, `force` in N. Returns phasors relative to the
-    force in m/s at every sensor; differentiable by all of them and by the modes. With the linear
-    ω and ζ it is the linear response, Eq. (23).
+    force in m/s at every sensor; differentiable by all of them and by the modes. With those of
+    `linear_mode` it is the linear response, Eq. (23).
     Valid for well-separated modes without internal resonance and a mode shape that does not
     change with amplitude. Reference: Kwarta & Allen, Eq. (10).
     """
     j = modes.mode_of_interest
-    constant = modes.mode_shape[:, j] * (modes.participation[j] * jnp.asarray(force)[..., None])
+    constant = modes.mode_shape[:, j] * (participation_of(modes) * jnp.asarray(force)[..., None])
+    sensed = sensed_mode(modes, frequency)
+    if not is_single(modes):
+        constant = constant * sensed.seen * jnp.asarray(sensed.driven)[..., None]
     of_mode = nonlinear_mode_velocity(
         constant,
         jnp.asarray(natural_frequency)[..., None],

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from snrmjax.identify.joint.joint_fit import JointFit
+from snrmjax.identify.pointwise.snrm import participation_of
 from snrmjax.identify.test_model.states import LEVEL_ERRORS
 from snrmjax.model.modes import LinearModes
 from snrmjax.numerics.compiled import on_numbers
@@ -48,13 +49,9 @@ class NewLevel(NamedTuple):
 
     def over_test(self, fit: JointFit) -> float:
         """How many times as much a newton moves the mode of interest as it did in the test."""
-        return (
-            1.0 if self.forced is None else _participation(self.forced) / _participation(fit.modes)
-        )
-
-
-def _participation(modes: LinearModes) -> float:
-    return modes.participation.item(modes.mode_of_interest)
+        if self.forced is None:
+            return 1.0
+        return float(participation_of(self.forced) / participation_of(fit.modes))
 
 
 ON_THE_CURVES = NewLevel(np.zeros(len(LEVEL_ERRORS)))

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from snrmjax.identify.pointwise.prediction import LARGEST_AMPLITUDE_RATIO
+from snrmjax.identify.pointwise.snrm import participation_of, sensed_mode
 from snrmjax.identify.prediction.new_level import NewLevel
 from snrmjax.model.modes import LinearModes, residual_velocity
 from snrmjax.numerics.facts import Fact
@@ -41,6 +42,16 @@ class ResonanceDistribution(AbstractResult):
     another_day: bool  # whether the errors are another day's too
 
     @property
+    def frequency_std(self) -> float:
+        """1σ of the frequency (rad/s) of those draws: half of the range that holds 68 %."""
+        return float(self.frequency[3] - self.frequency[1]) / 2
+
+    @property
+    def velocity_std(self) -> float:
+        """The same of the velocity, m/s."""
+        return float(self.velocity[3] - self.velocity[1]) / 2
+
+    @property
     def holds(self) -> Fact:
         """Which errors the quantiles hold."""
         return Fact("errors_of_a_level", another_day=self.another_day)
@@ -60,7 +71,7 @@ class KnownCurves(NamedTuple):
 
     values: Float[np.ndarray, "point curve"]  # ω̃² and 2ζ̃ω̃
     errors: Float[np.ndarray, "point curve error"]
-    load: float  # |A|F, m/s²
+    load: float | Float[np.ndarray, " point"]  # |A|F, m/s²
     load_errors: Float[np.ndarray, " error"]  # of its logarithm
 
 
@@ -97,13 +108,13 @@ def resonance_distribution(
     squared, damping = (curves.values.T[k] + error @ curves.errors[:, k].T for k in range(2))
     damping[::_HELD, edge:] = damping[::_HELD, edge, None]
     of_force = gain if gain_of_force and new.drive is not None else 0 * gain
-    load = curves.load * np.exp(error @ curves.load_errors + of_force) * np.cos(phase)
+    load = np.exp(error @ curves.load_errors + of_force) * np.cos(phase)
     squared, damping = squared * np.exp(stiffness)[:, None], damping * np.exp(loss)[:, None]
     with np.errstate(invalid="ignore"):
         natural = np.sqrt(squared)
     omega = natural + 0.5 * damping * np.tan(phase)[:, None]
     speed = amplitude * omega
-    root = _Root.of(speed * damping / load[:, None])
+    root = _Root.of(speed * damping / (load[:, None] * curves.load))
     kept = root.found | ~np.any(damping[:, edge:] <= 0, axis=1) | self_excited
     at, of_mode = root.at(omega), root.at(speed, at_rest=0.0)
     recorded = np.exp(0 * gain if gain_of_force else gain)
@@ -152,12 +163,13 @@ def other_modes(
     modes: LinearModes, sensor: int, force: float
 ) -> Callable[[Float[np.ndarray, " draw"]], Complex[np.ndarray, " draw"]]:
     """Velocity of the other modes at frequencies, in the direction of the mode's own motion."""
-    j = modes.mode_of_interest
-    sign = np.sign(float(modes.mode_shape[sensor, j] * modes.participation[j]))
+    shape = modes.mode_shape[sensor, modes.mode_of_interest]
+    sign = np.sign(float(shape * participation_of(modes)))
 
     def velocity(frequency: np.ndarray) -> np.ndarray:
         load = jnp.full(frequency.shape, force)
-        return sign * np.asarray(residual_velocity(modes, jnp.asarray(frequency), load))[:, sensor]
+        beside = np.asarray(residual_velocity(modes, jnp.asarray(frequency), load))[:, sensor]
+        return sign * beside * np.asarray(sensed_mode(modes, frequency).to_mode(sensor))
 
     return velocity
 

@@ -26,7 +26,7 @@ class TestStates(NamedTuple):
     # of a relative stiffness that wanders from state to state; in parts where not stated.
     errors: Float[np.ndarray, "state input"]
     stated: bool  # whether these were
-    constant: float  # A, 1/kg
+    constant: float | Float[np.ndarray, " state"]  # A, 1/kg, as it drives each state
     level_std: tuple[float, float, float, float]  # stated 1σ of `LEVEL_ERRORS`; zero: not stated
     mass_std: float  # relative 1σ of κ; zero where it is known
     force_is_free: bool = False  # whether a gain of the force is: a level's gain is then its own

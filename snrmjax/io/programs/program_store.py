@@ -41,6 +41,7 @@ except ImportError:  # JAX moves what is private to it: without these no program
 _PACKAGE = __name__.partition(".")[0]
 _LIBRARIES = ("jax", "jaxlib", "equinox", "optimistix", "lineax", "interpax", "numpy")
 _VERSIONS_KEPT = 3  # of this package and its libraries, each in a folder of its own
+_SOURCES = Path(__file__).resolve().parents[2]  # all of whose sources programs are made of
 _MOST_BYTES = 512 * 2**20  # of one version
 _DIGEST = hashlib.sha256().digest_size
 # Settings of JAX that change no program, but differ from user to user.
@@ -82,7 +83,7 @@ def keep_programs(folder: Path) -> None:
     """Keep programs in a folder, where JAX computes on one CPU."""
     if trace_context is None or jax.default_backend() != "cpu" or len(jax.devices()) != 1:
         return
-    version = folder / version_of(Path(__file__).resolve().parents[1])
+    version = folder / version_of(_SOURCES)
     if not version.is_dir():
         _drop_old(folder)
     keep_programs_with(ProgramStore(version, trace_context()))

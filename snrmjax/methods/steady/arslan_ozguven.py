@@ -7,13 +7,19 @@ describing function: Re v a stiffness and Im v a loss at that amplitude.
 Reference: Ö. Arslan, M. Aykan & H. N. Özgüven, Mech. Syst. Signal Process. 25 (2011) 1112.
 """
 
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Complex
+from jaxtyping import Complex, Float
 
 from snrmjax.measure.states import SteadyStates
 from snrmjax.methods.one_sensor import SensorStates, sensor_states, signed_drive_point
 from snrmjax.methods.result import MethodPoint, MethodResult, MethodStatus, method_result
-from snrmjax.model.modes import LinearModes, reference_sensor
+from snrmjax.model.modes import (
+    LinearModes,
+    dynamic_stiffness,
+    phasor_of_load,
+    reference_sensor,
+)
 
 
 def arslan_ozguven(data: SteadyStates, modes: LinearModes) -> MethodResult:
@@ -37,17 +43,16 @@ def arslan_ozguven(data: SteadyStates, modes: LinearModes) -> MethodResult:
 def describing_function(states: SensorStates, modes: LinearModes) -> Complex[np.ndarray, " state"]:
     """v(X) = N/X in N/m at the reference sensor, one number a state."""
     r, turn = reference_sensor(modes), np.sign(signed_drive_point(modes))
-    flexible = np.asarray(modes.mode_shape)[r]
-    square = states.frequency[:, None] ** 2
-    natural, ratio = np.asarray(modes.natural_frequency), np.asarray(modes.damping_ratio)
-    damping = 2j * ratio * natural * states.frequency[:, None]
-    modal = 1 / (natural**2 - square + damping)
-    rigid = np.asarray(modes.rigid_body_shape)[r]
-    driven = turn * (
-        modal @ (flexible * np.asarray(modes.participation))
-        - rigid @ np.asarray(modes.rigid_body_participation) / square[:, 0]
+    flexible, square = np.asarray(modes.mode_shape)[r], states.frequency**2
+    whole = np.asarray(
+        dynamic_stiffness(modes, np.arange(modes.n_modes), jnp.asarray(1j * states.frequency))
     )
-    direct = modal @ flexible**2 - rigid @ rigid / square[:, 0]
+    loads = np.stack([np.asarray(phasor_of_load(modes)), flexible], axis=1)
+    moved = flexible @ np.linalg.solve(whole, loads[None])
+    rigid = np.asarray(modes.rigid_body_shape)[r]
+    per_force = rigid @ np.asarray(modes.rigid_body_participation)
+    driven = turn * (moved[:, 0] - per_force / square)
+    direct = moved[:, 1] - rigid @ rigid / square
     return (driven * states.force - states.displacement) / (direct * states.displacement)
 
 
@@ -75,12 +80,32 @@ def _point(states: SensorStates, k: int, modes: LinearModes) -> MethodPoint:
     )
 
 
+def _eigenvalue_of(
+    stiffness: Float[np.ndarray, "mode mode"], damping: Float[np.ndarray, "mode mode"], which: int
+) -> tuple[float, float] | None:
+    """|λ| and −Re λ/|λ| of the complex mode in which one mode moves most."""
+    n = len(stiffness)
+    state = np.block([[np.zeros((n, n)), np.eye(n)], [-stiffness, -damping]])
+    values, vectors = np.linalg.eig(state)
+    rising = values.imag > 0
+    if not rising.any():
+        return None
+    own = np.abs(vectors[which]) / np.linalg.norm(vectors[:n], axis=0)
+    value = values[np.argmax(np.where(rising, own, -1.0))]
+    return (float(abs(value)), float(-value.real / abs(value))) if value.real < 0 else None
+
+
 def _mode_of(state: SensorStates, modes: LinearModes) -> tuple[float, float] | None:
     """ω̃ and ζ̃ of the mode of interest with the element of one state; None where it has none."""
     v = complex(describing_function(state, modes)[0])
     shape = np.asarray(modes.mode_shape)[reference_sensor(modes)]
     natural = np.asarray(modes.natural_frequency)
     stiffness = np.diag(natural**2) + v.real * np.outer(shape, shape)
+    if modes.damping_coupling is not None:
+        own = np.diag(2 * np.asarray(modes.damping_ratio) * natural)
+        rate = v.imag / float(state.frequency[0])
+        damped = own + np.asarray(modes.damping_coupling) + rate * np.outer(shape, shape)
+        return _eigenvalue_of(stiffness, damped, modes.mode_of_interest)
     squares, vectors = np.linalg.eigh(stiffness)
     k = int(np.argmax(np.abs(vectors[modes.mode_of_interest])))
     mode = vectors[:, k]

@@ -68,6 +68,26 @@ def _undetermined(name: str, std: float, how: str) -> str:
     return f"these data {verb} `{name}` (1σ {size}). {_REMEDIES[name]}, or do not free it."
 
 
+def _not_passive(what: str, free: Sequence[str]) -> str:
+    if "force_gain" in free:
+        return (
+            "the force gain cannot be determined from these data (the fit needs a negative "
+            f"{what}, which no passive structure has). {_MEASURE_GAIN}."
+        )
+    if free:
+        return (
+            f"these data cannot determine `{free[0]}` (the fit needs a negative {what}, which no "
+            f"passive structure has). {_REMEDIES[free[0]]}, or do not free it."
+        )
+    if what != "damping":
+        return f"no passive structure has these states: the fit needs a negative {what}."
+    return (
+        "the damping comes out negative at every state: the model's `participation`, its shape at "
+        "the sensor, the sensor or the force has the wrong sign, or the phases are not those of a "
+        "velocity relative to the force."
+    )
+
+
 def _at_limit(errors: Sequence[str], limit: float, gain: bool) -> str:
     said = (
         f"the error in {enumerated(errors)} that the states of a level share is as large as a fit "
@@ -230,19 +250,18 @@ def _resonance_range(
     another_day: bool,
     sure: bool,
 ) -> str:
-    words = []
-    if not sure:
-        words = [
-            f"it lies within {ratio:g} times the largest measured amplitude with probability "
-            f"{probability:.2g}, else beyond (a larger `--extrapolate` looks farther)"
-        ]
     (low, high), (slow, fast) = frequency_hz, velocity
-    if np.isfinite(low) and np.isfinite(high):
-        words.append(
-            f"with 95 % probability it lies between {low:.6g} and {high:.6g} Hz, its velocity "
-            f"between {slow:.3g} and {fast:.3g} m/s ({_errors_of_a_level(another_day)} included)"
-        )
-    return "; ".join(words)
+    reach = f"within {ratio:g} times the largest measured amplitude"
+    beyond = "else it lies beyond (a larger `--extrapolate` looks farther)"
+    where = (
+        f"with 95 % probability it lies between {low:.6g} and {high:.6g} Hz, its velocity "
+        f"between {slow:.3g} and {fast:.3g} m/s ({_errors_of_a_level(another_day)} included)"
+    )
+    if sure:
+        return where
+    if not (np.isfinite(low) and np.isfinite(high)):
+        return f"it lies {reach} with probability {probability:.2g}, {beyond}"
+    return f"if it lies {reach}, which has probability {probability:.2g}, {where}; {beyond}"
 
 
 def _not_located(points: Sequence[tuple[str, float]], force: float) -> str:
@@ -350,6 +369,7 @@ SENTENCES: dict[str, Wording] = {
         f"gain; the 1σ of gain and damping leave such errors out. {_MEASURE_GAIN}."
     ),
     "force_gain_undetermined": _undetermined_gain,
+    "fit_not_passive": _not_passive,
     "instrument_undetermined": _undetermined,
     "level_errors_at_limit": _at_limit,
     # Points.

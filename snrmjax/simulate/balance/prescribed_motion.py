@@ -213,13 +213,14 @@ class PrescribedMotion(eqx.Module):
 
         Another phase turns its harmonics h times as far.
         """
-        cosine = self.balance.load().reshape(self.balance.n_coefficients, -1)
+        rows = self.balance.load().reshape(self.balance.n_coefficients, -1)
+        one = rows[1::2] - 1j * rows[2::2]  # of one newton in phase; it acts with phases of its own
         phasor = self.force * (parts[0] - 1j * parts[1])
         there = jnp.where(phasor != 0, phasor, 1.0)
         turned = phasor * jnp.exp(1j * jnp.angle(there) * jnp.arange(self.balance.harmonic_order))
-        parts = jnp.stack([turned.real, -turned.imag], axis=1)
-        oscillating = (parts[:, :, None] * cosine[1::2, None]).reshape(-1)
-        return jnp.concatenate([jnp.abs(there) * cosine[0], oscillating])
+        each = turned[:, None] * one
+        oscillating = jnp.stack([each.real, -each.imag], axis=1).reshape(-1)
+        return jnp.concatenate([jnp.abs(there) * rows[0], oscillating])
 
     def _miss(self, point: Array) -> Float[Array, " part"]:
         velocity = self.recorded(point)[1][1, self.sensor]

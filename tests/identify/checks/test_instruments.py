@@ -62,6 +62,48 @@ def test_the_velocity_axis_ends_where_it_was_measured():
     assert float(as_backbone(fit).largest) == pytest.approx(fit.largest[0], rel=1e-12)
 
 
+def upper_branch(turned=1.0):
+    """Exact states of a hardening mode with 0.1 % of damping, on one side of resonance only.
+
+    By (ω̃² − Ω² + iΩδ) X = A F, solved for Ω at a given |X|.
+    """
+    level, omega, force, velocity, delta = [], [], [], [], 2 * 0.001 * 900.0
+    for number, largest in enumerate([1.0, 1.6, 2.5]):
+        load = delta * 900.0 * largest * np.sqrt(1 + 0.05 * largest**2)
+        for a in np.linspace(0.4, 0.93, 12) * largest:
+            natural = 900.0**2 * (1 + 0.05 * a**2)
+            root = np.sqrt((load / a) ** 2 - delta**2 * natural + 0.25 * delta**4)
+            squared = natural - 0.5 * delta**2 - root
+            x = load / (natural - squared + 1j * np.sqrt(squared) * delta)
+            level.append(number)
+            omega.append(np.sqrt(squared))
+            force.append(load)
+            velocity.append(turned * 1j * np.sqrt(squared) * x)
+    return sj.measure.steady_states(level, omega, force, velocity)
+
+
+@pytest.mark.parametrize(
+    ("free", "turned"),
+    [(("instrument_phase",), 1.0), (("instrument_phase",), -1.0), (("force_gain",), 1.0)],
+)
+def test_no_fit_that_frees_an_instrument_ends_with_damping_below_zero(free, turned):
+    """Of one side of resonance force and damping turned by 180° fit as well: the truth is 0.1 %."""
+    one = sj.model.linear_modes([900.0], [0.001], [[1.0]], [1.0])
+    fit = sj.fit_jointly(upper_branch(turned), one, free=free)
+    curve = fit.unknowns.modal_damping
+    found = np.asarray(curve(fit.motion().amplitude(curve)))
+    np.testing.assert_allclose(found, 1.8, rtol=0.05)  # 2ζω of the states, to what no noise leaves
+    expected = 0.0 if turned > 0 else np.pi
+    error = float(fit.unknowns.instrument_phase) - expected if "force_gain" not in free else 0.0
+    assert abs(np.angle(np.exp(1j * error))) < 0.005
+
+
+def test_a_known_force_against_the_motion_is_refused():
+    one = sj.model.linear_modes([900.0], [0.001], [[1.0]], [1.0])
+    with pytest.raises(ValueError, match=r"against the force|negative at every state"):
+        sj.fit_jointly(upper_branch(-1.0), one)
+
+
 class _Fit:
     """What a fit says of its instruments."""
 

@@ -104,6 +104,26 @@ def force_for(which, amplitude):
     return float(velocity_amplitude(which, a, omega) * damping(a) / abs(CONSTANT))
 
 
+class TestDampingThatGoesToNothing:
+    """δ falls as 1 − a²/4: a·δ rises up to a = 1.155, beyond the data, and δ is zero at 2."""
+
+    FALLING = backbone(W0**2 * line(0.0), RATE * line(-0.25))
+
+    def test_only_the_resonance_before_it_is_one(self):
+        force = force_for(self.FALLING, 1.1)
+        (tip,) = resonances(self.FALLING, MODES, force, largest_amplitude_ratio=2.5)
+        assert tip.amplitude == pytest.approx(1.1 * LARGEST, rel=1e-9)
+        (curve,) = predict_response(self.FALLING, MODES, force, largest_amplitude_ratio=2.5)
+        assert not curve.isolated
+        assert curve.amplitude.max() < 1.12 * LARGEST
+
+    def test_nothing_is_predicted_where_there_is_no_damping_left(self):
+        force = 1.05 * force_for(self.FALLING, 1.15)  # more than any amplitude needs
+        assert resonances(self.FALLING, MODES, force, largest_amplitude_ratio=2.5) == []
+        (curve,) = predict_response(self.FALLING, MODES, force, largest_amplitude_ratio=2.5)
+        assert curve.amplitude.max() <= 2.0 * LARGEST * (1 + 1e-9)
+
+
 class TestResonances:
     @pytest.mark.parametrize("part", [1e-3, 0.1, 0.6, 1.0, 1.4])
     def test_resonance_of_a_duffing_oscillator(self, part):

@@ -176,3 +176,9 @@ def test_a_folder_that_cannot_be_written_does_not_matter(tmp_path):
     digits, _ = ran(tmp_path)
     shutil.rmtree(tmp_path)
     assert ran(tmp_path)[0] == digits
+
+
+def test_programs_are_of_the_sources_of_the_whole_package():
+    """A change of an equation must not find the program of the old one."""
+    assert (program_store._SOURCES / "identify" / "pointwise" / "snrm.py").is_file()
+    assert Path(sj.__file__).resolve().parent == program_store._SOURCES
