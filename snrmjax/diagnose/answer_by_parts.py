@@ -74,6 +74,11 @@ def answers_of(naming: Naming, verdict: Verdict) -> dict[Kinds, float]:
     return {answer_of(kinds): p for kinds, p in naming.answers.items()}
 
 
+def agrees(naming: Naming, misfit: float) -> bool:
+    """Whether a fit of the laws ended where the readings are: else it leaves more than they do."""
+    return misfit < _AS_WELL * max(naming.misfit, 1.0)
+
+
 def fitted_parts(named: NamedParts, predictions: Predictions, data: SteadyStates) -> FoundEffects:
     """The laws of a naming fitted by harmonic balance at the measured motions, all together."""
     reference = predictions.reference
@@ -139,10 +144,8 @@ def completed_by_parts(
         for part in naming.parts
         if part.remainder is not None and part.remainder.significant
     }
-    fitted = {*naming.effects} <= {name.partition(".")[0] for name in answer.parameters}
-    # A fit that leaves more than the readings do ended elsewhere.
-    ended = diagnosis.gap.after < _AS_WELL * max(naming.misfit, 1.0)
-    if fitted and ended and not left:
+    ended = agrees(naming, diagnosis.gap.after)
+    if ended and not left:
         return diagnosis
     parameters, checks, gap = _estimates(naming), diagnosis.checks, diagnosis.gap
     if left or not ended:  # the linear mode is the one that the readings found with the laws

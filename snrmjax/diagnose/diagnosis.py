@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from snrmjax.diagnose import priors
 from snrmjax.diagnose.answer_by_parts import (
+    agrees,
     answers_of,
     completed_by_parts,
     fitted_parts,
@@ -115,14 +116,17 @@ def diagnose_model(
     if former is not None:
         notes.append(former.changed_to(probabilities))
     answer = _answer(verdict, probabilities, checked, completed)
-    if gain is not None and answer.effects:
+    before, after = rms_misfit(misfit, found.baseline), rms_misfit(misfit, fit)
+    if not agrees(naming, after):
+        answer = answer._replace(force_gain=1.0)
+    elif gain is not None and answer.effects:
         notes.append(Fact("gain_with_effects", gain=gain * answer.force_gain, before=gain))
-    notes += [*_notes_on_data(checked), *_notes_on_answer(checked, completed)]
+    notes += _notes_on_data(checked)
+    notes += _notes_on_answer(checked, completed) if agrees(naming, after) else []
     recorded_phases = not unknown[:, 0].any()
     open_classes = verdict is Verdict.AMBIGUOUS and recorded_phases
     test = recommended_test(found) if open_classes else None
     asked = recommendation(found, test, phases=recorded_phases) if verdict.is_answer else None
-    before, after = rms_misfit(misfit, found.baseline), rms_misfit(misfit, fit)
     if verdict is Verdict.NOTHING_MISSING:  # errors of levels that nobody stated are taken out
         before = after = min(after, naming.misfit)
     diagnosis = Diagnosis(
