@@ -149,7 +149,8 @@ class Balance(NamedTuple):
         """The problem made straight about some unknowns and errors.
 
         With `apart` errors of levels that nobody stated are what levels differ by: an error that
-        all have in common is one of the instruments, or of the modal mass.
+        all have in common is one of the instruments, or of the modal mass, and one that runs with
+        their order is a curve (`TestStates.shared_by_levels`).
         At `first` curves are not known yet: what they would pass on of an error is left out, and
         errors of levels move what was recorded.
         """
@@ -177,11 +178,12 @@ class Balance(NamedTuple):
             design[:, places.others] = z[:, None] * moved + slope[:, None] * moved.real
         of_gain = z if states.force_is_free else -z - slope
         columns = (of_gain, -1j * z, now.stiffness, now.damping)
+        shared = states.shared_by_levels
         for k, column in enumerate(columns):
             level = places.levels[:, k]
             design[np.arange(len(omega)), level[states.level]] = column
             if apart and not states.level_std[k] > 0:
-                design[:, level] -= np.mean(design[:, level], axis=1, keepdims=True)
+                design[:, level] -= design[:, level] @ shared @ shared.T
         design[:, places.beside] = self.beside
         # Residual at the record: rows − design @ unknowns, by its straight line.
         rows = now.z - now.model - np.sum(slopes * errors, axis=1) + design @ unknowns

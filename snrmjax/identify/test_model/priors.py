@@ -131,6 +131,9 @@ LEVELS: tuple[HalfNormalSize, ...] = (
 )
 """In the order of `LEVEL_ERRORS`."""
 
+ONE_AMPLITUDE = 0.1
+"""Of the logarithm of levels' amplitudes: closer levels repeat one another."""
+
 LEVELS_DIFFER = 5.41
 """Of −2 ln p, from which on levels are said to differ: 1 %, one-sided, as four kinds are tried."""
 

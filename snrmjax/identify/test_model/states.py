@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
-from snrmjax.identify.test_model.priors import FORCE_TO_VELOCITY
+from snrmjax.identify.test_model.priors import FORCE_TO_VELOCITY, ONE_AMPLITUDE
 
 LEVEL_ERRORS = ("gain", "phase", "stiffness", "damping")
 """What all states of a level may have in common, relative or in rad."""
@@ -51,6 +51,19 @@ class TestStates(NamedTuple):
     def amplitude(self) -> Float[np.ndarray, " state"]:
         """Displacement amplitudes, m."""
         return np.abs(self.velocity) / self.frequency
+
+    @property
+    def shared_by_levels(self) -> Float[np.ndarray, "level direction"]:
+        """What no differences between levels are, orthonormal: a constant, and a line over the
+        logarithm of their amplitudes, which curves of amplitude have as well.
+
+        Two levels, and levels of one amplitude, leave no line: all that they differ by is theirs.
+        """
+        level = np.arange(self.n_levels)
+        largest = np.array([np.max(self.amplitude[self.level == k]) for k in level])
+        along = np.log(largest / np.max(largest, initial=0.0))
+        line = len(level) > 2 and np.ptp(along) > ONE_AMPLITUDE
+        return np.linalg.qr(np.stack([np.ones(len(level)), along][: 1 + line], axis=1))[0]
 
 
 def state_errors(
