@@ -41,6 +41,7 @@ class Balance(NamedTuple):
     units: tuple[float, float]  # of both curves' coefficients
     weight: Float[np.ndarray, " state"]  # 1, or less for an outlier
     beside: Complex[np.ndarray, "state function"]  # what a discrepancy is made of
+    in_order: tuple[bool, ...] = (False,) * 4  # which of `LEVEL_ERRORS` would run with the levels
 
     def at(self, unknowns: np.ndarray, errors: np.ndarray) -> "BalancedStates":
         """The balance of states whose records are corrected by these errors."""
@@ -150,7 +151,7 @@ class Balance(NamedTuple):
 
         With `apart` errors of levels that nobody stated are what levels differ by: an error that
         all have in common is one of the instruments, or of the modal mass, and one that runs with
-        their order is a curve (`TestStates.shared_by_levels`).
+        their order (`in_order`) is a curve.
         At `first` curves are not known yet: what they would pass on of an error is left out, and
         errors of levels move what was recorded.
         """
@@ -183,7 +184,8 @@ class Balance(NamedTuple):
             level = places.levels[:, k]
             design[np.arange(len(omega)), level[states.level]] = column
             if apart and not states.level_std[k] > 0:
-                design[:, level] -= design[:, level] @ shared @ shared.T
+                common = shared[:, : 1 + self.in_order[k]]
+                design[:, level] -= design[:, level] @ common @ common.T
         design[:, places.beside] = self.beside
         # Residual at the record: rows − design @ unknowns, by its straight line.
         rows = now.z - now.model - np.sum(slopes * errors, axis=1) + design @ unknowns

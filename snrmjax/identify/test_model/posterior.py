@@ -20,9 +20,10 @@ taken where likelihood times prior is largest, and integrated over by Laplace's 
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
-from scipy.special import ndtri, stdtrit
+from jaxtyping import Bool, Float
+from scipy.special import fdtrc, ndtri, stdtrit
 
+from snrmjax.identify.test_model import priors
 from snrmjax.identify.test_model.balance import Balance
 from snrmjax.identify.test_model.curve_basis import CurveBasis
 from snrmjax.identify.test_model.hyper import (
@@ -84,6 +85,7 @@ class TestPosterior(NamedTuple):
     weight: Float[np.ndarray, " state"]  # 1, or less for an outlier
     share: float  # of the states that count, where neighbours err alike
     settled: bool  # whether the last round moved nothing by more than its error
+    in_order: tuple[bool, ...]  # which errors of levels ran with their amplitudes: curves do
 
     @property
     def modal_mass(self) -> tuple[float, float]:
@@ -174,7 +176,16 @@ def fit_test(
     places = places_of(basis, states.n_levels, discrepancy, reference, n_others)
     beside = np.zeros((n, 2 * ALONG * discrepancy), dtype=complex)
     balance = Balance(states, basis, places, units, np.ones(n), beside)
+    if start is not None:
+        balance = balance._replace(in_order=start.in_order)
     walk = likeliest_walk(balance, rounds, robust=robust, tempered=tempered)
+    while walk.found is not None:
+        in_order = walk.balance.in_order
+        more = levels_in_order(states, walk.found.mean[places.levels])
+        if not np.any(more > in_order):
+            break
+        balance = balance._replace(in_order=tuple((more | in_order).tolist()))
+        walk = likeliest_walk(balance, rounds, robust=robust, tempered=tempered)
     reached = walk.found
     if reached is None:
         raise ValueError(f"`rounds.most` must be at least one, not {rounds.most}.")
@@ -223,7 +234,21 @@ def fit_test(
         walk.balance.weight,
         reached.equations.share,
         walk.still,
+        walk.balance.in_order,
     )
+
+
+def levels_in_order(
+    states: TestStates, errors: Float[np.ndarray, "level error"]
+) -> Bool[np.ndarray, " error"]:
+    """Which unstated errors of levels run with the levels' amplitudes by more than chance does."""
+    shared, n = states.shared_by_levels, states.n_levels
+    if shared.shape[1] < 2 or n < 3:
+        return np.zeros(errors.shape[1], dtype=bool)
+    constant, line = (shared.T @ errors) ** 2
+    left = np.maximum(np.sum(errors**2, axis=0) - constant - line, 1e-12 * line + 1e-300)
+    chance = fdtrc(1, n - 2, line * (n - 2) / left)
+    return (chance < priors.IN_ORDER) & ~(np.array(states.level_std) > 0)
 
 
 def _log_likelihood(reached: Reached) -> float:

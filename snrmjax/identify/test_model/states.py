@@ -54,16 +54,13 @@ class TestStates(NamedTuple):
 
     @property
     def shared_by_levels(self) -> Float[np.ndarray, "level direction"]:
-        """What no differences between levels are, orthonormal: a constant, and a line over the
-        logarithm of their amplitudes, which curves of amplitude have as well.
-
-        Two levels, and levels of one amplitude, leave no line: all that they differ by is theirs.
+        """Orthonormal: a constant, and a line over the logarithm of the levels' amplitudes, which
+        curves of amplitude have as well; of levels of one amplitude, a constant alone.
         """
         level = np.arange(self.n_levels)
-        largest = np.array([np.max(self.amplitude[self.level == k]) for k in level])
-        along = np.log(largest / np.max(largest, initial=0.0))
-        line = len(level) > 2 and np.ptp(along) > ONE_AMPLITUDE
-        return np.linalg.qr(np.stack([np.ones(len(level)), along][: 1 + line], axis=1))[0]
+        along = np.log([np.max(self.amplitude[self.level == k]) for k in level])
+        constant, apart = np.ones(len(level)), np.ptp(along) > ONE_AMPLITUDE
+        return np.linalg.qr(np.stack([constant, along - along[0]][: 1 + apart], axis=1))[0]
 
 
 def state_errors(
