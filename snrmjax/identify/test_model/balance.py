@@ -150,7 +150,7 @@ class Balance(NamedTuple):
         """The problem made straight about some unknowns and errors.
 
         With `apart` errors of levels that nobody stated are what levels differ by: an error that
-        all have in common is one of the instruments, or of the modal mass, and one that runs with
+        all have in common is one of the instruments, or of the modal mass. One that runs with
         their order (`in_order`) is a curve.
         At `first` curves are not known yet: what they would pass on of an error is left out, and
         errors of levels move what was recorded.
@@ -183,8 +183,8 @@ class Balance(NamedTuple):
         for k, column in enumerate(columns):
             level = places.levels[:, k]
             design[np.arange(len(omega)), level[states.level]] = column
-            if apart and not states.level_std[k] > 0:
-                common = shared[:, : 1 + self.in_order[k]]
+            if not states.level_std[k] > 0:
+                common = shared[:, 0 if apart else 1 : 1 + self.in_order[k]]
                 design[:, level] -= design[:, level] @ common @ common.T
         design[:, places.beside] = self.beside
         # Residual at the record: rows − design @ unknowns, by its straight line.

@@ -190,9 +190,15 @@ def fit_test(
     if reached is None:
         raise ValueError(f"`rounds.most` must be at least one, not {rounds.most}.")
     # The size of what few levels differ by is not well known: as Student's t has it. What they have
-    # in common may be anything of that size.
+    # in common may be anything of that size, and so may what runs with their order: the curves
+    # have it, and bands say that it may be the levels'.
     last = walk.balance.straight(reached.mean, reached.errors, apart=False)
     equations = last.equations._replace(share=reached.equations.share)
+    exchanged = equations
+    if any(walk.balance.in_order):
+        free = walk.balance._replace(in_order=(False,) * 4)
+        anew = free.straight(reached.mean, reached.errors, apart=False)
+        exchanged = anew.equations._replace(share=equations.share)
 
     variances = prior_variances(basis, places, states)
 
@@ -206,7 +212,7 @@ def fit_test(
             variance[errors_of_kind] *= (
                 1.0 if std > 0 else students_factor(float(np.sum(informed[errors_of_kind]))) ** 2
             )
-        wide = equations.posterior(noise, variance)[1]
+        wide = exchanged.posterior(noise, variance)[1]
         return Gaussian(mean, wide, float(np.sum(informed)))
 
     objective = objective_of(reached.equations, states, basis, places)
