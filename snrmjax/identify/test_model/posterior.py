@@ -85,7 +85,7 @@ class TestPosterior(NamedTuple):
     weight: Float[np.ndarray, " state"]  # 1, or less for an outlier
     share: float  # of the states that count, where neighbours err alike
     settled: bool  # whether the last round moved nothing by more than its error
-    in_order: tuple[bool, ...]  # which errors of levels ran with their amplitudes: curves do
+    in_order: tuple[bool, ...]  # which errors of levels run with their forces: curves do
 
     @property
     def modal_mass(self) -> tuple[float, float]:
@@ -179,7 +179,8 @@ def fit_test(
     if start is not None:
         balance = balance._replace(in_order=start.in_order)
     walk = likeliest_walk(balance, rounds, robust=robust, tempered=tempered)
-    while walk.found is not None:
+    # Where neighbouring states miss the curves alike, levels may differ by what the model lacks.
+    while walk.found is not None and walk.found.equations.share < 1:
         in_order = walk.balance.in_order
         more = levels_in_order(states, walk.found.mean[places.levels])
         if not np.any(more > in_order):
@@ -247,7 +248,7 @@ def fit_test(
 def levels_in_order(
     states: TestStates, errors: Float[np.ndarray, "level error"]
 ) -> Bool[np.ndarray, " error"]:
-    """Which unstated errors of levels run with the levels' amplitudes by more than chance does."""
+    """Which unstated errors of levels run with the levels' forces by more than chance does."""
     shared, n = states.shared_by_levels, states.n_levels
     if shared.shape[1] < 2 or n < 3:
         return np.zeros(errors.shape[1], dtype=bool)
