@@ -119,19 +119,19 @@ class SmoothingSpline(Spline):
 
 
 def amplitudes_apart(
-    amplitude: Float[np.ndarray, " point"], most: int, ratio: float
+    amplitude: Float[np.ndarray, " point"], most: int, ratio: float, *, crowded: bool = False
 ) -> Float[np.ndarray, " knot"]:
     """Some of the amplitudes in rising order, each at least so many times the one below.
 
-    Where amplitudes crowd, every `_CROWD`th: a curve that is steep there keeps the amplitude of
-    many states alike, as a wire that meets a critical velocity.
+    With `crowded` also every `_CROWD`th where amplitudes crowd: a curve that is steep there keeps
+    the amplitudes of many states alike, as a wire that meets a critical velocity.
 
     Arguments: `amplitude` relative to the largest; of more than `most` even picks.
     """
     apart, since = [1.0], 0
     for size in np.sort(amplitude)[::-1]:
         since += 1
-        if 0 < size * (_CLOSEST if since >= _CROWD else ratio) <= apart[-1]:
+        if 0 < size * (_CLOSEST if crowded and since >= _CROWD else ratio) <= apart[-1]:
             apart.append(float(size))
             since = 0
     pick = np.linspace(0, len(apart) - 1, min(most, len(apart)))

@@ -17,6 +17,7 @@ from snrmjax.identify.curves.families import parse_family
 from snrmjax.identify.curves.splines import SmoothingSpline
 from snrmjax.identify.joint.family_fit import FamilyFit, FitStatus, fit_families
 from snrmjax.identify.joint.force_balance import (
+    STATE_ERRORS,
     BalanceData,
     BalanceProblem,
     Motion,

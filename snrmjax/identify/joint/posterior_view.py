@@ -76,6 +76,8 @@ def view_of(
     rounds = Rounds(most_knots=MOST_KNOTS if knots is None else knots)
     fit = functools.partial(fit_test, robust=robust, tempered=True)
     posterior = fit(states, compare_levels=False, rounds=rounds)
+    if _noise_of(posterior, stated).exceeded:  # curves may be steeper than their knots let them
+        posterior = fit(states, compare_levels=False, rounds=rounds._replace(crowded=True))
     mass, std = posterior.modal_mass
     assumed = "force_gain" not in free and problem.modes.modal_mass_std is None
     if assumed and abs(mass - 1) < _ASKED * std:

@@ -169,7 +169,8 @@ def fit_test(
         float(np.ptp(omega**2) + _REACH * np.median(np.abs(z))),
         float(np.quantile(np.abs(z.imag / omega), 0.9) + 1e-12 * np.sqrt(reference)),
     )
-    basis, start = CurveBasis.of(states.amplitude, rounds.most_knots), rounds.start
+    basis = CurveBasis.of(states.amplitude, rounds.most_knots, crowded=rounds.crowded)
+    start = rounds.start
     if start is not None:
         basis, units, reference = start.basis, start.units, start.places.reference
     n_others = 0 if states.beside is None else states.beside.shape[1]
