@@ -179,13 +179,13 @@ class Balance(NamedTuple):
             design[:, places.others] = z[:, None] * moved + slope[:, None] * moved.real
         of_gain = z if states.force_is_free else -z - slope
         columns = (of_gain, -1j * z, now.stiffness, now.damping)
-        shared = states.shared_by_levels
+        common = states.common_to_levels
         for k, column in enumerate(columns):
             level = places.levels[:, k]
             design[np.arange(len(omega)), level[states.level]] = column
             if not states.level_std[k] > 0:
-                common = shared[:, 0 if apart else 1 : 1 + self.in_order[k]]
-                design[:, level] -= design[:, level] @ common @ common.T
+                taken = common[:, 0 if apart else 1 : 1 + self.in_order[k]]
+                design[:, level] -= design[:, level] @ taken @ taken.T
         design[:, places.beside] = self.beside
         # Residual at the record: rows − design @ unknowns, by its straight line.
         rows = now.z - now.model - np.sum(slopes * errors, axis=1) + design @ unknowns

@@ -250,10 +250,10 @@ def levels_in_order(
     states: TestStates, errors: Float[np.ndarray, "level error"]
 ) -> Bool[np.ndarray, " error"]:
     """Which unstated errors of levels run with the levels' forces by more than chance does."""
-    shared, n = states.shared_by_levels, states.n_levels
-    if shared.shape[1] < 2 or n < 3:
+    common, n = states.common_to_levels, states.n_levels
+    if common.shape[1] < 2 or n < 3:
         return np.zeros(errors.shape[1], dtype=bool)
-    constant, line = (shared.T @ errors) ** 2
+    constant, line = (common.T @ errors) ** 2
     left = np.maximum(np.sum(errors**2, axis=0) - constant - line, 1e-12 * line + 1e-300)
     chance = fdtrc(1, n - 2, line * (n - 2) / left)
     return (chance < priors.IN_ORDER) & ~(np.array(states.level_std) > 0)

@@ -53,7 +53,7 @@ class TestStates(NamedTuple):
         return np.abs(self.velocity) / self.frequency
 
     @property
-    def shared_by_levels(self) -> Float[np.ndarray, "level direction"]:
+    def common_to_levels(self) -> Float[np.ndarray, "level direction"]:
         """Orthonormal: a constant, and a line over the logarithm of the levels' forces, which
         curves of amplitude have as well; of levels of one force, a constant alone.
         """
