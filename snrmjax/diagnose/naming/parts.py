@@ -36,7 +36,8 @@ class Remainder(NamedTuple):
     laws: Float[np.ndarray, " point"]  # what the laws add, alike
     std: Float[np.ndarray, " point"]
     state_velocity: Float[np.ndarray, " state"]  # m/s, alike
-    state_change: Float[np.ndarray, " state"]  # what each state reads of the whole change
+    # What each state reads of the whole change, with the linear mode that was found.
+    state_change: Float[np.ndarray, " state"]
     rms: float  # over the measured states
     significant: bool  # beyond what noise can be
 
@@ -366,9 +367,13 @@ def _remainder(problem: Problem, reads: list[_Read], part: str, best: _Read) -> 
     if part in DRAWN:
         unit: Any = 1.0 if part == "stiffness" else 0.5
         unit_of_state = unit
+        # What the linear test had wrong is no change with amplitude.
+        softer, lossier = best.solved.linear
         beyond = np.real(readings.beyond) / natural**2
+        beyond = beyond - 2 * softer * readings.linear.frequency_std / natural
         if part == "damping":
             beyond = np.imag(readings.beyond) / (2 * natural * readings.frequency)
+            beyond = beyond - lossier * readings.linear.damping_std
         std = _std_along(functions, change.covariance)
         value = functions @ change.rest
     else:  # sizes, of the velocity at the sensor

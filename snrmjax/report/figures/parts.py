@@ -60,8 +60,9 @@ def _draw(axes: Axes, part: str, left: Remainder, *, laws: bool) -> None:
     if laws:
         law: Style = {"color": SIMULATED, "linestyle": "--"}
         axes.plot(at, times * left.laws, **law, label="laws alone")
-    # States far from resonance read little: the axis is that of the curves.
-    reach = np.concatenate([whole, times * left.laws])
+    # States far from resonance read little: the axis is that of the curves and of the others.
+    states = np.nanquantile(times * left.state_change, [0.25, 0.75])
+    reach = np.concatenate([whole, times * left.laws, states])
     margin = 0.5 * max(np.ptp(reach), 1e-3 * np.max(np.abs(reach), initial=1e-9))
     axes.set_ylim(np.min(reach) - margin, np.max(reach) + margin)
     name_axes(axes, "", f"Velocity amplitude ({unit.name})", title[part])
