@@ -204,8 +204,12 @@ def _read(problem: Problem, cell: Cell, weight: float, least: dict[str, _Least])
     seen = np.abs(solution.mean[:k]) > priors.VISIBLE * std
     laws: dict[str, Laws] = {"instrument": ()}
     left = {"instrument": False}
+    damping = _changes(problem, cell, solution, "damping")
+    damped = 2 * problem.readings.damping_ratio + damping.of_law @ damping.strength + damping.left
     for part in problem.parts:
         small, visible = least[part]
+        if part in DRAWN:
+            small = small * np.abs(damped)
         change = _changes(problem, cell, solution, part)
         rest, each = change.left, change.of_law * change.strength
         whole = _size(np.sum(each, axis=1) + rest)
@@ -233,9 +237,12 @@ def _read(problem: Problem, cell: Cell, weight: float, least: dict[str, _Least])
 
 
 def _smallest(problem: Problem, part: str) -> _Least:
-    """Changes that are no finding at every state, and whether rows show a change."""
+    """Changes that are no finding at every state, and whether rows show a change.
+
+    Of stiffness and damping over the damping δ/ω₀.
+    """
     if part in DRAWN:
-        return priors.BELOW_BANDWIDTH * problem.readings.relative_damping, lambda _: True
+        return np.full(len(problem.functions), priors.BELOW_BANDWIDTH), lambda _: True
     one = problem.readings.harmonics[problem.parts.index(part) - 2]
     unit = problem.readings.natural_frequency**2
 
