@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex, Float
 
-from snrmjax.diagnose.misfit.predictions import Predictions, scales_of
+from snrmjax.diagnose.misfit.predictions import Predictions, predictions_of, scales_of
 from snrmjax.diagnose.misfit.reference import test_states_of
 from snrmjax.diagnose.naming.evidence import Problem, best_hypotheses
 from snrmjax.diagnose.naming.parts import Naming, naming_of
@@ -24,7 +24,6 @@ from snrmjax.diagnose.naming.readings import (
 )
 from snrmjax.diagnose.verdict import Verdict
 from snrmjax.identify.calibrate.calibration_states import ASSUMED_ERROR
-from snrmjax.identify.calibrate.inverse_force import inverse_force
 from snrmjax.identify.pointwise.snrm import (
     is_single,
     linear_mode,
@@ -36,7 +35,6 @@ from snrmjax.model.effect_base import AbstractAddedMode
 from snrmjax.model.effects import EFFECTS
 from snrmjax.model.library.measurement_chain import ModeShapeChange
 from snrmjax.model.modes import linear_response, residual_velocity
-from snrmjax.model.parameters import with_parameters
 from snrmjax.numerics.blocks import padded
 
 _ANY_PHASE = 1.0  # rad, 1σ of a phase that was not recorded, about the likely one
@@ -164,11 +162,9 @@ def _motion_of_model(
         return linear
     constant = modes.mode_shape.item(sensor, j) * float(participation_of(modes))
     used = predictions.chosen.rows[rows]
-    uncertain = [
-        with_parameters(model, (name,), jnp.asarray([value + std]))
-        for name, (value, std) in predictions.stated.items()
-        if not name.startswith("mode_")  # linear parameters have columns of their own
-    ]
+    # Linear parameters have columns of their own.
+    names = [name for name in predictions.stated if not name.startswith("mode_")]
+    stds = np.array([predictions.stated[name][1] for name in names])
 
     def balanced(
         velocity: Complex[np.ndarray, " state"], omega: Float[np.ndarray, " state"]
@@ -176,20 +172,24 @@ def _motion_of_model(
         sensed = sensed_mode(modes, omega)
         to_mode, driven = np.asarray(sensed.to_mode(sensor)), constant * np.asarray(sensed.ratio)
         own = np.sign(constant) * velocity / to_mode
-        force = jnp.asarray(np.asarray(data.force)[used])
-        rest = np.asarray(residual_velocity(modes, jnp.asarray(omega), jnp.ones_like(force)))
+        force = np.asarray(data.force)[used]
+        rest = np.asarray(residual_velocity(modes, *map(jnp.asarray, (omega, np.ones_like(force)))))
         recorded = np.asarray(data.velocity).copy()
-        recorded[used, sensor] = own + rest[:, sensor] * np.asarray(force)
+        recorded[used, sensor] = own + rest[:, sensor] * force
         known = jnp.asarray(recorded), jnp.zeros_like(data.phase_std)
         moved = eqx.tree_at(lambda d: (d.velocity, d.phase_std), data, known)
-        found, higher = [], []
-        for one in (model, *uncertain):
-            solved = inverse_force(one, moved)
-            needed = np.asarray(solved.force)[used]
-            higher.append(np.asarray(solved.velocity)[used][:, list(orders), sensor])
-            # The rest of the motion at the force that the model needs, and not the measured one.
-            mode = own + rest[:, sensor] * (np.asarray(force) - needed)
-            found.append(1j * omega * driven * needed / (mode * to_mode))
-        return ModelMotion(np.array(found), np.array(higher))
+        there = predictions_of(model, moved, kinds=())
+        found = there.of(there.group.values[None], names)
+        columns = np.moveaxis(found.slopes[0] * stds, 2, 0) + found.columns[0]
+        parts = np.concatenate([found.columns, columns])
+        parts = parts[..., 0::2] + 1j * parts[..., 1::2]
+        chosen = there.chosen
+        size, n = np.abs(np.asarray(chosen.states.velocity)[:, :1]), len(chosen.sensors)
+        measured = np.asarray(chosen.states.harmonics)[:, 0]
+        higher = (measured + parts[:, :, n : n + len(chosen.orders)] * size)[..., : len(orders)]
+        needed = force * (1 + parts[:, :, 0])
+        # The rest of the motion at the force that the model needs, and not the measured one.
+        mode = own + rest[:, sensor] * (force - needed)
+        return ModelMotion(1j * omega * driven * needed / (mode * to_mode), higher)
 
     return balanced

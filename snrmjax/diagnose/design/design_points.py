@@ -80,7 +80,8 @@ def predicted_test(
     found = _states(
         misfit, whose[good], at[good], own[good], np.abs(force)[good], seen[good], floor
     )
-    predictions = predictions_of(misfit.model, found, misfit.predictions.force_gain_std)
+    before = misfit.predictions
+    predictions = predictions_of(misfit.model, found, before.force_gain_std, kinds=before.kinds)
     rows = tuple(whose[good] == number for number in range(len(points)))
     phases = np.angle(np.asarray(found.velocity)[:, sensor])
     at_resonance = []
@@ -133,7 +134,7 @@ def _needed(
     misfit: WeightedMisfit, fit: EffectFit, data: SteadyStates
 ) -> tuple[Complex[np.ndarray, " state"], Complex[np.ndarray, "state harmonic"]]:
     """The force that motions need under a fit, for one newton recorded, and their harmonics."""
-    predictions = predictions_of(misfit.model, data)
+    predictions = predictions_of(misfit.model, data, kinds=misfit.predictions.kinds)
     given = misfit.baseline_parameters(fit.rows)
     values = np.append(list(given.values()), fit.values)
     columns = predictions.of(predictions.group.at((*given, *fit.labels), values)[None]).columns[0]

@@ -110,6 +110,12 @@ class Predictions:
         """How many shared errors are the baseline's: they come first, then those of levels."""
         return len(self.stated) + (self.force_gain_std > 0)
 
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """The effects that candidates may have."""
+        added = self.group.model.effects[len(self.model.effects) :]
+        return tuple(effect.kind for effect in added)
+
     def with_kinds(self, kinds: Iterable[str]) -> "Predictions":
         """The same for candidates of some kinds of effects."""
         return dataclasses.replace(self, group=_with_effects(self.model, scales_of(self), kinds))

@@ -144,7 +144,7 @@ def best_hypotheses(readings: Readings, kinds: Iterable[str]) -> tuple[Problem, 
     """All hypotheses that can count, the most probable first; their shapes as fine as needed."""
     problem = problem_of(readings, hypothesis_columns(readings, kinds))
     for _ in range(_ROUNDS):
-        counts = _worth_dividing(problem, *_weighed(problem))
+        counts = _worth_dividing(problem, *_weighed(problem, 2))
         if not counts:
             break
         finer = [one for k in counts for one in problem.columns[k].divided(readings)]
@@ -174,12 +174,15 @@ def hypotheses_of(problem: Problem) -> list[Cell]:
     return _weighed(problem)[0]
 
 
-def _weighed(problem: Problem) -> tuple[list[Cell], Float[np.ndarray, " column"]]:
-    """Hypotheses that can count, and ln evidence of every column alone with its best remainders."""
-    few, each = _sizes(2), _sizes(1)
+def _weighed(problem: Problem, every: int = 1) -> tuple[list[Cell], Float[np.ndarray, " column"]]:
+    """Hypotheses that can count, and ln evidence of every column alone with its best remainders.
+
+    With every size of remainders, or some: `every` second one.
+    """
+    few, each = _sizes(2), _sizes(every)
     own, *others = problem.blocks
     grid = [_Normal.of(problem.columns, own, s) for s in itertools.product(each, each)]
-    higher = _of_harmonics(problem.columns, others)
+    higher = _of_harmonics(problem.columns, others, every)
     cells: list[Cell] = []
     alone, best = np.full(len(problem.columns), -np.inf), -np.inf
     of_higher = _Diagonals.of(higher)
@@ -208,11 +211,11 @@ def _weighed(problem: Problem) -> tuple[list[Cell], Float[np.ndarray, " column"]
     return sorted(kept, key=lambda cell: -cell.log_evidence), alone
 
 
-def _of_harmonics(columns: list[Column], blocks: list[Block]) -> "list[_Normal | None]":
+def _of_harmonics(columns: list[Column], blocks: list[Block], every: int) -> "list[_Normal | None]":
     """What counts of all other harmonics, for remainders of every combination of sizes."""
     if not blocks:
         return [None]
-    sizes = [(size,) for size in priors.HARMONIC_REMAINDERS.tolist()]
+    sizes = [(size,) for size in priors.HARMONIC_REMAINDERS[::every].tolist()]
     each = [[_Normal.of(columns, block, size) for size in sizes] for block in blocks]
     return [
         functools.reduce(lambda one, other: one.with_rows_of(other), some)

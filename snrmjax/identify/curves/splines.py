@@ -17,6 +17,9 @@ from snrmjax.identify.curves.family_base import (
     linear_start,
 )
 
+_CROWD = 4  # states between two knots, at most
+_CLOSEST = 1.003  # ratio of knots' amplitudes: velocities are hardly known better
+
 
 class Spline(AbstractFamily):
     """A natural cubic spline in amplitude², through values at knots; the first knot is at zero.
@@ -116,16 +119,21 @@ class SmoothingSpline(Spline):
 
 
 def amplitudes_apart(
-    amplitude: Float[np.ndarray, " point"], most: int, ratio: float
+    amplitude: Float[np.ndarray, " point"], most: int, ratio: float, *, crowded: bool = False
 ) -> Float[np.ndarray, " knot"]:
     """Some of the amplitudes in rising order, each at least so many times the one below.
 
+    With `crowded` also every `_CROWD`th where amplitudes crowd: a curve that is steep there keeps
+    the amplitudes of many states alike, as a wire that meets a critical velocity.
+
     Arguments: `amplitude` relative to the largest; of more than `most` even picks.
     """
-    apart = [1.0]
+    apart, since = [1.0], 0
     for size in np.sort(amplitude)[::-1]:
-        if 0 < size * ratio <= apart[-1]:
+        since += 1
+        if 0 < size * (_CLOSEST if crowded and since >= _CROWD else ratio) <= apart[-1]:
             apart.append(float(size))
+            since = 0
     pick = np.linspace(0, len(apart) - 1, min(most, len(apart)))
     return np.array(apart)[np.round(pick).astype(int)][::-1]
 

@@ -17,6 +17,7 @@ from snrmjax.identify.curves.families import parse_family
 from snrmjax.identify.curves.splines import SmoothingSpline
 from snrmjax.identify.joint.family_fit import FamilyFit, FitStatus, fit_families
 from snrmjax.identify.joint.force_balance import (
+    STATE_ERRORS,
     BalanceData,
     BalanceProblem,
     Motion,
@@ -311,10 +312,8 @@ def fit_jointly(
         FitStatus.CONVERGED if posterior.settled else FitStatus.NOT_SETTLED,
     )
     if not all(choice.kind in SMOOTH and choice.argument != "velocity" for choice in choices):
-        jitter = np.full(
-            n, view.stiffness_jitter_std / (1.0 if view.believed else view.noise.scale)
-        )
-        errors = np.column_stack([np.asarray(measured.std)[:, :3], jitter])
+        own = posterior.states.errors
+        errors = np.column_stack([own, np.zeros((n, len(STATE_ERRORS) - own.shape[1]))])
         best = fit_families(
             *(unknowns, view.problem, released, view.noise, errors), believed=view.believed
         )
@@ -346,7 +345,7 @@ def fit_jointly(
         np.asarray(curve(fit.motion().amplitude(curve))),
     )
     named = any(choice.kind != SmoothingSpline.kind for choice in choices)
-    notes += _notes(fit, 0.5 * view.stiffness_jitter_std, level_std, named)
+    notes += _notes(fit, 0.5 * view.more_noise.stiffness, level_std, named)
     return dataclasses.replace(fit, notes=tuple(notes))
 
 

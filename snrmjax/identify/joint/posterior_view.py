@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 from jaxtyping import Complex, Float
-from scipy.optimize import minimize, nnls
+from scipy.optimize import nnls
 
 from snrmjax.identify.checks.instruments import require_passive
 from snrmjax.identify.curves.families import ARGUMENTS, FAMILIES, Choice
@@ -20,6 +20,7 @@ from snrmjax.identify.joint.force_balance import (
     velocity_of_others,
 )
 from snrmjax.identify.joint.notes import NoiseEstimate
+from snrmjax.identify.joint.state_noise import StateNoise, noise_of_states
 from snrmjax.identify.test_model.curve_basis import MOST_KNOTS
 from snrmjax.identify.test_model.hyper import MASS, OFFSET, PHASE
 from snrmjax.identify.test_model.posterior import TestPosterior, fit_test, students_factor
@@ -28,7 +29,6 @@ from snrmjax.identify.test_model.states import TestStates
 from snrmjax.identify.test_model.walk import Rounds
 
 _FREE = 3.0  # 1σ of what nobody knows of the instruments, once its size is guessed
-_CLEARLY = 20.0  # of −2 ln p, to believe in a frequency that wanders though nobody stated it
 LEAST_LEFT = 0.25
 """Of the residuals, that no number of unknowns can take."""
 
@@ -46,7 +46,7 @@ class View(NamedTuple):
     gain: complex  # of the force, and phase of the velocity, as guessed beforehand
     free: tuple[str, ...]
     noise: NoiseEstimate
-    stiffness_jitter_std: float  # 1σ of relative stiffness from state to state
+    more_noise: StateNoise  # of the states, of kinds that nobody stated
 
     @property
     def believed(self) -> bool:
@@ -78,6 +78,8 @@ def view_of(
     rounds = Rounds(most_knots=MOST_KNOTS if knots is None else knots)
     fit = functools.partial(fit_test, robust=robust, tempered=True)
     posterior = fit(states, compare_levels=False, rounds=rounds)
+    if _noise_of(posterior, stated).exceeded:  # curves may be steeper than their knots let them
+        posterior = fit(states, compare_levels=False, rounds=rounds._replace(crowded=True))
     mass, std = posterior.modal_mass
     assumed = "force_gain" not in free and problem.modes.modal_mass_std is None
     if assumed and abs(mass - 1) < _ASKED * std:
@@ -86,10 +88,8 @@ def view_of(
         problem = dataclasses.replace(problem, prior=known)
         states = states._replace(mass_std=0.0)
         posterior = fit(states, compare_levels=False, rounds=rounds._replace(start=posterior))
-    stiffness_jitter_std = _stiffness_jitter_std(posterior)
-    if stiffness_jitter_std > 0:
-        wander_std = np.full(len(states.level), stiffness_jitter_std / posterior.hyper.noise)
-        states = states._replace(errors=np.column_stack([states.errors, wander_std]))
+    more = noise_of_states(posterior)
+    states = more.of(states)
     posterior = fit(states, over_sizes=True, rounds=rounds._replace(start=posterior))
     require_passive(free, posterior.modal_mass[0])
     if "force_gain" in free:
@@ -116,7 +116,7 @@ def view_of(
         prior=dataclasses.replace(problem.prior, level=jax.device_put(level)),
     )
     posterior = posterior._replace(covariance=wider**2 * posterior.covariance)
-    return View(posterior, problem, guess, free, noise, stiffness_jitter_std)
+    return View(posterior, problem, guess, free, noise, more)
 
 
 def _with_common_gain_in_the_force(posterior: TestPosterior) -> TestPosterior:
@@ -242,29 +242,6 @@ def _noise_of(posterior: TestPosterior, stated: bool) -> NoiseEstimate:
     noise = posterior.hyper.noise * float(np.sqrt(np.sum(posterior.residuals**2) / left))
     std = noise / np.sqrt(2 * posterior.share * left)
     return NoiseEstimate(noise, std, np.array(posterior.hyper.level_std), stated)
-
-
-def _stiffness_jitter_std(posterior: TestPosterior) -> float:
-    """1σ of relative stiffness from state to state, zero unless the residuals ask for it.
-
-    Errors of force and phase move the balance alike along a response; a natural frequency that
-    wanders moves it most where the mode is driven hardest.
-    """
-    arm = posterior.arms_of_stiffness / posterior.hyper.noise
-    length = np.sum(arm**2, axis=1)
-    along = np.sum(arm * posterior.residuals, axis=1) ** 2
-    size = np.sum(posterior.residuals**2, axis=1)
-
-    def criterion(point: np.ndarray) -> float:
-        noise, extra = np.exp(2 * point)
-        inner = noise + extra * length
-        squares = (size - along * extra / inner) / noise
-        return float(np.sum(squares + np.log(noise) + np.log(inner)))
-
-    start = np.log([0.5, 0.5 / np.sqrt(np.median(length))])
-    best = minimize(criterion, start, method="Nelder-Mead")
-    alone = 2 * len(size) * (np.log(np.sum(size) / (2 * len(size))) + 1)
-    return float(np.exp(best.x[1])) if best.fun < alone - _CLEARLY else 0.0
 
 
 def _curve(posterior: TestPosterior, choice: Choice, which: int) -> AbstractFamily:

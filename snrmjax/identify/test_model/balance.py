@@ -41,6 +41,7 @@ class Balance(NamedTuple):
     units: tuple[float, float]  # of both curves' coefficients
     weight: Float[np.ndarray, " state"]  # 1, or less for an outlier
     beside: Complex[np.ndarray, "state function"]  # what a discrepancy is made of
+    in_order: tuple[bool, ...] = (False,) * 4  # which of `LEVEL_ERRORS` would run with the levels
 
     def at(self, unknowns: np.ndarray, errors: np.ndarray) -> "BalancedStates":
         """The balance of states whose records are corrected by these errors."""
@@ -149,7 +150,8 @@ class Balance(NamedTuple):
         """The problem made straight about some unknowns and errors.
 
         With `apart` errors of levels that nobody stated are what levels differ by: an error that
-        all have in common is one of the instruments, or of the modal mass.
+        all have in common is one of the instruments, or of the modal mass. One that runs with
+        their order (`in_order`) is a curve.
         At `first` curves are not known yet: what they would pass on of an error is left out, and
         errors of levels move what was recorded.
         """
@@ -177,11 +179,13 @@ class Balance(NamedTuple):
             design[:, places.others] = z[:, None] * moved + slope[:, None] * moved.real
         of_gain = z if states.force_is_free else -z - slope
         columns = (of_gain, -1j * z, now.stiffness, now.damping)
+        common = states.common_to_levels
         for k, column in enumerate(columns):
             level = places.levels[:, k]
             design[np.arange(len(omega)), level[states.level]] = column
-            if apart and not states.level_std[k] > 0:
-                design[:, level] -= np.mean(design[:, level], axis=1, keepdims=True)
+            if not states.level_std[k] > 0:
+                taken = common[:, 0 if apart else 1 : 1 + self.in_order[k]]
+                design[:, level] -= design[:, level] @ taken @ taken.T
         design[:, places.beside] = self.beside
         # Residual at the record: rows − design @ unknowns, by its straight line.
         rows = now.z - now.model - np.sum(slopes * errors, axis=1) + design @ unknowns

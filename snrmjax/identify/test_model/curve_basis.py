@@ -35,12 +35,18 @@ class CurveBasis(NamedTuple):
 
     @classmethod
     def of(
-        cls, amplitude: Float[np.ndarray, " state"], most_knots: int = MOST_KNOTS
+        cls,
+        amplitude: Float[np.ndarray, " state"],
+        most_knots: int = MOST_KNOTS,
+        *,
+        crowded: bool = False,
     ) -> "CurveBasis":
-        """For measured amplitudes: knots at rest, at amplitudes of states, and a little beyond."""
+        """For measured amplitudes: knots at rest, at amplitudes of states, and a little beyond;
+        more of them where amplitudes crowd, if asked.
+        """
         largest = float(np.max(amplitude))
         most = max(most_knots - 1 - len(_BEYOND), 1)
-        inside = amplitudes_apart(amplitude / largest, most, _NEAREST)
+        inside = amplitudes_apart(amplitude / largest, most, _NEAREST, crowded=crowded)
         knots = np.array([0.0, *inside, *_BEYOND]) ** 2
         bends = bends_of(knots)
         functions = np.column_stack([np.ones_like(knots), knots, np.linalg.pinv(bends)])

@@ -20,9 +20,10 @@ taken where likelihood times prior is largest, and integrated over by Laplace's 
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
-from scipy.special import ndtri, stdtrit
+from jaxtyping import Bool, Float
+from scipy.special import fdtrc, ndtri, stdtrit
 
+from snrmjax.identify.test_model import priors
 from snrmjax.identify.test_model.balance import Balance
 from snrmjax.identify.test_model.curve_basis import CurveBasis
 from snrmjax.identify.test_model.hyper import (
@@ -84,6 +85,7 @@ class TestPosterior(NamedTuple):
     weight: Float[np.ndarray, " state"]  # 1, or less for an outlier
     share: float  # of the states that count, where neighbours err alike
     settled: bool  # whether the last round moved nothing by more than its error
+    in_order: tuple[bool, ...]  # which errors of levels run with their forces: curves do
 
     @property
     def modal_mass(self) -> tuple[float, float]:
@@ -167,21 +169,38 @@ def fit_test(
         float(np.ptp(omega**2) + _REACH * np.median(np.abs(z))),
         float(np.quantile(np.abs(z.imag / omega), 0.9) + 1e-12 * np.sqrt(reference)),
     )
-    basis, start = CurveBasis.of(states.amplitude, rounds.most_knots), rounds.start
+    basis = CurveBasis.of(states.amplitude, rounds.most_knots, crowded=rounds.crowded)
+    start = rounds.start
     if start is not None:
         basis, units, reference = start.basis, start.units, start.places.reference
     n_others = 0 if states.beside is None else states.beside.shape[1]
     places = places_of(basis, states.n_levels, discrepancy, reference, n_others)
     beside = np.zeros((n, 2 * ALONG * discrepancy), dtype=complex)
     balance = Balance(states, basis, places, units, np.ones(n), beside)
+    if start is not None:
+        balance = balance._replace(in_order=start.in_order)
     walk = likeliest_walk(balance, rounds, robust=robust, tempered=tempered)
+    # Where neighbouring states miss the curves alike, levels may differ by what the model lacks.
+    while walk.found is not None and walk.found.equations.share < 1:
+        in_order = walk.balance.in_order
+        more = levels_in_order(states, walk.found.mean[places.levels])
+        if not np.any(more > in_order):
+            break
+        balance = balance._replace(in_order=tuple((more | in_order).tolist()))
+        walk = likeliest_walk(balance, rounds, robust=robust, tempered=tempered)
     reached = walk.found
     if reached is None:
         raise ValueError(f"`rounds.most` must be at least one, not {rounds.most}.")
     # The size of what few levels differ by is not well known: as Student's t has it. What they have
-    # in common may be anything of that size.
+    # in common may be anything of that size, and so may what runs with their order: the curves
+    # have it, and bands say that it may be the levels'.
     last = walk.balance.straight(reached.mean, reached.errors, apart=False)
     equations = last.equations._replace(share=reached.equations.share)
+    exchanged = equations
+    if any(walk.balance.in_order):
+        free = walk.balance._replace(in_order=(False,) * 4)
+        anew = free.straight(reached.mean, reached.errors, apart=False)
+        exchanged = anew.equations._replace(share=equations.share)
 
     variances = prior_variances(basis, places, states)
 
@@ -195,7 +214,7 @@ def fit_test(
             variance[errors_of_kind] *= (
                 1.0 if std > 0 else students_factor(float(np.sum(informed[errors_of_kind]))) ** 2
             )
-        wide = equations.posterior(noise, variance)[1]
+        wide = exchanged.posterior(noise, variance)[1]
         return Gaussian(mean, wide, float(np.sum(informed)))
 
     objective = objective_of(reached.equations, states, basis, places)
@@ -223,7 +242,21 @@ def fit_test(
         walk.balance.weight,
         reached.equations.share,
         walk.still,
+        walk.balance.in_order,
     )
+
+
+def levels_in_order(
+    states: TestStates, errors: Float[np.ndarray, "level error"]
+) -> Bool[np.ndarray, " error"]:
+    """Which unstated errors of levels run with the levels' forces by more than chance does."""
+    common, n = states.common_to_levels, states.n_levels
+    if common.shape[1] < 2 or n < 3:
+        return np.zeros(errors.shape[1], dtype=bool)
+    constant, line = (common.T @ errors) ** 2
+    left = np.maximum(np.sum(errors**2, axis=0) - constant - line, 1e-12 * line + 1e-300)
+    chance = fdtrc(1, n - 2, line * (n - 2) / left)
+    return (chance < priors.IN_ORDER) & ~(np.array(states.level_std) > 0)
 
 
 def _log_likelihood(reached: Reached) -> float:

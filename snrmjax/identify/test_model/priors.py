@@ -131,6 +131,13 @@ LEVELS: tuple[HalfNormalSize, ...] = (
 )
 """In the order of `LEVEL_ERRORS`."""
 
+ONE_FORCE = 0.1
+"""Of the logarithm of levels' forces: closer levels repeat one another."""
+
+IN_ORDER = 0.01
+"""Probability by chance of a line over the levels' forces, below which their errors run with it:
+they are then no errors of levels, which know nothing of one another."""
+
 LEVELS_DIFFER = 5.41
 """Of −2 ln p, from which on levels are said to differ: 1 %, one-sided, as four kinds are tried."""
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
-from snrmjax.identify.test_model.priors import FORCE_TO_VELOCITY
+from snrmjax.identify.test_model.priors import FORCE_TO_VELOCITY, ONE_FORCE
 
 LEVEL_ERRORS = ("gain", "phase", "stiffness", "damping")
 """What all states of a level may have in common, relative or in rad."""
@@ -51,6 +51,16 @@ class TestStates(NamedTuple):
     def amplitude(self) -> Float[np.ndarray, " state"]:
         """Displacement amplitudes, m."""
         return np.abs(self.velocity) / self.frequency
+
+    @property
+    def common_to_levels(self) -> Float[np.ndarray, "level direction"]:
+        """Orthonormal: a constant, and a line over the logarithm of the levels' forces, which
+        curves of amplitude have as well; of levels of one force, a constant alone.
+        """
+        level = np.arange(self.n_levels)
+        along = np.log([np.median(self.force[self.level == k]) for k in level])
+        constant, apart = np.ones(len(level)), np.ptp(along) > ONE_FORCE
+        return np.linalg.qr(np.stack([constant, along - along[0]][: 1 + apart], axis=1))[0]
 
 
 def state_errors(

@@ -54,6 +54,7 @@ class Rounds(NamedTuple):
     most_knots: int = MOST_KNOTS  # of the curves
     levels_apart: bool = False
     start: "TestPosterior | None" = None
+    crowded: bool = False  # whether knots crowd where states do
 
 
 def likeliest_walk(balance: Balance, rounds: Rounds, *, robust: bool, tempered: bool) -> "Walk":

@@ -76,3 +76,13 @@ def test_few_amplitudes_are_enough(amplitude):
     own = CurveBasis.of(np.array(amplitude))
     assert own.n_functions == len(own.knots) >= 2
     assert np.all(np.isfinite(own.values(np.array(amplitude))[0]))
+
+
+def test_knots_crowd_where_states_do_if_asked():
+    wall = np.concatenate([np.geomspace(1e-5, 1e-3, 40), np.linspace(0.96e-3, 1e-3, 40)])
+    even, crowded = (CurveBasis.of(wall, crowded=one) for one in (False, True))
+    inside = [np.sqrt(basis.knots) for basis in (even, crowded)]
+    near = [int(np.sum((knots > 0.955) & (knots < 1.01))) for knots in inside]
+    assert near[0] == 1  # at the largest amplitude: others are a tenth apart
+    assert near[1] >= 7
+    assert np.min(np.diff(np.log(inside[1][1:]))) > np.log(1.003) - 1e-12
