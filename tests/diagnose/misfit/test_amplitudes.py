@@ -227,7 +227,8 @@ def test_a_table_of_amplitudes_is_diagnosed(tmp_path):
     wanted = Fact("phases_unknown", n_states=50, of_states=50), Fact("harmonics_without_phase")
     assert set(map(str, wanted)) <= set(told["notes"])
     assert (out / "residuals.png").stat().st_size > 10_000
-    # An effect as large as its limit moves χ² by what detection asks for.
+    # An effect as large as its limit moves χ² by what detection asks for, and by no more than twice
+    # and a bit: the readings leave phases and the modal mass open, which χ² does not.
     model, data = files("blind_03")
     misfit = weighted_misfit(predictions_of(model, without_phases(data)))
     for kind in ("linear_damping_change", "linear_frequency_shift", "cubic_stiffness"):
@@ -235,7 +236,7 @@ def test_a_table_of_amplitudes_is_diagnosed(tmp_path):
         limit = limits[parameter_labels(kind)[0]]
         rows = unfitted(misfit, one._replace(starts=((limit,),))).rows
         need = 10.0 + np.log(misfit.n_rows)
-        assert misfit.chi_square(rows - misfit.base) == pytest.approx(need, rel=0.1), kind
+        assert need < misfit.chi_square(rows - misfit.base) < 2.5 * need, kind
 
 
 @pytest.mark.long
