@@ -142,7 +142,7 @@ def completed_by_parts(
     left = {
         part.part: part.remainder
         for part in naming.parts
-        if part.remainder is not None and part.remainder.significant
+        if part.part in DRAWN and part.remainder is not None and part.remainder.significant
     }
     ended = agrees(naming, diagnosis.gap.after)
     if ended and not left:

@@ -9,8 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex, Float
 
+from snrmjax.diagnose import priors
 from snrmjax.diagnose.misfit.predictions import Predictions, predictions_of, scales_of
 from snrmjax.diagnose.misfit.reference import test_states_of
+from snrmjax.diagnose.naming.columns import is_instrument
 from snrmjax.diagnose.naming.evidence import Problem, best_hypotheses
 from snrmjax.diagnose.naming.parts import Naming, naming_of
 from snrmjax.diagnose.naming.phases import likely_dynamic_stiffness
@@ -60,7 +62,14 @@ def named_parts(predictions: Predictions, data: SteadyStates, kinds: Iterable[st
         predictions = _with_likely_phases(predictions, data)
     if not predictions.chosen.orders or unknown.any():
         kinds = [k for k in kinds if not issubclass(EFFECTS[k], _SEEN_BY_HARMONICS)]
-    problem, cells = best_hypotheses(_readings(predictions, data, unknown), kinds)
+    readings = _readings(predictions, data, unknown)
+    gain, phase, *_ = readings.posterior.hyper.level_std
+    # What all levels have in common is theirs where their own errors are about as large.
+    if gain > priors.OF_LEVELS * priors.GAIN:
+        kinds = [k for k in kinds if not (is_instrument(k) and EFFECTS[k].like_force_gain)]
+    if phase > priors.OF_LEVELS * priors.INSTRUMENT_PHASE:
+        kinds = [k for k in kinds if not (is_instrument(k) and EFFECTS[k].only_phase)]
+    problem, cells = best_hypotheses(readings, kinds)
     return NamedParts(naming_of(problem, cells), problem)
 
 

@@ -40,6 +40,10 @@ INSTRUMENT_PHASE = 0.1
 GAIN = 0.1
 """Relative 1σ of a gain that is a hypothesis: a wrong range or sensitivity."""
 
+OF_LEVELS = 0.5
+"""Of these, from which on a gain or a phase of that size may be what the errors of levels have in
+common, and is no hypothesis of the instruments."""
+
 ADDED_MASS = 0.05
 """Relative 1σ of a mass that was added. Beside a change of stiffness one of any size would follow a
 resonance wherever it goes."""

@@ -24,6 +24,7 @@ from snrmjax.model.library.measurement_chain import ForceHarmonics
 
 _ROUNDS = 3  # of finer shapes
 _COARSE = 40.0  # nats that a coarse shape may lack
+_REACH = 16.0  # nats below the best, down to which a column is kept while shapes are refined
 _COUNTS = 0.02  # probability from which on a shape is divided
 _LEAST = 8.0  # of ln p below the most probable answer: what is less likely is left out
 _KNOTS_A_UNIT = 8  # of ln a
@@ -144,12 +145,14 @@ def best_hypotheses(readings: Readings, kinds: Iterable[str]) -> tuple[Problem, 
     """All hypotheses that can count, the most probable first; their shapes as fine as needed."""
     problem = problem_of(readings, hypothesis_columns(readings, kinds))
     for _ in range(_ROUNDS):
-        counts = _worth_dividing(problem, *_weighed(problem, 2))
+        cells, alone = _weighed(problem, 2, _REACH)
+        counts = _worth_dividing(problem, cells, alone)
         if not counts:
             break
+        kept = {*_best_of_kinds(problem, alone), *(k for cell in cells for k in cell.columns)}
         finer = [one for k in counts for one in problem.columns[k].divided(readings)]
-        kept = [one for k, one in enumerate(problem.columns) if k not in counts]
-        problem = problem.with_columns([*kept, *finer])
+        left = [problem.columns[k] for k in sorted(kept - {*counts})]
+        problem = problem.with_columns([*left, *finer])
     return problem, hypotheses_of(problem)
 
 
@@ -160,13 +163,18 @@ def _worth_dividing(
     mass = np.zeros(len(problem.columns))
     for cell in cells:
         mass[list(cell.columns)] += np.exp(cell.log_evidence - cells[0].log_evidence)
-    best: dict[str, int] = {}
-    for k in np.argsort(-alone).tolist():
-        if alone[k] > cells[0].log_evidence - _COARSE:
-            best.setdefault(problem.columns[k].kind, k)
     whole = sum(np.exp(cell.log_evidence - cells[0].log_evidence) for cell in cells)
-    counts = {*best.values(), *np.flatnonzero(mass > _COUNTS * whole).tolist()}
+    best = [k for k in _best_of_kinds(problem, alone) if alone[k] > cells[0].log_evidence - _COARSE]
+    counts = {*best, *np.flatnonzero(mass > _COUNTS * whole).tolist()}
     return [k for k in sorted(counts) if problem.columns[k].widths]
+
+
+def _best_of_kinds(problem: Problem, alone: Float[np.ndarray, " column"]) -> list[int]:
+    """Of every kind the column that is most probable alone."""
+    best: dict[str, int] = {}
+    for k in np.argsort(-alone, kind="stable").tolist():
+        best.setdefault(problem.columns[k].kind, k)
+    return list(best.values())
 
 
 def hypotheses_of(problem: Problem) -> list[Cell]:
@@ -174,10 +182,13 @@ def hypotheses_of(problem: Problem) -> list[Cell]:
     return _weighed(problem)[0]
 
 
-def _weighed(problem: Problem, every: int = 1) -> tuple[list[Cell], Float[np.ndarray, " column"]]:
+def _weighed(
+    problem: Problem, every: int = 1, reach: float = _LEAST
+) -> tuple[list[Cell], Float[np.ndarray, " column"]]:
     """Hypotheses that can count, and ln evidence of every column alone with its best remainders.
 
-    With every size of remainders, or some: `every` second one.
+    With every size of remainders, or some: `every` second one. Down to `reach` below the most
+    probable, in nats.
     """
     few, each = _sizes(2), _sizes(every)
     own, *others = problem.blocks
@@ -192,7 +203,7 @@ def _weighed(problem: Problem, every: int = 1) -> tuple[list[Cell], Float[np.nda
         best = max(best, np.max(base), np.max(value, initial=-np.inf))
         sizes = [normal.sizes if one is None else (*normal.sizes, *one.sizes) for one in higher]
         cells += [Cell(float(v), (), s) for v, s in zip(base, sizes, strict=True)]
-        for one, k in np.argwhere(value > best - _LEAST).tolist():
+        for one, k in np.argwhere(value > best - reach).tolist():
             cells.append(Cell(float(value[one, k]), (k,), sizes[one]))
     bounds = [None if other is None else other.most() for other in higher]
     for normal in grid:
@@ -201,13 +212,13 @@ def _weighed(problem: Problem, every: int = 1) -> tuple[list[Cell], Float[np.nda
         most = normal.most() + np.log(np.outer(normal.prior, normal.prior)) + _PRIOR_OF_PAIRS
         most = np.where(normal.apart(), most, -np.inf)
         for other, bound in zip(higher, bounds, strict=True):
-            places = np.nonzero((most if bound is None else most + bound) > best - _LEAST)
+            places = np.nonzero((most if bound is None else most + bound) > best - reach)
             if places[0].size:
                 whole = normal if other is None else normal.with_rows_of(other)
-                some = whole.pairs(places[0], places[1], best - _LEAST)
+                some = whole.pairs(places[0], places[1], best - reach)
                 best = max([best, *(cell.log_evidence for cell in some)])
                 cells += some
-    kept = [cell for cell in cells if cell.log_evidence > best - _LEAST]
+    kept = [cell for cell in cells if cell.log_evidence > best - reach]
     return sorted(kept, key=lambda cell: -cell.log_evidence), alone
 
 

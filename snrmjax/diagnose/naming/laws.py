@@ -54,13 +54,14 @@ from snrmjax.model.library.stiffness import (
 )
 from snrmjax.numerics.units import HERTZ
 
-_GAPS = np.linspace(0.05, 0.95, 19)  # over the largest amplitude
-_STIFFNESSES = np.log([0.1, 1.0, 10.0, 100.0])  # ln, of a stop, over ω₀²
+# Over the largest amplitude; so fine that a kink between two of them is seen from both.
+_GAPS = np.linspace(0.04, 0.96, 47)
+_STIFFNESSES = np.log([0.2, 2.0, 20.0])  # ln, of a stop, over ω₀²
 _QUADRATICS = np.log(
     [0.003, 0.008, 0.02, 0.05, 0.12, 0.3]
 )  # ln, over ω₀² and the largest amplitude
 _BILINEARS = np.log([0.003, 0.01, 0.03, 0.1, 0.3])  # ln, over ω₀²
-_SLIPS = np.linspace(np.log(0.02), np.log(0.95), 28)  # ln, over the largest amplitude
+_SLIPS = np.linspace(np.log(0.02), np.log(0.95), 47)  # ln, over the largest amplitude
 _EXPONENTS = np.linspace(1.1, 2.9, 10)
 _DETUNINGS = np.linspace(-0.04, 0.04, 9)
 _APART = np.array([-0.3, -0.1, -0.05, -0.02, 0.02, 0.05, 0.1, 0.3])  # of a close mode
@@ -241,7 +242,7 @@ LAWS: dict[str, Law] = {
     OneSidedStop.kind: Law(
         lambda r, width, log_k: describing.stop(r.relative_amplitude, width, np.exp(log_k)) + 0j,
         _at_stop,
-        (_GAPS[::3], _STIFFNESSES),
+        (_GAPS, _STIFFNESSES),
         sign=1,
         parameters=lambda r, s, width, _: (s * r.natural_frequency**2, width * r.largest),
     ),
