@@ -4,7 +4,15 @@ import dataclasses
 
 import numpy as np
 import pytest
-from truths.balanced_sets import OMEGA, PARTICIPATION, SHAPE, ZETA, balanced, linear_model, quadratic
+from truths.balanced_sets import (
+    OMEGA,
+    PARTICIPATION,
+    SHAPE,
+    ZETA,
+    balanced,
+    linear_model,
+    quadratic,
+)
 
 import snrmjax as sj
 from snrmjax.pipelines import diagnose

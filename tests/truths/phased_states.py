@@ -1,4 +1,4 @@
-"""States of one mode with set changes of stiffness and damping, at set phases, and their readings."""
+"""States of one mode with set changes of stiffness and damping, at set phases, and readings."""
 
 import numpy as np
 
@@ -49,7 +49,9 @@ def readings(stiffness, damping, harmonics=None, **settings):
     )
     linear = LinearTest(OMEGA, RATIO, 0.0, 0.0, 0.01, SHAPE, 1.0, scales)
     recorded = None if harmonics is None else harmonics(states)
-    return readings_of(states, np.linspace(0, 1, len(states.level)), linear_motion, linear, recorded)
+    return readings_of(
+        states, np.linspace(0, 1, len(states.level)), linear_motion, linear, recorded
+    )
 
 
 def linear_motion(_, omega):

@@ -5,7 +5,7 @@ import dataclasses
 import equinox as eqx
 import numpy as np
 import pytest
-from truths.balanced_sets import balanced, linear_model, quadratic
+from truths.balanced_sets import balanced, linear_model
 from truths.exact_states import GAIN, driven, modes
 
 import snrmjax as sj

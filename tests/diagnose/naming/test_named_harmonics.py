@@ -1,10 +1,10 @@
-"""Laws named by the other harmonics that were recorded, and how strong a law must be to be found."""
+"""Laws named by other harmonics that were recorded, and how strong a law must be to be found."""
 
 import functools
 
 import numpy as np
 import pytest
-from truths.phased_states import OMEGA, RATIO, SHAPE, dynamic, named, nothing
+from truths.phased_states import OMEGA, SHAPE, dynamic, named, nothing
 
 from snrmjax.diagnose.naming.detection import detection_limits
 from snrmjax.diagnose.naming.readings import RecordedHarmonics
