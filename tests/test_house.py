@@ -84,15 +84,9 @@ SUB_ROOMS = {
     "methods.records": {"methods.result", "methods.one_sensor"},
     "identify.test_model": {"identify.checks", "identify.curves"},
     "diagnose.misfit": {"diagnose.priors"},
-    "diagnose.naming": set(),
-    "diagnose.search": {"diagnose.misfit", "diagnose.priors"},
-    "diagnose.checks": {
-        *("diagnose.misfit", "diagnose.search", "diagnose.priors", "diagnose.evidence"),
-    },
+    "diagnose.naming": {"diagnose.priors"},
+    "diagnose.checks": {"diagnose.misfit", "diagnose.priors"},
     "diagnose.location": {"diagnose.misfit"},
-    "diagnose.laws": {
-        *("diagnose.misfit", "diagnose.search", "diagnose.checks", "diagnose.priors"),
-    },
     "io.calculix": {"io.files"},
     "io.laboratory": {"io.files", "io.rows", "io.units"},
     "io.exchange": {
@@ -116,7 +110,7 @@ SUB_ROOMS = {
     "io.reduction": {
         *("io.columns", "io.files", "io.rows", "io.tables", "io.toml_table", "io.units"),
     },
-    "diagnose.design": {"diagnose.misfit", "diagnose.search", "diagnose.priors"},
+    "diagnose.design": {"diagnose.misfit", "diagnose.fitted_effects", "diagnose.priors"},
     "condense.elements": {"condense.load_cases"},
     # A study is made of computations, which know nothing of where and how often they run.
     "study.computations": set(),

@@ -8,8 +8,8 @@ from matplotlib.figure import Figure
 from truths.balanced_sets import balanced, linear_model, quadratic
 
 import snrmjax as sj
-from snrmjax.diagnose.decide import Verdict
 from snrmjax.diagnose.diagnosis_result import CompletedStatus, unit_of
+from snrmjax.diagnose.verdict import Verdict
 from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
 
 

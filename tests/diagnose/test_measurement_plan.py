@@ -29,8 +29,8 @@ from typer.testing import CliRunner
 import snrmjax as sj
 from snrmjax.cli import app
 from snrmjax.diagnose.diagnosis_result import FormerAnswer
-from snrmjax.diagnose.evidence import NONE, answer_of
 from snrmjax.diagnose.measurement_plan import measurement_plan
+from snrmjax.diagnose.verdict import NONE, answer_of
 from snrmjax.io.measurement_plans import read_former_answer, read_further_states, write_plan
 from snrmjax.numerics.facts import Fact
 

@@ -20,12 +20,7 @@ from snrmjax.model.effect_metadata import (
     Symmetry,
     parameter,
 )
-from snrmjax.model.effect_shape import (
-    acts_like,
-    computed_shape,
-    shape_of,
-    starts_of,
-)
+from snrmjax.model.effect_shape import computed_shape, shape_of, starts_of
 from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
 from snrmjax.model.library.confusions import CONFUSIONS
 from snrmjax.numerics.rules import POSITIVE
@@ -185,7 +180,6 @@ def test_what_a_user_does_not_state_follows_from_the_force():
     assert drag == Shape(Part.DAMPING, Symmetry.ODD, Argument.VELOCITY, pytest.approx(0.5))
     assert drag.is_drag
     assert drag.lowest_harmonic == 3
-    assert acts_like(OwnDrag) == acts_like(EFFECTS["cubic_damping"]) == "damping"
     wanted = Shape(Part.STIFFNESS, Symmetry.EVEN, Argument.DISPLACEMENT, strength_order=2)
     assert even == wanted
     assert even.lowest_harmonic == 2

@@ -11,10 +11,10 @@ from matplotlib.colors import to_rgba
 from truths.printed_page import unreadable
 
 import snrmjax as sj
-from snrmjax.diagnose.decide import Verdict
 from snrmjax.diagnose.location.laws_at_places import PlacedLaw
 from snrmjax.diagnose.location.where import PlacedForce, Whereabouts
-from snrmjax.diagnose.search.locating import Located
+from snrmjax.diagnose.misfit.locating import Located
+from snrmjax.diagnose.verdict import Verdict
 from snrmjax.io.units import HERTZ
 from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
 from snrmjax.pipelines.diagnose import DiagnosedTest, simulated_levels

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from snrmjax.diagnose.laws.law_search import DrawnLaw, LawOnset
+from snrmjax.diagnose.drawn_law import DrawnLaw, LawOnset
 from snrmjax.model.effect_metadata import Argument
 from snrmjax.report.figures.drawn_laws import drawn_laws_figure, law_tables
 

@@ -1,25 +1,19 @@
-"""Whether an answer is doubted that says something of gains: of the force, of the modal mass."""
+"""What an answer says of gains: of the force, of the modal mass."""
 
 import dataclasses
 
 import equinox as eqx
 import numpy as np
 import pytest
-from truths.balanced_sets import balanced, linear_model, quadratic
+from truths.balanced_sets import balanced, linear_model
 from truths.exact_states import GAIN, driven, modes
 
 import snrmjax as sj
-from snrmjax.diagnose.checks.gains import (
-    doubts_on_gains,
-    gain_found,
-    modal_mass_found,
-    notes_on_gains,
-)
+from snrmjax.diagnose.checks.gains import gain_found, modal_mass_found, notes_on_gains
 from snrmjax.diagnose.diagnosis import excluded_kinds
 from snrmjax.diagnose.misfit.effect_fit import baseline_fit
 from snrmjax.diagnose.misfit.predictions import predictions_of
 from snrmjax.diagnose.misfit.weighted_misfit import weighted_misfit
-from snrmjax.model.library.confusions import SIZE_OF_RESPONSE
 
 WRONG = 1.06  # the model's modal mass over the true one
 
@@ -51,37 +45,6 @@ def test_a_free_gain_is_found_with_its_error():
     assert gain.std == pytest.approx(curvature**-0.5 / 1.5, rel=0.01)
     certain = misfit_of(1.0)
     assert gain_found(certain, baseline_fit(certain)) is None
-    assert doubts_on_gains(certain, baseline_fit(certain), {}) == []
-
-
-@pytest.mark.parametrize(
-    ("factor", "refutes", "kind"),
-    [(1.02, None, ""), (1.2, False, "force_gain_moved"), (5.0, True, "force_gain_far")],
-)
-def test_an_answer_that_moves_the_gain_is_doubted_and_one_that_moves_it_far_refuted(
-    factor, refutes, kind
-):
-    """Smooth curves of amplitude had given the gain of 1."""
-    misfit = misfit_of(factor, force_gain_std=1.0)
-    found = doubts_on_gains(misfit, baseline_fit(misfit), {})
-    assert [one.refutes for one in found] == ([] if refutes is None else [refutes])
-    if found:
-        assert found[0].reason.kind == kind
-        assert found[0].decide_by.kind == "determine_force_gain"
-
-
-@pytest.mark.parametrize("std", [5.0, 30.0])
-def test_an_effect_smaller_than_its_error_is_doubted(std):
-    misfit = misfit_of(1.0, change=quadratic)
-    label = "quadratic_damping.coefficient"
-    fit = baseline_fit(misfit)._replace(
-        kinds=("quadratic_damping",), labels=(label,), values=np.array([18.0])
-    )
-    found = doubts_on_gains(misfit, fit, {label: std})
-    assert len(found) == (std > 18.0)
-    if found:
-        assert not found[0].refutes
-        assert (found[0].reason["strength"], found[0].reason["std"]) == (18.0, 30.0)
 
 
 def test_a_stated_error_that_is_exceeded_is_said():
@@ -167,28 +130,6 @@ def test_the_right_mass_and_a_free_gain_take_no_word():
     # A free gain of all forces is one with the mass: only one of them is free.
     free = misfit_of_mass(0.05, force_gain_std=1.0)
     assert modal_mass_found(free, baseline_fit(free)) is None
-
-
-@pytest.mark.parametrize(
-    ("std", "gain", "doubted"),
-    [
-        (None, 0.06, True),
-        (None, 0.3, False),  # no modal mass of a linear test is wrong by that
-        (0.01, 0.06, False),  # the fit has had the mass's own error
-    ],
-)
-@pytest.mark.parametrize("kind", ["force_gain_error", "sensor_gain_error"])
-def test_a_gain_that_may_be_the_modal_mass_is_doubted(kind, std, gain, doubted):
-    misfit = misfit_of_mass(std, wrong=1.0)
-    label = f"{kind}.gain"
-    fit = baseline_fit(misfit)._replace(kinds=(kind,), labels=(label,), values=np.array([gain]))
-    found = doubts_on_gains(misfit, fit, {label: 0.001})
-    assert len(found) == doubted
-    if doubted:
-        assert found[0].reason.kind == "gain_or_modal_mass"
-        assert found[0].reason["mass"] == pytest.approx(true_mass() / 1.06)
-        assert found[0].decide_by == SIZE_OF_RESPONSE.separated_by
-        assert not found[0].refutes
 
 
 @pytest.mark.long

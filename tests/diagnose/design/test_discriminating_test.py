@@ -3,8 +3,6 @@
 The states are those of `truths.growing_damping`.
 """
 
-import dataclasses
-
 import numpy as np
 import pytest
 from truths.growing_damping import (
@@ -18,7 +16,6 @@ from truths.growing_damping import (
 )
 
 import snrmjax as sj
-from snrmjax.diagnose.decide import most_probable
 from snrmjax.diagnose.design.design_points import (
     DesignPoints,
     Rows,
@@ -31,12 +28,12 @@ from snrmjax.diagnose.design.discriminating_test import (
     discriminating_test,
     recommendation,
 )
-from snrmjax.diagnose.evidence import weights_of
-from snrmjax.diagnose.misfit.candidates import only_by_calibration
+from snrmjax.diagnose.fitted_effects import FoundEffects, TriedEffect
+from snrmjax.diagnose.misfit.candidates import candidate, only_by_calibration
+from snrmjax.diagnose.misfit.effect_fit import baseline_fit, fit_effect
 from snrmjax.diagnose.misfit.noise_model import shared_covariance
 from snrmjax.diagnose.misfit.predictions import predictions_of, scales_of
 from snrmjax.diagnose.misfit.weighted_misfit import weighted_misfit
-from snrmjax.diagnose.search.model_search import find_effects
 from snrmjax.io.diagnosis_results import summarise_diagnosis
 from snrmjax.numerics.facts import Fact
 
@@ -59,25 +56,38 @@ def test_a_sum_of_squares_is_refitted_with_all_that_is_free():
     assert refitted_chi_square(Rows(rows.slopes[:, 0], rows.slopes), covariance) < 1e-9
 
 
-def test_a_free_force_of_a_measured_level_says_nothing_of_a_further_test():
-    predictions = predictions_of(linear_model(), measured(), force_gain_std=0.2)
-    freed = weighted_misfit(dataclasses.replace(predictions, free_level_forces=(1,)))
-    further = weighted_misfit(predictions)
-    kept = np.arange(further.n_rows) < 6
-    shared = shared_by_both(freed, further, kept)
-    by_force = shared[:, predictions.n_baseline_errors]
-    assert np.max(np.abs(by_force[: freed.n_rows])) > 1.0
-    np.testing.assert_array_equal(by_force[freed.n_rows :], 0.0)
-    # The gain that all forces share is that of both.
-    np.testing.assert_array_equal(
-        shared[freed.n_rows :, predictions.n_baseline_errors - 1], further.noise.shared[kept][:, -1]
+def fitted(*rivals):
+    """The first of some effects as the answer, with the others as its rivals."""
+    predictions = predictions_of(linear_model(), measured())
+    misfit, scales = weighted_misfit(predictions), scales_of(predictions)
+    nothing = baseline_fit(misfit)
+    fits = [fit_effect(misfit, candidate(kind, scales)) for kind in rivals]
+    table = tuple(
+        TriedEffect(
+            fit.kinds[0],
+            nothing.criterion - fit.criterion,
+            fit.chi_square,
+            dict(zip(fit.labels, fit.values.tolist(), strict=True)),
+            fit.status,
+        )
+        for fit in fits
     )
+    return FoundEffects(misfit, fits[0], nothing, (table,), (rivals,))
+
+
+def test_a_gain_that_all_forces_have_in_common_is_that_of_both_tests():
+    predictions = predictions_of(linear_model(), measured(), force_gain_std=0.2)
+    first, further = weighted_misfit(predictions), weighted_misfit(predictions)
+    kept = np.arange(further.n_rows) < 6
+    shared = shared_by_both(first, further, kept)
+    by_gain = shared[:, predictions.n_baseline_errors - 1]
+    assert np.max(np.abs(by_gain[: first.n_rows])) > 1.0
+    np.testing.assert_array_equal(by_gain[: first.n_rows], first.noise.shared[:, -1])
+    np.testing.assert_array_equal(by_gain[first.n_rows :], further.noise.shared[kept][:, -1])
 
 
 def test_design_points_obey_the_law_that_predicts_them():
-    predictions = predictions_of(linear_model(), measured())
-    misfit, scales = weighted_misfit(predictions), scales_of(predictions)
-    found = find_effects(misfit, scales, ("cubic_damping",))
+    found = fitted("cubic_damping")
     (size,) = found.fit.values
     phase = np.radians([-50.0, -10.0, 30.0])
     test = predicted_test(found.misfit, found.fit, (DesignPoints(4, 2.0, phase),), 1e-3)
@@ -127,14 +137,12 @@ def test_the_measurement_that_was_asked_for_leaves_the_truth(ambiguous, truth):
 
 
 def test_where_no_measurement_would_settle_it_that_is_said():
-    predictions = predictions_of(linear_model(), measured())
-    found = find_effects(weighted_misfit(predictions), scales_of(predictions), tuple(THIRD))
-    found = most_probable(found, weights_of(found))
+    found = fitted(*THIRD)
     test = discriminating_test(found, (0,))
     weak = test._replace(expected_gain=0.5 * test.needed_gain)
-    asked = recommendation(found, weak, [], phases=True)["measurements"]
+    asked = recommendation(found, weak, phases=True)["measurements"]
     assert asked == (Fact("no_test_settles"), test.measurement)
-    assert recommendation(found, test, [], phases=True)["measurements"] == asked[1:]
+    assert recommendation(found, test, phases=True)["measurements"] == asked[1:]
 
 
 def test_what_no_test_of_one_mode_separates_needs_a_calibration():

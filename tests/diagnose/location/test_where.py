@@ -9,7 +9,7 @@ from truths import two_modes
 from truths.chain_states import steady_states, structure
 
 import snrmjax as sj
-from snrmjax.diagnose.decide import Verdict
+from snrmjax.diagnose.verdict import Verdict
 from snrmjax.io.diagnosis_results import placed_answer, summarise_whereabouts
 from snrmjax.pipelines.diagnose import DiagnosedTest
 from snrmjax.report.pages.diagnosis import answer_in_words

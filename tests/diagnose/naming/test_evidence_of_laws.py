@@ -1,90 +1,31 @@
 """Evidences and fractions of a small test whose truth is known, against dense linear algebra."""
 
-import dataclasses
-
 import numpy as np
 import pytest
+from truths.phased_states import OMEGA, linear_motion, named, nothing, readings, states_of
 
-import snrmjax.identify.test_model.states as test_states
 from snrmjax.diagnose import priors
 from snrmjax.diagnose.naming import evidence
 from snrmjax.diagnose.naming.columns import hypothesis_columns
 from snrmjax.diagnose.naming.evidence import (
     Cell,
-    best_hypotheses,
     hypotheses_of,
     problem_of,
     solved,
 )
-from snrmjax.diagnose.naming.parts import naming_of
-from snrmjax.diagnose.naming.readings import LinearTest, readings_of
+from snrmjax.diagnose.naming.readings import readings_of
 from snrmjax.diagnose.naming.remainder_law import remainder_laws
-from snrmjax.model.effect_metadata import MotionScales
-from snrmjax.model.effects import EFFECTS
 
-OMEGA, RATIO, SHAPE = 500.0, 0.01, 2.0
 LAWS = ("cubic_stiffness", "quintic_stiffness", "quadratic_damping", "coulomb_friction")
-
-
-def states_of(stiffness, damping, *, noise=2e-3, seed=0, levels=5):
-    """States of one mode at some levels of amplitude, off resonance by set phases, with noise.
-
-    Arguments: relative changes of ω₀² and of 2ζ as functions of amplitude over the largest.
-    """
-    rng = np.random.default_rng(seed)
-    amplitude = np.geomspace(1e-4, 1e-3, levels)
-    phase = np.radians([-60.0, -40, -20, 0, 20, 40, 60])
-    a, turn = (part.ravel() for part in np.meshgrid(amplitude, phase, indexing="ij"))
-    level = np.repeat(np.arange(levels), len(phase))
-    x = a / a.max()
-    squared = OMEGA**2 * (1 + stiffness(x))
-    # At the velocity phase θ: Re Z = tan θ · Im Z, and Im Z = Ω δ.
-    omega = np.sqrt(squared)
-    for _ in range(50):
-        lost = OMEGA * (2 * RATIO + damping(x, omega / OMEGA))
-        omega = np.sqrt(squared - np.tan(turn) * omega * lost)
-    z = squared - omega**2 + 1j * omega * lost
-    constant = SHAPE**2
-    velocity = 1j * omega * a * np.exp(1j * (turn - np.pi / 2))
-    force = np.abs(z) * a / constant
-    velocity = velocity * np.exp(noise * (rng.normal(size=a.size) + 1j * rng.normal(size=a.size)))
-    errors = np.tile([0.1 * noise, noise, noise], (a.size, 1))
-    return test_states.TestStates(
-        *(level, omega, force, velocity, errors, True, constant, (1e-3, 1e-3, 1e-4, 1e-3), 0.01)
-    )
-
-
-def readings(stiffness, damping, **settings):
-    states = states_of(stiffness, damping, **settings)
-    scales = MotionScales(
-        *(float(np.median(states.amplitude)) / SHAPE, float(states.amplitude.max()) / SHAPE, OMEGA),
-        *(0.01 * OMEGA**2, 1e-4, float(states.force.min()), RATIO),
-    )
-    linear = LinearTest(OMEGA, RATIO, 0.0, 0.0, 0.01, SHAPE, scales)
-    n = len(states.level)
-    return readings_of(
-        states,
-        np.linspace(0, 1, n),
-        lambda _, omega: (OMEGA**2 - omega**2 + 2j * RATIO * OMEGA * omega)[None],
-        linear,
-    )
-
-
-def named(stiffness, damping, **settings):
-    problem, cells = best_hypotheses(readings(stiffness, damping, **settings), EFFECTS)
-    return problem, naming_of(problem, cells)
-
-
-def nothing(x, _=None):
-    return 0 * x
 
 
 def test_an_evidence_is_that_of_the_dense_gaussian():
     read = readings(lambda x: 0.02 * x**2, nothing)
     problem = problem_of(read, hypothesis_columns(read, LAWS))
     sizes = (float(priors.REMAINDERS[4]), 0.0)
-    cells = {c.columns: c for c in hypotheses_of(problem, 1e6) if c.sizes == sizes}
-    base = problem.design * np.sqrt(problem.variances(sizes))
+    cells = {c.columns: c for c in evidence._weighed(problem, reach=1e6)[0] if c.sizes == sizes}
+    (block,) = problem.blocks
+    base = block.design * np.sqrt(block.variances(sizes))
     noise = np.eye(len(read.rows)) + base @ base.T
 
     def log_density(covariance):
@@ -93,7 +34,7 @@ def test_an_evidence_is_that_of_the_dense_gaussian():
         return -0.5 * white @ white - np.sum(np.log(np.diag(factor)))
 
     # Cubic stiffness against none: the mixture over strengths, one by one.
-    column = problem.laws[:, [0]]
+    column = block.laws[:, [0]]
     each = [log_density(noise + s**2 * column @ column.T) for s in priors.STRENGTHS]
     alone = log_density(noise)
     wanted = np.logaddexp.reduce(each) - np.log(len(each)) - alone
@@ -189,12 +130,7 @@ def test_readings_do_not_change_with_units_of_force():
     other = states._replace(force=10 * states.force, constant=0.1 * states.constant)
     linear = readings(lambda x: 0.02 * x**2, nothing).linear
     rows = [
-        readings_of(
-            one,
-            np.zeros(len(one.level)),
-            lambda _, omega: (OMEGA**2 - omega**2 + 2j * RATIO * OMEGA * omega)[None],
-            dataclasses.replace(linear) if dataclasses.is_dataclass(linear) else linear,
-        ).rows
+        readings_of(one, np.zeros(len(one.level)), linear_motion, linear).rows
         for one in (states, other)
     ]
     np.testing.assert_allclose(rows[0], rows[1], rtol=1e-6, atol=1e-6)
