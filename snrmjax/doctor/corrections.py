@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from snrmjax.doctor.findings import Kind
 from snrmjax.doctor.force_checks import deepest_fall
@@ -20,6 +20,7 @@ from snrmjax.doctor.priors import (
 )
 from snrmjax.identify.test_model.states import TestStates
 
+_SHORTEST_SWEEP = 3  # states, from one turn of the frequency to the next
 _LEFT = (0.2, 0.45, 0.7, 0.85)  # of what a step changes, at its end
 
 
@@ -68,6 +69,57 @@ def _moving(states: TestStates, base: Judged, along: np.ndarray) -> tuple[Judged
     judged = _freer(states._replace(trend=along, trend_std=MOVES), base)
     stiffness = np.maximum(1 + judged.posterior.trend[0] * along, 1e-6)  # over the mean one
     return judged, float(np.sqrt(stiffness[np.argmax(along)] / stiffness[np.argmin(along)])) - 1
+
+
+def sweeps_apart(seen: CheckedStates, states: TestStates, base: Judged) -> Judged | None:
+    """The fit where what sweeps of a level differ by does not go with the time of the test.
+
+    They differ by their pace, by settling and by warmth that comes and goes: both directions by one
+    amount, all levels by a change that begins anew with each, or every sweep by its own error, as
+    levels do. None where each level was swept once.
+    """
+    sweep, rising = sweeps(states.level, states.frequency, seen.order)
+    if sweep.max() == states.level.max():
+        return None
+    parent = np.array([states.level[sweep == k][0] for k in range(sweep.max() + 1)])
+    own = states._replace(level=sweep, level_std=(*states.level_std[:2], 0.0, states.level_std[3]))
+    start = base._replace(posterior=base.posterior.with_levels(parent))
+    middle = np.array([seen.order[states.level == k].mean() for k in range(states.n_levels)])
+    anew = seen.order - middle[states.level]
+    alike = (_moving(states, base, along)[0] for along in (rising, anew))
+    return likelier((*alike, judge(own, start=start)))
+
+
+def sweeps(
+    level: Int[np.ndarray, " state"],
+    frequency: Float[np.ndarray, " state"],
+    order: Float[np.ndarray, " state"],
+) -> tuple[Int[np.ndarray, " state"], Float[np.ndarray, " state"]]:
+    """The sweep of every state, counted from 0, and its direction: ½ upwards, −½ downwards.
+
+    A sweep ends where the frequency does not go on in its direction. Where one is then shorter than
+    three states, frequencies were not swept: the level is one part, without a direction.
+    """
+    sweep, rising = np.zeros(len(level), dtype=int), np.zeros(len(level))
+    count = 0
+    for one in range(level.max() + 1):
+        of_level = np.flatnonzero(level == one)
+        of_level = of_level[np.argsort(order[of_level], kind="stable")]
+        up = np.diff(frequency[of_level]) > 0
+        begins = [0]
+        for k in range(len(up)):
+            if k > begins[-1] and up[k] != up[begins[-1]]:
+                begins.append(k + 1)
+        parts = np.split(of_level, begins[1:])
+        if min(len(part) for part in parts) < _SHORTEST_SWEEP:
+            parts = [of_level]
+        else:
+            for k, part in enumerate(parts):
+                rising[part] = up[begins[k]] - 0.5
+        for part in parts:
+            sweep[part] = count
+            count += 1
+    return sweep, rising
 
 
 class Tried(NamedTuple):
