@@ -19,6 +19,7 @@ from snrmjax.doctor.priors import (
     FEWEST_STATES,
     FITS_WELL,
     GAIN_MATTERS,
+    MOST_OF_MISFIT,
     MOVED_MATTERS,
     OTHER_RANGE,
 )
@@ -156,7 +157,8 @@ def _beats(seen: CheckedStates, one: TestCorrection, base: Judged) -> bool:
     """Whether a correction beats the table as it is read."""
     if one.kind == "force_dropout":  # the noise of a cell is no misfit
         return one.judged.noise < FITS_WELL and one.judged.explains(base)
-    if not one.judged.beats(base):
+    most = not base.damped or one.judged.misfit**2 < MOST_OF_MISFIT * base.misfit**2
+    if not (most and one.judged.beats(base)):
         return False
     other = sweeps_apart(seen, base.states, base) if one.kind == "drift" else None
     return other is None or one.judged.is_likelier(other)

@@ -20,6 +20,8 @@ from snrmjax.doctor.priors import (
 )
 from snrmjax.identify.test_model.states import TestStates
 
+_OWN_OF_CURVES = 2  # states, beyond which both curves' value and slope are no matter of a limit
+_LEVELS_GAIN = 0.02  # ln of what a limit takes from forces: cut more alike it is a gain of levels
 _SHORTEST_SWEEP = 3  # states, from one turn of the frequency to the next
 _LEFT = (0.2, 0.45, 0.7, 0.85)  # of what a step changes, at its end
 
@@ -153,16 +155,23 @@ def _clipped(states: TestStates, base: Judged) -> Iterator[TestCorrection]:
     tried = []
     for limit in limits:
         true, stretch = unclipped(size, limit * size.max())
+        if np.sum(size > limit * size.max()) <= _OWN_OF_CURVES:
+            continue
         errors = states.errors * np.column_stack([np.ones_like(size), stretch, np.ones_like(size)])
         moved = states._replace(velocity=states.velocity * true / size, errors=errors)
         tried.append(Tried(limit, moved, float(np.sum(np.log(stretch)))))
     value, judged = likeliest(base, tried)
-    value *= float(size.max())
-    yield TestCorrection("clipped_channel", judged, value, column="response")
-    undone = [states._replace(force=unclipped(force, x * force.max())[0]) for x in limits]
-    value, judged = likeliest(base, [Tried(*pair) for pair in zip(limits, undone, strict=True)])
-    value *= float(force.max())
-    yield TestCorrection("clipped_channel", judged, value, column="force")
+    if tried:
+        yield TestCorrection("clipped_channel", judged, value * size.max(), column="response")
+    tried = []
+    for limit in limits:
+        true, _ = unclipped(force, limit * force.max())
+        gain = np.log(true / force)
+        if max(np.ptp(gain[states.level == k]) for k in range(states.n_levels)) > _LEVELS_GAIN:
+            tried.append(Tried(limit, states._replace(force=true)))
+    value, judged = likeliest(base, tried)
+    if tried:
+        yield TestCorrection("clipped_channel", judged, value * force.max(), column="force")
 
 
 def unclipped(
