@@ -241,12 +241,18 @@ def fit_test(
 
 
 def _near_linear(posterior: TestPosterior) -> float:
-    """ln of the density of both curves at the smallest amplitude over that of the linear test's."""
+    """ln of the density of both curves at the smallest amplitude over that of the linear test's.
+
+    A discrepancy counts by the linear test's damping too: it is no tenth of one that is a hundred
+    times larger.
+    """
     at_rest = posterior.curves(np.array([posterior.states.amplitude.min()]))
     found = np.concatenate([at_rest.squared_frequency, at_rest.modal_damping])
     least = 1e-3  # of the linear ones: noise may take a damping below zero
     off = np.log(np.maximum(found / np.array(posterior.states.linear), least)) / priors.NEAR_LINEAR
-    return -0.5 * float(off @ off)
+    added = max(posterior.hyper.discrepancy) * np.exp(off[1] * priors.NEAR_LINEAR[1])
+    over = added / (priors.DISCREPANCY.scale * np.exp(priors.NEAR_LINEAR[1]))
+    return -0.5 * float(off @ off + over**2)
 
 
 def _log_likelihood(reached: Reached) -> float:
