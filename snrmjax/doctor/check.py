@@ -146,9 +146,7 @@ def mode_findings(
 
 def _likeliest(seen: CheckedStates, base: Judged) -> TestCorrection | None:
     """The likeliest correction that matters."""
-    tried = (
-        one for one in corrections(seen, base.states, base) if one.judged.leaves_less(base)
-    )
+    tried = (one for one in corrections(seen, base.states, base) if one.judged.leaves_less(base))
     best = max(tried, key=lambda one: one.judged.evidence, default=None)
     return best if best is not None and _matters(best, base) else None
 
