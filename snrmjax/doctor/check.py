@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from snrmjax.doctor.corrections import TestCorrection, corrections
+from snrmjax.doctor.corrections import TestCorrection, corrections, sweeps_apart
 from snrmjax.doctor.findings import Checkup, Finding, gravest_first
 from snrmjax.doctor.force_checks import deepest_fall, dropout_findings, harmonic_findings
 from snrmjax.doctor.judgement import (
@@ -19,6 +19,7 @@ from snrmjax.doctor.priors import (
     FEWEST_STATES,
     FITS_WELL,
     GAIN_MATTERS,
+    MOST_OF_MISFIT,
     MOVED_MATTERS,
     OTHER_RANGE,
 )
@@ -133,7 +134,7 @@ def mode_findings(
             base, first = scale.judged, None
     if first is None:
         first = _likeliest(seen, base)
-        first = first if first is not None and _beats(first, base) else None
+        first = first if first is not None and _beats(seen, first, base) else None
     plain = all(one.kind in ("rms_for_peak", "shape_not_mass_normalised") for one in found)
     if first is not None:
         found.append(_finding(seen, base, first, where))
@@ -145,19 +146,20 @@ def mode_findings(
 
 def _likeliest(seen: CheckedStates, base: Judged) -> TestCorrection | None:
     """The likeliest correction that matters."""
-    mattering = (
-        correction
-        for correction in corrections(seen, base.states, base)
-        if _matters(correction, base) and correction.judged.leaves_less(base)
-    )
-    return max(mattering, key=lambda one: one.judged.evidence, default=None)
+    tried = (one for one in corrections(seen, base.states, base) if one.judged.leaves_less(base))
+    best = max(tried, key=lambda one: one.judged.evidence, default=None)
+    return best if best is not None and _matters(best, base) else None
 
 
-def _beats(one: TestCorrection, base: Judged) -> bool:
+def _beats(seen: CheckedStates, one: TestCorrection, base: Judged) -> bool:
     """Whether a correction beats the table as it is read."""
     if one.kind == "force_dropout":  # the noise of a cell is no misfit
         return one.judged.noise < FITS_WELL and one.judged.explains(base)
-    return one.judged.beats(base)
+    most = not base.damped or one.judged.misfit**2 < MOST_OF_MISFIT * base.misfit**2
+    if not (most and one.judged.beats(base)):
+        return False
+    other = sweeps_apart(seen, base.states, base) if one.kind == "drift" else None
+    return other is None or one.judged.is_likelier(other)
 
 
 def _matters(one: TestCorrection, base: Judged) -> bool:

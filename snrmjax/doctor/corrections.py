@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from snrmjax.doctor.findings import Kind
 from snrmjax.doctor.force_checks import deepest_fall
@@ -20,6 +20,9 @@ from snrmjax.doctor.priors import (
 )
 from snrmjax.identify.test_model.states import TestStates
 
+_OWN_OF_CURVES = 2  # states, beyond which both curves' value and slope are no matter of a limit
+_LEVELS_GAIN = 0.02  # ln of what a limit takes from forces: cut more alike it is a gain of levels
+_SHORTEST_SWEEP = 3  # states, from one turn of the frequency to the next
 _LEFT = (0.2, 0.45, 0.7, 0.85)  # of what a step changes, at its end
 
 
@@ -70,6 +73,57 @@ def _moving(states: TestStates, base: Judged, along: np.ndarray) -> tuple[Judged
     return judged, float(np.sqrt(stiffness[np.argmax(along)] / stiffness[np.argmin(along)])) - 1
 
 
+def sweeps_apart(seen: CheckedStates, states: TestStates, base: Judged) -> Judged | None:
+    """The fit where what sweeps of a level differ by does not go with the time of the test.
+
+    They differ by their pace, by settling and by warmth that comes and goes: both directions by one
+    amount, all levels by a change that begins anew with each, or every sweep by its own error, as
+    levels do. None where each level was swept once.
+    """
+    sweep, rising = sweeps(states.level, states.frequency, seen.order)
+    if sweep.max() == states.level.max():
+        return None
+    parent = np.array([states.level[sweep == k][0] for k in range(sweep.max() + 1)])
+    own = states._replace(level=sweep, level_std=(*states.level_std[:2], 0.0, states.level_std[3]))
+    start = base._replace(posterior=base.posterior.with_levels(parent))
+    middle = np.array([seen.order[states.level == k].mean() for k in range(states.n_levels)])
+    anew = seen.order - middle[states.level]
+    alike = (_moving(states, base, along)[0] for along in (rising, anew))
+    return likelier((*alike, judge(own, start=start)))
+
+
+def sweeps(
+    level: Int[np.ndarray, " state"],
+    frequency: Float[np.ndarray, " state"],
+    order: Float[np.ndarray, " state"],
+) -> tuple[Int[np.ndarray, " state"], Float[np.ndarray, " state"]]:
+    """The sweep of every state, counted from 0, and its direction: ½ upwards, −½ downwards.
+
+    A sweep ends where the frequency does not go on in its direction. Where one is then shorter than
+    three states, frequencies were not swept: the level is one part, without a direction.
+    """
+    sweep, rising = np.zeros(len(level), dtype=int), np.zeros(len(level))
+    count = 0
+    for one in range(level.max() + 1):
+        of_level = np.flatnonzero(level == one)
+        of_level = of_level[np.argsort(order[of_level], kind="stable")]
+        up = np.diff(frequency[of_level]) > 0
+        begins = [0]
+        for k in range(len(up)):
+            if k > begins[-1] and up[k] != up[begins[-1]]:
+                begins.append(k + 1)
+        parts = np.split(of_level, begins[1:])
+        if min(len(part) for part in parts) < _SHORTEST_SWEEP:
+            parts = [of_level]
+        else:
+            for k, part in enumerate(parts):
+                rising[part] = up[begins[k]] - 0.5
+        for part in parts:
+            sweep[part] = count
+            count += 1
+    return sweep, rising
+
+
 class Tried(NamedTuple):
     """One value of a correction's parameter."""
 
@@ -101,16 +155,23 @@ def _clipped(states: TestStates, base: Judged) -> Iterator[TestCorrection]:
     tried = []
     for limit in limits:
         true, stretch = unclipped(size, limit * size.max())
+        if np.sum(size > limit * size.max()) <= _OWN_OF_CURVES:
+            continue
         errors = states.errors * np.column_stack([np.ones_like(size), stretch, np.ones_like(size)])
         moved = states._replace(velocity=states.velocity * true / size, errors=errors)
         tried.append(Tried(limit, moved, float(np.sum(np.log(stretch)))))
     value, judged = likeliest(base, tried)
-    value *= float(size.max())
-    yield TestCorrection("clipped_channel", judged, value, column="response")
-    undone = [states._replace(force=unclipped(force, x * force.max())[0]) for x in limits]
-    value, judged = likeliest(base, [Tried(*pair) for pair in zip(limits, undone, strict=True)])
-    value *= float(force.max())
-    yield TestCorrection("clipped_channel", judged, value, column="force")
+    if tried:
+        yield TestCorrection("clipped_channel", judged, value * size.max(), column="response")
+    tried = []
+    for limit in limits:
+        true, _ = unclipped(force, limit * force.max())
+        gain = np.log(true / force)
+        if max(np.ptp(gain[states.level == k]) for k in range(states.n_levels)) > _LEVELS_GAIN:
+            tried.append(Tried(limit, states._replace(force=true)))
+    value, judged = likeliest(base, tried)
+    if tried:
+        yield TestCorrection("clipped_channel", judged, value * force.max(), column="force")
 
 
 def unclipped(

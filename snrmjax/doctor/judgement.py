@@ -267,6 +267,7 @@ def checked_states(
     to_mode: np.ndarray | float = 1.0
     ratio_of_drive: np.ndarray | float = 1.0
     stds = (0.0, 0.0, 0.0, 0.0)
+    linear = None
     if model is not None:
         modes = model.modes
         one = modes.mode_of_interest
@@ -279,6 +280,8 @@ def checked_states(
         natural, ratio = (
             float(np.asarray(a)[one]) for a in (modes.natural_frequency, modes.damping_ratio)
         )
+        rate = 2 * ratio * natural
+        linear = (natural**2, rate) if natural > 0 and rate > 0 else None
         stds = (gain, phase, 2 * frequency / natural, damping / max(ratio, 1e-6))
     sign = -1.0 if constant < 0 else 1.0
     errors, stated = state_errors(np.asarray(relative_errors(some))[:, sensor])
@@ -292,6 +295,7 @@ def checked_states(
     test = TestStates(
         *(level, omega, force, sign * to_mode * (velocity - beside), errors, False),
         *((abs(constant) or 1.0) * ratio_of_drive, stds, MODAL_MASS),
+        linear=linear,
     )
     own = None
     if data.base is not None and model is not None:

@@ -18,6 +18,11 @@ CLEARLY = 12.0
 """ln of the odds, before priors, of what is said: some twenty hypotheses, true in one table of a
 hundred together, leave one wrong answer in a hundred from 20 · 10⁴ on."""
 
+MOST_OF_MISFIT = 0.5
+"""Of the mean square that states are missed by, which is left at most where what is wrong is named:
+if more of it has another cause, that may have this one's signs too, as a steep curve has a limit's.
+"""
+
 FEWEST_STATES = 8
 """Of a table that is looked at: fewer say nothing of curves of their own."""
 

@@ -44,6 +44,16 @@ def test_a_wrong_scale_is_found_again(factor):
     assert scale.std < 0.01
 
 
+def test_a_fit_pays_for_a_mode_far_from_the_linear_tests():
+    """ln of K is one 1σ of 0.5 off, and of δ two of 1.5: −½(1² + 2²)."""
+    states = checked().test
+    (stiffness, damping), here = states.linear, judge(states)
+    assert judge(states._replace(linear=None)).evidence == pytest.approx(here.evidence, abs=0.05)
+    far = (stiffness * np.exp(0.5), damping * np.exp(-3.0))
+    paid = here.evidence - judge(states._replace(linear=far)).evidence
+    assert paid == pytest.approx(2.5, abs=0.15)  # K is 0.3 % above ω² and δ within 3 %
+
+
 def test_a_fit_that_goes_on_finds_what_a_new_one_does():
     """Forces 3 % larger at one level, from the fit without."""
     states = checked().test

@@ -20,7 +20,7 @@ taken where likelihood times prior is largest, and integrated over by Laplace's 
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.special import fdtrc, ndtri, stdtrit
 
 from snrmjax.identify.test_model import priors
@@ -113,6 +113,16 @@ class TestPosterior(NamedTuple):
         deviations of stiffness and damping.
         """
         return self.mean[self.places.levels]
+
+    def with_levels(self, parent: Int[np.ndarray, " level"]) -> "TestPosterior":
+        """Where a fit begins of the same states in other levels, each a part of one of these."""
+        n_others = self.places.others.stop - self.places.others.start
+        places = places_of(self.basis, len(parent), False, self.places.reference, n_others)
+        mean = np.zeros(places.others.stop)
+        first = int(self.places.levels.min())
+        mean[:first], mean[places.others] = self.mean[:first], self.mean[self.places.others]
+        mean[places.levels] = self.level_errors[parent]
+        return self._replace(mean=mean, places=places)
 
     def curves(self, amplitude: Float[np.ndarray, " point"]) -> CurveValues:
         """ω̃² and δ at displacement amplitudes (m), with their covariance."""
@@ -224,7 +234,7 @@ def fit_test(
         sized = sizes_of_bends(objective, reached.point, bounds)
         point, summary = averaged(sized, gaussian)
     flat = objective_of(reached.equations, states, basis, places, flat=True)
-    return TestPosterior(
+    posterior = TestPosterior(
         states,
         basis,
         units,
@@ -244,6 +254,24 @@ def fit_test(
         walk.still,
         walk.balance.in_order,
     )
+    if states.linear is None:
+        return posterior
+    return posterior._replace(log_evidence=posterior.log_evidence + _near_linear(posterior))
+
+
+def _near_linear(posterior: TestPosterior) -> float:
+    """ln of the density of both curves at the smallest amplitude over that of the linear test's.
+
+    A discrepancy counts by the linear test's damping too: it is no tenth of one that is a hundred
+    times larger.
+    """
+    at_rest = posterior.curves(np.array([posterior.states.amplitude.min()]))
+    found = np.concatenate([at_rest.squared_frequency, at_rest.modal_damping])
+    least = 1e-3  # of the linear ones: noise may take a damping below zero
+    off = np.log(np.maximum(found / np.array(posterior.states.linear), least)) / priors.NEAR_LINEAR
+    added = max(posterior.hyper.discrepancy) * np.exp(off[1] * priors.NEAR_LINEAR[1])
+    over = added / (priors.DISCREPANCY.scale * np.exp(priors.NEAR_LINEAR[1]))
+    return -0.5 * float(off @ off + over**2)
 
 
 def levels_in_order(

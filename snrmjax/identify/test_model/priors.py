@@ -114,6 +114,11 @@ LEVEL_STIFFNESS = HalfNormalSize(0.008)
 LEVEL_DAMPING = HalfNormalSize(0.05)
 """Relative: joints and clamps that are opened between levels repeat to some 10 %."""
 
+NEAR_LINEAR = (0.5, 1.5)
+"""1σ of ln ω̃² and of ln δ at the smallest measured amplitude about the linear test's: friction and
+stops change damping tenfold. Where amplitude tells all states of a sweep apart, some smooth curves
+fit with any modal mass; one a thousand times off has no resonance near the test."""
+
 INSTRUMENT_PHASE = 0.1
 """rad: 6°, of all records together, where a hypothesis may be that there is one."""
 

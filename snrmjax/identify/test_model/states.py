@@ -39,6 +39,9 @@ class TestStates(NamedTuple):
     trend_std: float = 0.0
     # 1σ of how what moves both curves goes with the forcing frequency (`priors.OFF_RESONANCE`).
     off_resonance_std: tuple[float, float] = (0.0, 0.0)
+    # Squared natural frequency (rad²/s²) and modal damping (1/s) of a linear test, which the
+    # smallest amplitude has about (`priors.NEAR_LINEAR`); None: not known, or not to count.
+    linear: tuple[float, float] | None = None
     # What other modes move beside it for 1σ of their linear parameters, m/s; None: all are known.
     beside: Complex[np.ndarray, "state deviation"] | None = None
 
