@@ -79,15 +79,23 @@ def agrees(naming: Naming, misfit: float) -> bool:
     return misfit < _AS_WELL * max(naming.misfit, 1.0)
 
 
+def kinds_to_fit(named: NamedParts) -> list[str]:
+    """The effects of a naming, those that may stand in their place, and the user's own."""
+    wanted = {kind for group in named.naming.candidates for kind in group} | _own_kinds(named)
+    return [kind for kind in EFFECTS if kind in wanted]
+
+
+def _own_kinds(named: NamedParts) -> set[str]:
+    return {one.kind for one in named.problem.columns if is_own(one.kind)}
+
+
 def fitted_parts(named: NamedParts, predictions: Predictions, data: SteadyStates) -> FoundEffects:
     """The laws of a naming fitted by harmonic balance at the measured motions, all together."""
     reference = predictions.reference
     if not predictions.chosen.noise_stated and reference is not None:
         scale = reference.posterior.hyper.noise / ASSUMED_ERROR
         predictions = predictions.with_errors_scaled(scale / predictions.error_scale)
-    own = {one.kind for one in named.problem.columns if is_own(one.kind)}
-    wanted = {kind for group in named.naming.candidates for kind in group} | own
-    misfit = weighted_misfit(predictions.with_kinds([kind for kind in EFFECTS if kind in wanted]))
+    misfit = weighted_misfit(predictions)
     fit = _fitted(misfit, named.naming, named.naming.effects)
     if fit.kinds:
         misfit, fit = refined(data, misfit, fit)
@@ -99,7 +107,7 @@ def fitted_parts(named: NamedParts, predictions: Predictions, data: SteadyStates
         for rival in group[1:]
     ]
     tried = {*fit.kinds, *(kind for one in rivals for kind in one.kinds)}
-    for kind in sorted(own - tried):
+    for kind in sorted(_own_kinds(named) - tried):
         rivals.append(_fitted(misfit, named.naming, [kind]))  # who brings an effect sees it fitted
     nothing = baseline_fit(misfit)
     rows = tuple(_tried(nothing, one) for one in (fit, *rivals) if one.kinds)

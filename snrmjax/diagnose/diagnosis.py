@@ -14,6 +14,7 @@ from snrmjax.diagnose.answer_by_parts import (
     answers_of,
     completed_by_parts,
     fitted_parts,
+    kinds_to_fit,
     verdict_of,
 )
 from snrmjax.diagnose.checks.gains import gain_found, notes_on_gains
@@ -102,10 +103,11 @@ def diagnose_model(
         notes += of_gain
     recorded = predictions_of(model, data, force_gain_std, kinds=())
     unknown = recorded.chosen.phase_unknown
-    predictions = _corrected_predictions(recorded, data)
+    _check_states(recorded)
     phases = not unknown[:, 0].all()
     excluded = excluded_kinds(model, force_gain_std, phases=phases)
     named = named_parts(recorded, data, [kind for kind in EFFECTS if kind not in excluded])
+    predictions = _corrected_predictions(recorded.with_kinds(kinds_to_fit(named)), data)
     found = fitted_parts(named, predictions, data)
     checked = _Checked.of(found)
     misfit, fit, naming = checked.misfit, found.fit, named.naming
@@ -147,8 +149,8 @@ def diagnose_model(
     return completed_by_parts(diagnosis, named, misfit.baseline_parameters(fit.rows), model)
 
 
-def _corrected_predictions(predictions: Predictions, data: SteadyStates) -> Predictions:
-    """Predictions weighed by what the states show by themselves, of corrected records."""
+def _check_states(predictions: Predictions) -> None:
+    """Raise `ValueError` for fewer states than a diagnosis needs."""
     unknown, least = predictions.chosen.phase_unknown[:, 0], 6
     n = len(unknown)
     if 2 * n - unknown.sum() < 2 * least:
@@ -156,6 +158,10 @@ def _corrected_predictions(predictions: Predictions, data: SteadyStates) -> Pred
             f"a diagnosis needs at least {least} usable steady states, or {2 * least} where phases "
             f"are unknown, not {n}."
         )
+
+
+def _corrected_predictions(predictions: Predictions, data: SteadyStates) -> Predictions:
+    """Predictions weighed by what the states show by themselves, of corrected records."""
     predictions = with_reference(predictions)
     if not np.isfinite(weighted_misfit(predictions).base).all():
         raise ValueError(

@@ -36,7 +36,8 @@ class Remainder(NamedTuple):
     laws: Float[np.ndarray, " point"]  # what the laws add, alike
     std: Float[np.ndarray, " point"]
     state_velocity: Float[np.ndarray, " state"]  # m/s, alike
-    state_change: Float[np.ndarray, " state"]  # what each state reads of the whole change
+    # What each state reads of the whole change, with the linear mode that was found.
+    state_change: Float[np.ndarray, " state"]
     rms: float  # over the measured states
     significant: bool  # beyond what noise can be
 
@@ -203,8 +204,12 @@ def _read(problem: Problem, cell: Cell, weight: float, least: dict[str, _Least])
     seen = np.abs(solution.mean[:k]) > priors.VISIBLE * std
     laws: dict[str, Laws] = {"instrument": ()}
     left = {"instrument": False}
+    damping = _changes(problem, cell, solution, "damping")
+    damped = 2 * problem.readings.damping_ratio + damping.of_law @ damping.strength + damping.left
     for part in problem.parts:
         small, visible = least[part]
+        if part in DRAWN:
+            small = small * np.abs(damped)
         change = _changes(problem, cell, solution, part)
         rest, each = change.left, change.of_law * change.strength
         whole = _size(np.sum(each, axis=1) + rest)
@@ -232,9 +237,12 @@ def _read(problem: Problem, cell: Cell, weight: float, least: dict[str, _Least])
 
 
 def _smallest(problem: Problem, part: str) -> _Least:
-    """Changes that are no finding at every state, and whether rows show a change."""
+    """Changes that are no finding at every state, and whether rows show a change.
+
+    Of stiffness and damping over the damping δ/ω₀.
+    """
     if part in DRAWN:
-        return priors.BELOW_BANDWIDTH * problem.readings.relative_damping, lambda _: True
+        return np.full(len(problem.functions), priors.BELOW_BANDWIDTH), lambda _: True
     one = problem.readings.harmonics[problem.parts.index(part) - 2]
     unit = problem.readings.natural_frequency**2
 
@@ -366,9 +374,13 @@ def _remainder(problem: Problem, reads: list[_Read], part: str, best: _Read) -> 
     if part in DRAWN:
         unit: Any = 1.0 if part == "stiffness" else 0.5
         unit_of_state = unit
+        # What the linear test had wrong is no change with amplitude.
+        softer, lossier = best.solved.linear
         beyond = np.real(readings.beyond) / natural**2
+        beyond = beyond - 2 * softer * readings.linear.frequency_std / natural
         if part == "damping":
             beyond = np.imag(readings.beyond) / (2 * natural * readings.frequency)
+            beyond = beyond - lossier * readings.linear.damping_std
         std = _std_along(functions, change.covariance)
         value = functions @ change.rest
     else:  # sizes, of the velocity at the sensor

@@ -107,12 +107,6 @@ class Readings(NamedTuple):
         return self.linear.damping_ratio
 
     @property
-    def relative_damping(self) -> Float[np.ndarray, " state"]:
-        """Damping δ of every state by smooth curves, over ω₀."""
-        damping = self.posterior.curves(self.amplitude).modal_damping
-        return np.abs(damping) / self.natural_frequency
-
-    @property
     def amplitude(self) -> Float[np.ndarray, " state"]:
         """Displacement amplitudes of the mode at the sensor, m."""
         return np.abs(self.velocity) / self.frequency

@@ -1,10 +1,12 @@
 """Figure of a diagnosis by parts: what the states read, the laws that explain it, and the rest."""
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from snrmjax.diagnose import priors
 from snrmjax.diagnose.diagnosis_result import Diagnosis
+from snrmjax.diagnose.naming.parts import Remainder
 from snrmjax.report.style import (
     DOT,
     IDENTIFIED,
@@ -25,31 +27,42 @@ PARTS_CAPTION = (
 
 
 def parts_figure(diagnosis: Diagnosis) -> Figure:
-    """Changes of stiffness and damping beyond the model, against velocity amplitude.
+    """Changes of stiffness and damping, and other harmonics, beyond the model against velocity.
 
     Dots are what every state reads, with the errors that its level shares; the dashed line is what
     the named laws add, the line that and the remainder, with the remainder's 95 % band.
     """
     shown = [one for one in diagnosis.parts if one.remainder is not None]
-    figure, (row,) = panels(PAGE, 3.0, 1, len(shown))
-    titles = {"stiffness": "Change of stiffness (%)", "damping": "Change of damping ratio (%)"}
-    for axes, one in zip(row, shown, strict=True):
-        left = one.remainder
-        if left is None:
-            continue
-        unit = unit_for(left.velocity, "m/s")
-        at, whole = left.velocity / unit.size, 100 * (left.laws + left.value)
-        marks(axes, left.state_velocity / unit.size, 100 * left.state_change, DOT, "states")
-        band = 100 * priors.BAND * left.std
-        axes.fill_between(at, whole - band, whole + band, color=IDENTIFIED, alpha=0.25, lw=0)
-        axes.plot(at, whole, color=IDENTIFIED, label="laws and remainder")
-        if one.effects:
-            law: Style = {"color": SIMULATED, "linestyle": "--"}
-            axes.plot(at, 100 * left.laws, **law, label="laws alone")
-        # States far from resonance read little: the axis is that of the curves.
-        reach = np.concatenate([whole, 100 * left.laws])
-        margin = 0.5 * max(np.ptp(reach), 1e-3 * np.max(np.abs(reach), initial=1e-9))
-        axes.set_ylim(np.min(reach) - margin, np.max(reach) + margin)
-        name_axes(axes, "", f"Velocity amplitude ({unit.name})", titles[one.part])
+    n_rows = 1 + (len(shown) > 2)
+    figure, rows = panels(PAGE, 3.0 * n_rows, n_rows, -(-len(shown) // n_rows))
+    for axes, one in zip(np.ravel(rows), shown, strict=False):
+        if one.remainder is not None:
+            _draw(axes, one.part, one.remainder, laws=bool(one.effects))
+    for axes in np.ravel(rows)[len(shown) :]:
+        axes.set_visible(False)
     legend(figure)
     return figure
+
+
+def _draw(axes: Axes, part: str, left: Remainder, *, laws: bool) -> None:
+    """One part: in per cent of the linear value, or a harmonic's velocity."""
+    unit, times = unit_for(left.velocity, "m/s"), 100.0
+    title = {"stiffness": "Change of stiffness (%)", "damping": "Change of damping ratio (%)"}
+    if part not in title:
+        size = np.abs(np.concatenate([left.laws, left.laws + left.value]))
+        own = unit_for(np.maximum(size, 1e-12), "m/s")
+        times, title = 1 / own.size, {part: f"{part.replace('_', ' ').capitalize()} ({own.name})"}
+    at, whole = left.velocity / unit.size, times * (left.laws + left.value)
+    marks(axes, left.state_velocity / unit.size, times * left.state_change, DOT, "states")
+    band = times * priors.BAND * left.std
+    axes.fill_between(at, whole - band, whole + band, color=IDENTIFIED, alpha=0.25, lw=0)
+    axes.plot(at, whole, color=IDENTIFIED, label="laws and remainder")
+    if laws:
+        law: Style = {"color": SIMULATED, "linestyle": "--"}
+        axes.plot(at, times * left.laws, **law, label="laws alone")
+    # States far from resonance read little: the axis is that of the curves and of the others.
+    states = np.nanquantile(times * left.state_change, [0.25, 0.75])
+    reach = np.concatenate([whole, times * left.laws, states])
+    margin = 0.5 * max(np.ptp(reach), 1e-3 * np.max(np.abs(reach), initial=1e-9))
+    axes.set_ylim(np.min(reach) - margin, np.max(reach) + margin)
+    name_axes(axes, "", f"Velocity amplitude ({unit.name})", title[part])

@@ -123,14 +123,15 @@ def _part_of_change(
     if part == "instrument":
         return f"The records show {laws}."
     what = f"the change of {part} with amplitude"
+    if part.startswith("harmonic"):
+        what = part.replace("_", " ")
     if not classes or explained is None:
         return f"No law of the library explains {what}: it is drawn."
     value, low, high = (f"{100 * number:.0f}" for number in explained)
     band = f"{value} %" if low == high else f"{value} % ({low} to {high})"
     several = any(len(group) > 1 for group in classes)
-    first = f"{laws[0].upper()}{laws[1:]} explain{'' if several or len(classes) > 1 else 's'}"
-    told = f"{first} {band} of {what}" if not several else f"{laws} explains {band} of {what}"
-    told = f"{told[0].upper()}{told[1:]}"
+    verb = "explain" if len(classes) > 1 else "explains"
+    told = f"{laws[0].upper()}{laws[1:]} {verb} {band} of {what}"
     if several:
         told += "; these data cannot tell which"
     elif probability < 0.99:
