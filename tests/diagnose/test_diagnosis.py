@@ -164,7 +164,7 @@ def test_what_an_effect_turns_of_an_uncertain_baseline_is_no_second_effect():
 def test_a_mode_close_by_is_not_taken_for_noise():
     found, key = blind("blind_14")
     assert key["outside"] == "close_mode"
-    assert (found.verdict, found.effects) == ("ambiguous", ("close_mode",))
+    assert (found.verdict, found.effects) == ("named", ("close_mode",))
 
 
 @pytest.mark.long
@@ -250,7 +250,7 @@ def test_a_mode_close_by_is_found_beside_a_nonlinearity():
     data = beside(1.03 * OMEGA, 0.01, 0.3, stiffening=0.03, seed=1)
     found = sj.diagnose_model(linear_model(), data)
     assert set(found.effects) == {"cubic_stiffness", "close_mode"}
-    assert found.verdict == "ambiguous"
+    assert found.verdict == "named"
     # ¾ a Q² = 0.03 ω₀² where q is x over the mode's shape.
     wanted = 0.03 * OMEGA**2 / 0.75 * (SHAPE / 1e-3) ** 2
     value, std = found.parameters["cubic_stiffness.coefficient"]

@@ -64,15 +64,13 @@ def test_nothing_that_the_force_drives_is_looked_for_beside_a_free_gain(std, kep
 
 
 @pytest.mark.long
-def test_a_gain_near_resonance_is_kept_and_doubted():
+def test_a_gain_near_resonance_is_kept():
     data = driven(8)
     silent = np.full(data.n_states, np.nan)
     data = dataclasses.replace(data, velocity_std=silent[:, None], phase_std=silent[:, None])
     model = sj.model.structure(modes())
     found = sj.diagnose_model(model, data)
     assert "residual_mode" not in found.effects
-    assert any("determine the force gain" in str(one) for one in found.notes)
-    assert found.verdict is not sj.diagnose.Verdict.NAMED
     gain = np.median(np.asarray(found.data.force) / np.asarray(data.drive))
     assert gain * found.answer.force_gain == pytest.approx(GAIN, rel=0.3)
 
@@ -133,11 +131,9 @@ def test_the_right_mass_and_a_free_gain_take_no_word():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("std", "verdict"), [(0.05, "none"), (None, "ambiguous")])
-def test_a_wrong_modal_mass_is_never_named(std, verdict):
+@pytest.mark.parametrize("std", [0.05, None])
+def test_a_wrong_modal_mass_is_never_named(std):
+    """Where nobody states it, its 1σ is taken for 5 %: that it is off by 6 % is no finding."""
     found = sj.diagnose_model(wrong_mass(std), states())
-    assert found.verdict == verdict
-    if std is None:
-        assert any(getattr(note, "kind", "") == "gain_or_modal_mass" for note in found.notes)
-    else:
-        assert found.effects == ()
+    assert found.verdict == "none"
+    assert found.effects == ()
