@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 from snrmjax.diagnose import priors
+from snrmjax.diagnose.checks.residuals import neighbour_noise
 from snrmjax.diagnose.diagnosis_result import (
     CompletedStatus,
     Diagnosis,
@@ -42,9 +43,14 @@ def verdict_of(named: NamedParts, found: FoundEffects) -> tuple[Verdict, tuple[F
     # What neighbouring states miss alike is no noise of any standard deviation.
     stated = chosen.noise_stated and posterior.share > _INDEPENDENT
     stated = stated and not chosen.phase_unknown.any()
-    if stated and not low < np.log(noise) < high:
+    misstated = stated and not low < np.log(noise) < high
+    scatter = 0.5 * np.log(neighbour_noise(found.misfit, found.fit))
+    if misstated and not low < scatter < high:
         return Verdict.NOISE_REJECTED, (Fact("noise_misstated", ratio=noise),)
     verdict = overall(named.naming)
+    if misstated:  # neighbours scatter as stated: what is left is no function of the amplitude
+        nothing = verdict is Verdict.NOTHING_MISSING
+        return Verdict.UNKNOWN if nothing else Verdict.DRAWN, (Fact("no_effect_explains"),)
     n_rows = len(named.problem.readings.rows)
     by_chance = chi_square_p_value(n_rows * named.naming.misfit**2, n_rows)
     if verdict is Verdict.NOTHING_MISSING and by_chance < priors.REJECTED:

@@ -5,7 +5,7 @@ from collections.abc import Collection
 import numpy as np
 
 from snrmjax.diagnose import priors
-from snrmjax.diagnose.naming.columns import parameters_of
+from snrmjax.diagnose.naming.columns import is_instrument, parameters_of
 from snrmjax.diagnose.naming.evidence import Problem, seen_strengths
 from snrmjax.diagnose.naming.parts import Naming
 from snrmjax.model.effect_base import AbstractEffect
@@ -23,9 +23,12 @@ def detection_limits(
     `excluded`, and for what the data do not show at all.
     """
     strength = seen_strengths(problem, naming.cell, priors.DETECTED)
+    smallest = 2 * priors.BELOW_BANDWIDTH * problem.readings.damping_ratio  # less is no finding
     limits: dict[str, float] = {}
-    for column, seen in zip(problem.columns, strength.tolist(), strict=True):
-        kind = column.kind
+    for column, shown in zip(problem.columns, strength.tolist(), strict=True):
+        kind, seen = column.kind, shown
+        if not (is_instrument(kind) or np.any(column.higher)):
+            seen = max(shown, smallest / float(np.max(np.abs(column.change))))
         if kind in excluded or kind in naming.effects or not EFFECTS[kind].searched:
             continue
         sign = column.sign or 1

@@ -43,7 +43,7 @@ class Cell(NamedTuple):
     sizes: Sizes  # σ of the remainders of stiffness, damping and every other harmonic
 
 
-class Block(NamedTuple):
+class RowBlock(NamedTuple):
     """Rows that have errors and remainders of their own, made triangular once."""
 
     rows: Float[np.ndarray, " row"]
@@ -61,14 +61,14 @@ class Block(NamedTuple):
         rows: Float[np.ndarray, " row"],
         errors: Float[np.ndarray, "row error"],
         *remainders: Float[np.ndarray, "row function"],
-    ) -> "Block":
+    ) -> "RowBlock":
         """A block without laws."""
         design = np.hstack([errors, *remainders])
         groups = errors.shape[1], *(one.shape[1] for one in remainders)
         none = np.empty((0, 0))
         return cls(rows, design, groups, *np.linalg.qr(design), none, none, none)
 
-    def with_laws(self, laws: Float[np.ndarray, "row column"]) -> "Block":
+    def with_laws(self, laws: Float[np.ndarray, "row column"]) -> "RowBlock":
         """The same with the columns of laws."""
         both = np.column_stack([laws, self.rows])
         along = self.directions.T @ both
@@ -86,7 +86,7 @@ class Problem(NamedTuple):
     readings: Readings
     columns: list[Column]
     functions: Float[np.ndarray, "state function"]  # of a remainder of size 1
-    blocks: tuple[Block, ...]  # fundamentals, then every other harmonic
+    blocks: tuple[RowBlock, ...]  # fundamentals, then every other harmonic
 
     @property
     def parts(self) -> tuple[str, ...]:
@@ -117,10 +117,10 @@ def problem_of(readings: Readings, columns: list[Column]) -> Problem:
     curves = natural**2 * functions.T
     lossy = 1j * readings.relative_frequency * curves
     remainders = readings.whitened(curves).T, readings.whitened(lossy).T
-    blocks = [Block.of(readings.rows, readings.errors, *remainders)]
+    blocks = [RowBlock.of(readings.rows, readings.errors, *remainders)]
     for one in readings.harmonics:
         both = np.concatenate([one.whitened(curves), one.whitened(1j * curves)]).T
-        blocks.append(Block.of(one.whitened(one.beyond), one.whitened(one.errors).T, both))
+        blocks.append(RowBlock.of(one.whitened(one.beyond), one.whitened(one.errors).T, both))
     return Problem(readings, [], functions, tuple(blocks)).with_columns(columns)
 
 
@@ -222,7 +222,9 @@ def _weighed(
     return sorted(kept, key=lambda cell: -cell.log_evidence), alone
 
 
-def _of_harmonics(columns: list[Column], blocks: list[Block], every: int) -> "list[_Normal | None]":
+def _of_harmonics(
+    columns: list[Column], blocks: list[RowBlock], every: int
+) -> "list[_Normal | None]":
     """What counts of all other harmonics, for remainders of every combination of sizes."""
     if not blocks:
         return [None]
@@ -258,7 +260,7 @@ class _Normal(NamedTuple):
     prior: Float[np.ndarray, " column"]  # probability among single laws
 
     @classmethod
-    def of(cls, columns: list[Column], block: Block, sizes: Sizes) -> "_Normal":
+    def of(cls, columns: list[Column], block: RowBlock, sizes: Sizes) -> "_Normal":
         """By one Cholesky factor."""
         root = block.triangle * np.sqrt(block.variances(sizes))
         factor = cholesky(root @ root.T + np.eye(len(root)), lower=True)
