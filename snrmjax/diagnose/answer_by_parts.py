@@ -171,7 +171,10 @@ def completed_by_parts(
     whole = completed_model(model, baseline, *_structural(naming.effects, parameters))
     completed, status, reason = whole.model, whole.status, whole.reason
     if left or not ended:  # without a level the answer would be another one
-        checks, gap = checks._replace(completed_without={}), gap._replace(after=naming.misfit)
+        checks, gap = (
+            checks._replace(completed_without={}),
+            gap._replace(after=naming.misfit, interpolated=None, extrapolated=None),
+        )
     drawn: tuple[str, ...] = ()
     laws: tuple[DrawnLaw, ...] = ()
     if left and completed is not None:

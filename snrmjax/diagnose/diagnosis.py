@@ -146,7 +146,12 @@ def diagnose_model(
         data=data,
         parts=naming.parts,
     )
-    return completed_by_parts(diagnosis, named, misfit.baseline_parameters(fit.rows), model)
+    diagnosis = completed_by_parts(diagnosis, named, misfit.baseline_parameters(fit.rows), model)
+    shift = _frequency_shift(model, diagnosis.completed or model)
+    if abs(shift) > priors.OTHER_MODE:
+        off = Fact("frequency_off", share=shift)
+        diagnosis = dataclasses.replace(diagnosis, notes=(*diagnosis.notes, off))
+    return diagnosis
 
 
 def _check_states(predictions: Predictions) -> None:
@@ -293,9 +298,6 @@ def _notes_on_data(checked: _Checked) -> Iterator[Fact | str]:
 def _notes_on_answer(checked: _Checked, completed: _Completed) -> Iterator[Fact]:
     misfit, fit = checked.misfit, checked.found.fit
     yield from notes_on_gains(misfit, fit)
-    shift = _frequency_shift(completed.given, completed.whole.model or completed.given)
-    if abs(shift) > priors.OTHER_MODE:
-        yield Fact("frequency_off", share=shift)
     if completed.whole.reason:
         yield Fact("not_physical", reason=completed.whole.reason)
     if completed.refused:

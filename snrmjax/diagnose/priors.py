@@ -54,9 +54,6 @@ FORCE_OFFSET = 0.1
 DRIFT = 0.005
 """1σ of a relative drift of the natural frequency over a test: some 20 K in metals."""
 
-UNSTATED_MASS = 0.05
-"""Relative 1σ of a modal mass of which nobody stated one."""
-
 VISIBLE = 2.0
 """1σ, from which on a law's strength or a remainder counts as seen: less is no answer."""
 

@@ -8,7 +8,6 @@ priors (orthogonal distance regression: Boggs, Byrd & Schnabel, doi:10.1137/0908
 
 import dataclasses
 import logging
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +18,6 @@ from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
 from snrmjax.diagnose.misfit.predictions import Predictions, scales_of
 from snrmjax.diagnose.misfit.weighted_misfit import ErrorPropagation, WeightedMisfit, by_baseline
 from snrmjax.measure.states import SteadyStates
-from snrmjax.numerics.blocks import over_cores
 from snrmjax.numerics.levenberg_marquardt import MinimisationStatus, StepRule, minimise
 
 _log = logging.getLogger(__name__)
@@ -163,17 +161,6 @@ def fit_effect(
         upper=upper[order],
         status=best.status,
     )
-
-
-def fit_effects(
-    misfit: WeightedMisfit,
-    jobs: Sequence[tuple[EffectCandidate, EffectFit]],
-    hopeless: float = np.inf,
-) -> list[EffectFit]:
-    """The best fit of every candidate beside what was fitted before, over the cores."""
-    kinds = " and ".join(jobs[0][1].kinds) if jobs else ""
-    _log.info("fits %d effects%s", len(jobs), f" in addition to {kinds}" if kinds else "")
-    return over_cores(lambda job: fit_effect(misfit, *job, hopeless), jobs)
 
 
 def with_errors_passed_on(misfit: WeightedMisfit, fit: EffectFit) -> WeightedMisfit:

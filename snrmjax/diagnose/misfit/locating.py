@@ -77,14 +77,6 @@ def curve_knots(where: Float[np.ndarray, " state"], knots: int) -> Float[np.ndar
     return np.asarray(np.quantile(where, np.linspace(0, 1, knots)) + 1e-9 * np.arange(knots))
 
 
-def hat_functions(
-    where: Float[np.ndarray, " state"], knots: int
-) -> Float[np.ndarray, "state knot"]:
-    """Piecewise linear curves of unit height at each of these knots."""
-    at = curve_knots(where, knots)
-    return np.stack([np.interp(where, at, row) for row in np.eye(knots)], axis=1)
-
-
 def _range(speed: np.ndarray, seen: np.ndarray | None = None) -> tuple[float, float]:
     """The range of velocities where something is seen; of all where it is seen nowhere."""
     where = speed if seen is None or not seen.any() else speed[seen]
@@ -100,21 +92,6 @@ def _fitted(
     values = -inverse @ (scaled.T @ left)
     left = left + scaled @ values
     return float(left @ left), values / size, inverse / np.outer(size, size)
-
-
-def power_of_answer(
-    misfit: WeightedMisfit, baseline: EffectFit, fit: EffectFit, part: str
-) -> float | None:
-    """The power of amplitude with which a fitted answer changes a part, found as in the data.
-
-    A law has its power to lowest order only: softening by q² has terms of the fourth power of the
-    amplitude too. None where the answer follows no power or does not change the part.
-    """
-    if misfit.predictions.chosen.phase_unknown.any():
-        return None  # sizes are not linear in what an answer changes
-    alone = baseline._replace(rows=baseline.rows - fit.rows)
-    powers = [one.exponent for one in locate_misfit(misfit, alone) if one.part == part]
-    return powers[0] if powers else None
 
 
 def power_of_amplitude(

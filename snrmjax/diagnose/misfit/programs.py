@@ -36,8 +36,6 @@ from snrmjax.simulate.balance.prescribed_motion import Secants, batched_zero, st
 HARMONICS = 5
 """Of the motions: three that are compared, and two more that influence those."""
 
-MANY_HARMONICS = 25
-"""Of the motions where these leave more than noise: stops and sliders have no last one."""
 
 COMPARED = (2, 3)
 """Harmonics that the programs hold, measured or not."""

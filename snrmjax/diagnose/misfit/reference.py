@@ -21,7 +21,7 @@ from snrmjax.diagnose.misfit.weighted_misfit import weighted_misfit
 from snrmjax.identify.checks.instruments import force_gain_undetermined
 from snrmjax.identify.pointwise.snrm import participation_of, sensed_mode
 from snrmjax.identify.test_model.posterior import TestPosterior, fit_test
-from snrmjax.identify.test_model.priors import INSTRUMENT_PHASE, LEVELS
+from snrmjax.identify.test_model.priors import INSTRUMENT_PHASE
 from snrmjax.identify.test_model.states import TestStates, state_errors
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.modes import residual_velocity
@@ -119,19 +119,6 @@ def with_reference(predictions: Predictions) -> Predictions:
         for size, differs in zip(found.hyper.level_std, found.differing, strict=True)
     ]
     return _with_levels(dataclasses.replace(predictions, reference=reference), sizes)
-
-
-def with_unstated_level_errors(predictions: Predictions) -> Predictions:
-    """The predictions with errors of levels of all kinds that nobody stated.
-
-    Few levels may lie on one smooth curve however they differ: a law then says what the curve
-    could not.
-    """
-    found = predictions.reference.posterior
-    sizes = [
-        max(size, prior.scale) for size, prior in zip(found.hyper.level_std, LEVELS, strict=True)
-    ]
-    return _with_levels(predictions, sizes)
 
 
 def _with_levels(predictions: Predictions, sizes: Sequence[float]) -> Predictions:

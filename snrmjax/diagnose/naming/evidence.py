@@ -399,7 +399,7 @@ def seen_strengths(problem: Problem, cell: Cell, nats: float) -> Float[np.ndarra
     across = normal.gram[:, some]
     known = across @ np.linalg.pinv(normal.gram[np.ix_(some, some)], hermitian=True)
     precision = np.diag(normal.gram) - np.sum(known * across, axis=1)
-    # Half the fall of χ² has to pay for the choice, and for one number more.
+    # The fall of χ² has to pay for the choice, and for one number more.
     need = nats + np.log(n_rows)
     return np.sqrt(need / np.maximum(precision, 1e-12))
 

@@ -282,7 +282,7 @@ def _part(
     elif (
         probability >= priors.NAMED
         and explained is not None
-        and explained.value >= priors.EXPLAINED
+        # Most of the change, or all of it that is more than noise.
         and (explained.low >= priors.EXPLAINED or not remainder.significant)
     ):
         single = all(len(group) == 1 for group in candidates)

@@ -198,6 +198,8 @@ class StaticPreload(AbstractMemoryless):
     )
     shape: ClassVar[Shape] = _EVEN
     confusions: ClassVar[tuple[Confusion, ...]] = (TOLD_BY_MEAN_OR_SECOND_HARMONIC,)
+    # A linear structure does not show it; with a cubic spring it is a quadratic one.
+    searched: ClassVar[bool] = False
     constant_force: Scalar = parameter("kg^1/2 m/s²", "constant force")
 
     @classmethod

@@ -1,13 +1,8 @@
 """The power of amplitude that a free curve follows, from curves whose power is known."""
 
-from types import SimpleNamespace
-
 import numpy as np
-import pytest
-from truths.made_up_misfits import noise_of
 
-from snrmjax.diagnose.misfit.effect_fit import EffectFit
-from snrmjax.diagnose.misfit.locating import locate_misfit, power_of_amplitude, power_of_answer
+from snrmjax.diagnose.misfit.locating import power_of_amplitude
 
 AMPLITUDE = np.log(np.array([0.12, 0.3, 0.5, 0.7, 0.85, 1.0]))
 OWN, SHARED = 0.05, 0.3  # 1σ of every knot, and of an offset that all have in common
@@ -70,38 +65,3 @@ def softened(amplitude):
     phase = np.pi * time / np.sum(slow)
     # Over half a period in time; the other half mirrors it.
     return abs(2 * np.sum(q * np.cos(phase) * slow) / np.sum(slow)), omega**2
-
-
-def test_quadratic_softening_has_the_power_of_its_own_motion():
-    """To lowest order it goes with the square of the amplitude; at large ones with more."""
-    pairs = np.array([softened(a) for a in np.repeat(np.linspace(0.1, 0.62, 40), 2)])
-    small = softened(0.01)
-    # −5/6 X₁², the next term X₁⁴ of order one.
-    assert small[1] - 1 == pytest.approx(-5 / 6 * small[0] ** 2, rel=1e-3)
-    size, change = pairs[:, 0], pairs[:, 1] - 1
-    n = len(size)
-    by_linear = np.tile(np.eye(2), (n, 1)) / 1e-3
-    misfit = SimpleNamespace(
-        noise=noise_of(np.tile(np.eye(2) / 1e-3, (n, 1, 1))),
-        by_linear=by_linear,
-        predictions=SimpleNamespace(
-            states=SimpleNamespace(velocity=size[:, None]),
-            sizes=SimpleNamespace(alone=np.zeros((n, 1), dtype=bool)),
-            chosen=SimpleNamespace(orders=(), phase_unknown=np.zeros((n, 1), dtype=bool)),
-        ),
-    )
-    left = np.random.default_rng(0).normal(size=2 * n)
-    none, no_slopes = np.zeros(0), np.zeros((2 * n, 0))
-    law = by_linear[:, 0] * np.repeat(change, 2)
-    nothing = EffectFit((), (), none, 0.0, left - law, no_slopes, none, none)
-    fit = nothing._replace(kinds=("quadratic_stiffness",), rows=left)
-    parts = locate_misfit(misfit, nothing)
-    (part,) = (one for one in parts if one.part == "stiffness")
-    own = power_of_answer(misfit, nothing, fit, "stiffness")
-    assert power_of_answer(misfit, nothing, fit, "damping") is None
-    assert abs(part.exponent - 2) > 4 * part.exponent_std
-    assert abs(part.exponent - own) < 2 * part.exponent_std
-    for seed in range(1, 5):  # what noise leaves is no part of the answer's own
-        other = np.random.default_rng(seed).normal(size=2 * n)
-        again = nothing._replace(rows=other - law), fit._replace(rows=other)
-        assert power_of_answer(misfit, *again, "stiffness") == own

@@ -22,10 +22,9 @@ from snrmjax.diagnose.misfit.predictions import predictions_of
 from snrmjax.diagnose.misfit.reference import (
     reference_of,
     with_reference,
-    with_unstated_level_errors,
 )
 from snrmjax.diagnose.misfit.weighted_misfit import weighted_misfit
-from snrmjax.identify.test_model.priors import FORCE_TO_VELOCITY, LEVELS
+from snrmjax.identify.test_model.priors import FORCE_TO_VELOCITY
 from snrmjax.numerics.blocks import on_one_core
 
 N_LEVELS, SHIFT, SEED = 6, 4e-3, 3
@@ -71,11 +70,6 @@ def test_levels_that_agree_get_no_errors():
     assert found.level_sizes == (0.0,) * 4
     assert found.unstated_levels == (False,) * 4
     assert found.model.level_stds == found.given.level_stds
-    apart = with_unstated_level_errors(found)
-    assert apart.unstated_levels == (True,) * 4
-    for size, prior in zip(apart.level_sizes, LEVELS, strict=True):
-        assert size >= prior.scale
-    assert min(apart.model.level_stds) > 0
 
 
 def test_stated_errors_of_levels_are_kept():
@@ -84,7 +78,6 @@ def test_stated_errors_of_levels_are_kept():
     found = referred(predicted(model, stated=True))
     assert not found.unstated_levels[2]
     assert found.model.level_stds[2] == pytest.approx(std)
-    assert with_unstated_level_errors(found).model.level_stds[2] == pytest.approx(std)
 
 
 def test_errors_of_whole_levels_are_told_by_their_kind():
