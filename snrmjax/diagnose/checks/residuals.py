@@ -189,6 +189,17 @@ def neighbour_noise(misfit: WeightedMisfit, fit: EffectFit) -> float:
     return min(found)
 
 
+def scatter_of_levels(misfit: WeightedMisfit, fit: EffectFit) -> Float[np.ndarray, " part"]:
+    """1σ of both parts of the force over the stated one, level by level.
+
+    By second differences along the resonance; 1 where no level has three states.
+    """
+    left = misfit.noise.without_shared(fit.rows)
+    parts = [some for some in along(misfit, left) if len(some) > 2]
+    squares = [np.mean((p[:-2] - 2 * p[1:-1] + p[2:]) ** 2) / 6 for p in parts]
+    return np.sqrt(squares) if parts else np.ones(1)
+
+
 def tolerated(noise: float) -> float:
     """Variance that counts as noise: stated a little too small it is no sign of further physics."""
     return float(np.clip(noise, 1.0, priors.TOLERATED_VARIANCE))
