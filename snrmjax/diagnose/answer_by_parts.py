@@ -21,7 +21,7 @@ from snrmjax.diagnose.misfit.effect_fit import EffectFit, baseline_fit, fit_effe
 from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
 from snrmjax.diagnose.misfit.predictions import Predictions, scales_of
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit, weighted_misfit
-from snrmjax.diagnose.naming.parts import DRAWN, Naming, Remainder
+from snrmjax.diagnose.naming.parts import DRAWN, Naming, PartAnswer, Remainder
 from snrmjax.diagnose.naming.remainder_law import remainder_laws
 from snrmjax.diagnose.verdict import Kinds, Verdict, answer_of
 from snrmjax.identify.calibrate.calibration_states import ASSUMED_ERROR
@@ -72,6 +72,15 @@ def _missed_by_other_sensors(found: FoundEffects) -> float | None:
         return None
     missed = float(np.sqrt(np.mean(left**2)))
     return missed if missed > _AS_WELL else None
+
+
+def parts_of(naming: Naming, *, explained: bool) -> tuple[PartAnswer, ...]:
+    """The parts of an answer; none of them is named where what is left is no noise."""
+    named = (Verdict.NAMED, Verdict.AMBIGUOUS)
+    return tuple(
+        part if explained or part.verdict not in named else part._replace(verdict="drawn")
+        for part in naming.parts
+    )
 
 
 def answers_of(naming: Naming, verdict: Verdict) -> dict[Kinds, float]:

@@ -15,6 +15,7 @@ from snrmjax.diagnose.answer_by_parts import (
     completed_by_parts,
     fitted_parts,
     kinds_to_fit,
+    parts_of,
     verdict_of,
 )
 from snrmjax.diagnose.checks.gains import gain_found, notes_on_gains
@@ -144,7 +145,7 @@ def diagnose_model(
         notes=tuple(notes),
         force_misfit=_force_misfit(misfit, found.baseline, fit),
         data=data,
-        parts=naming.parts,
+        parts=parts_of(naming, explained=all(r.kind != "no_effect_explains" for r in reasons)),
     )
     diagnosis = completed_by_parts(diagnosis, named, misfit.baseline_parameters(fit.rows), model)
     shift = _frequency_shift(model, diagnosis.completed or model)
