@@ -44,9 +44,9 @@ def verdict_of(named: NamedParts, found: FoundEffects) -> tuple[Verdict, tuple[F
     stated = chosen.noise_stated and posterior.share > _INDEPENDENT
     stated = stated and not chosen.phase_unknown.any()
     misstated = stated and not low < np.log(noise) < high
-    # Noise of another size shows in all levels, a jump or a drift in some.
-    scatter = np.quantile(scatter_of_levels(found.misfit, found.fit), 0.25 if noise > 1 else 0.5)
-    if misstated and not low < np.log(scatter) < high:
+    # Noise of another size shows in all levels, a jump or a drift in some; neither makes it less.
+    scatter = np.quantile(scatter_of_levels(found.misfit, found.fit), 0.25)
+    if misstated and (noise < 1 or np.log(scatter) > high):
         return Verdict.NOISE_REJECTED, (Fact("noise_misstated", ratio=noise),)
     verdict = overall(named.naming)
     if misstated:  # neighbours scatter as stated: what is left is no function of the amplitude
