@@ -39,7 +39,10 @@ _INDEPENDENT = 0.5  # of the states that err by themselves, from which on a misf
 def verdict_of(named: NamedParts, found: FoundEffects) -> tuple[Verdict, tuple[Fact, ...]]:
     """The verdict on a test, and why nothing is named where the readings do not say it."""
     posterior, chosen = named.problem.readings.posterior, found.misfit.predictions.chosen
-    noise, (low, high) = float(posterior.hyper.noise), priors.TOLERATED_NOISE
+    low, high = priors.TOLERATED_NOISE
+    # Of smooth curves, and of what the answer leaves of it: a drift is no smooth curve.
+    noise = float(posterior.hyper.noise)
+    noise = min(noise, max(noise * named.naming.of_fundamentals, 1.0)) if noise > 1 else noise
     # What neighbouring states miss alike is no noise of any standard deviation.
     stated = chosen.noise_stated and posterior.share > _INDEPENDENT
     stated = stated and not chosen.phase_unknown.any()

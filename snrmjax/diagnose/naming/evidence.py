@@ -410,6 +410,7 @@ class Solved(NamedTuple):
     mean: Float[np.ndarray, " unknown"]  # strengths, then the remainders' functions, part by part
     covariance: Float[np.ndarray, "unknown unknown"]
     misfit: float  # root-mean-square of what is left of the rows
+    of_fundamentals: float  # that of the fundamentals' rows
     linear: tuple[float, float]  # errors of the natural frequency and damping ratio, in their 1σ
 
 
@@ -429,8 +430,10 @@ def solved(problem: Problem, cell: Cell) -> Solved:
     q, r = np.linalg.qr(np.vstack([design * root, np.eye(len(root))]))
     inverse = root[:, None] * solve_triangular(r, np.eye(len(root)))
     mean = inverse @ (q[: len(rows)].T @ rows)
-    misfit = float(np.sqrt(np.mean((rows - design @ mean) ** 2)))
+    left = (rows - design @ mean) ** 2
+    misfit = float(np.sqrt(np.mean(left)))
+    of_fundamentals = float(np.sqrt(np.mean(left[: len(blocks[0].rows)])))
     # The first error is that of the modal mass.
     linear = float(mean[len(laws) + 1]), float(mean[len(laws) + 2])
     covariance = (inverse @ inverse.T)[np.ix_(remain, remain)]
-    return Solved(mean[remain], covariance, misfit, linear)
+    return Solved(mean[remain], covariance, misfit, of_fundamentals, linear)

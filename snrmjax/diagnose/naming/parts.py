@@ -68,6 +68,7 @@ class Naming(NamedTuple):
     answers: Mapping[Laws, float]  # probabilities of sets of laws, the likeliest first
     parameters: Mapping[str, Strength]  # of the laws in the most probable hypothesis with them all
     misfit: float  # root-mean-square residual of that hypothesis, over the noise
+    of_fundamentals: float  # that of the fundamentals alone
     cell: Cell
     natural_frequency: float  # rad/s, of the linear mode in that hypothesis
     damping_ratio: float
@@ -121,6 +122,7 @@ def naming_of(problem: Problem, cells: list[Cell]) -> Naming:
     linear, (softer, lossier) = problem.readings.linear, best.solved.linear
     return Naming(
         *(tuple(parts), answers, _parameters(problem, best, wanted), best.solved.misfit),
+        of_fundamentals=best.solved.of_fundamentals,
         cell=best.cell,
         natural_frequency=linear.natural_frequency + softer * linear.frequency_std,
         damping_ratio=linear.damping_ratio + lossier * linear.damping_std,
