@@ -161,7 +161,8 @@ def completed_by_parts(
 ) -> Diagnosis:
     """The diagnosis with a completed model that holds laws and remainders.
 
-    Where a remainder is seen the laws' parameters are those found with it; else those of the fit.
+    Where a remainder is seen, or the fit ended elsewhere, the laws' parameters are those of the
+    readings; else those of the fit.
     """
     naming, answer = named.naming, diagnosis.answer
     if not diagnosis.verdict.is_answer:
@@ -171,23 +172,21 @@ def completed_by_parts(
         for part in naming.parts
         if part.part in DRAWN and part.remainder is not None and part.remainder.significant
     }
-    ended = agrees(naming, diagnosis.gap.after)
-    if ended and not left:
+    if agrees(naming, diagnosis.gap.after) and not left:
         return diagnosis
-    parameters, checks, gap = _estimates(naming), diagnosis.checks, diagnosis.gap
-    if left or not ended:  # the linear mode is the one that the readings found with the laws
-        mode = f"mode_{model.modes.mode_of_interest + 1}"
-        found = (naming.natural_frequency, naming.damping_ratio)
-        names = (f"{mode}.natural_frequency", f"{mode}.damping_ratio")
-        linear = dict(zip(names, found, strict=True))
-        baseline = {name: value for name, value in linear.items() if name in baseline}
+    parameters = _estimates(naming)
+    # The linear mode is the one that the readings found with the laws.
+    mode = f"mode_{model.modes.mode_of_interest + 1}"
+    linear = {
+        f"{mode}.natural_frequency": naming.natural_frequency,
+        f"{mode}.damping_ratio": naming.damping_ratio,
+    }
+    baseline = {name: value for name, value in linear.items() if name in baseline}
     whole = completed_model(model, baseline, *_structural(naming.effects, parameters))
     completed, status, reason = whole.model, whole.status, whole.reason
-    if left or not ended:  # without a level the answer would be another one
-        checks, gap = (
-            checks._replace(completed_without={}),
-            gap._replace(after=naming.misfit, interpolated=None, extrapolated=None),
-        )
+    # Without a level the answer would be another one.
+    checks = diagnosis.checks._replace(completed_without={})
+    gap = diagnosis.gap._replace(after=naming.misfit, interpolated=None, extrapolated=None)
     drawn: tuple[str, ...] = ()
     laws: tuple[DrawnLaw, ...] = ()
     if left and completed is not None:

@@ -315,7 +315,6 @@ class FormerAnswer(NamedTuple):
     verdict: str
     effects: tuple[str, ...]
     probabilities: Mapping[Kinds, float]  # of the answers considered
-    starts: Mapping[str, tuple[float, ...]]  # parameters of every effect that was compared
 
     def changed_to(self, probabilities: Mapping[Kinds, float]) -> Fact:
         """What further states did to the answers that were likely before, or are now."""

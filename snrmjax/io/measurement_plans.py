@@ -90,26 +90,17 @@ def _check_filled(path: FilePath) -> None:
 
 
 def read_former_answer(path: FilePath) -> FormerAnswer:
-    """The answer of a `diagnosis.json`, from which a diagnosis of more states continues.
+    """The answer of a `diagnosis.json`, that a diagnosis of more states is compared with.
 
     Raises `ValueError` for a file that `snrmjax diagnose` has not written.
     """
     file = file_name(path)
     try:
         answer = json.loads(read_text(path))
-        rows = {row["effect"]: row for step in answer["tried"] for row in step}
-        starts = {
-            kind: tuple(
-                float(value)
-                for name, value in row["parameters"].items()
-                if name.startswith(f"{kind}.")
-            )
-            for kind, row in rows.items()
-        }
         probabilities = {
             tuple(name.split("+")): float(p) for name, p in answer["probabilities"].items()
         }
-        return FormerAnswer(str(answer["verdict"]), tuple(answer["effects"]), probabilities, starts)
+        return FormerAnswer(str(answer["verdict"]), tuple(answer["effects"]), probabilities)
     except (json.JSONDecodeError, KeyError, TypeError, AttributeError, ValueError) as error:
         if isinstance(error, ValueError) and not isinstance(error, json.JSONDecodeError):
             raise

@@ -188,7 +188,7 @@ def test_planned_states_resonate_where_the_structure_does(asked):
 
 def test_what_changed_names_old_and_new_answers():
     a, b, c, d, e = (("a",), ("b",), ("c",), ("d",), ("a", "b"))
-    former = FormerAnswer("ambiguous", a, {a: 0.5, b: 0.4, c: 0.1, d: 0.0}, {})
+    former = FormerAnswer("ambiguous", a, {a: 0.5, b: 0.4, c: 0.1, d: 0.0})
     changed = former.changed_to({b: 0.9, e: 0.1})["probabilities"]
     assert changed == ((a, 0.5, 0.0), (b, 0.4, 0.9), (c, 0.1, 0.0), (e, None, 0.1))
 

@@ -72,11 +72,6 @@ def locate_misfit(misfit: WeightedMisfit, base: EffectFit) -> tuple[Located, ...
     return tuple(parts)
 
 
-def curve_knots(where: Float[np.ndarray, " state"], knots: int) -> Float[np.ndarray, " knot"]:
-    """Knots with equally many states between any two."""
-    return np.asarray(np.quantile(where, np.linspace(0, 1, knots)) + 1e-9 * np.arange(knots))
-
-
 def _range(speed: np.ndarray, seen: np.ndarray | None = None) -> tuple[float, float]:
     """The range of velocities where something is seen; of all where it is seen nowhere."""
     where = speed if seen is None or not seen.any() else speed[seen]

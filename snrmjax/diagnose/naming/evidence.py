@@ -329,7 +329,7 @@ class _Normal(NamedTuple):
         s, t, b, c, g = *np.diag(self.gram)[[i, j]], *self.b[[i, j]], self.gram[i, j]
         s, t = s + 1.0, t + 1.0
         both = (b * b * t + c * c * s - 2 * g * b * c) / np.maximum(s * t - g * g, 1e-9 * s * t)
-        first, second = both - c * c / t, both - b * b / s  # gain of one beside the other
+        first, second = both - c * c / t, both - b * b / s  # gain of one given the other
         occam = np.log(np.maximum(first, 1.0)) + np.log(np.maximum(second, 1.0))
         prior = np.log(self.prior[i] * self.prior[j]) + _PRIOR_OF_PAIRS
         value = 0.5 * both - 0.5 * occam + self.base + prior + 1.0

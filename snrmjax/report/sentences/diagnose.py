@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from snrmjax.numerics.units import unit_in_print
-from snrmjax.report.sentences import Wording, enumerated, number_of
+from snrmjax.report.sentences import Wording, number_of
 
 _PEOPLE = ("Coulomb", "Jenkins", "Iwan", "Van der Pol")
 _PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"))
@@ -53,11 +53,6 @@ def effect_names(kinds: Sequence[str], word: str = "and") -> str:
     """Kinds in words as a list."""
     names = [effect_name(kind) for kind in kinds]
     return f" {word} ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
-
-
-def level_names(levels: Sequence[int]) -> str:
-    """Levels by their numbers."""
-    return f"level{'s' if len(levels) > 1 else ''} {enumerated(levels)}"
 
 
 def _times(misfit: float) -> str:
@@ -131,12 +126,12 @@ def _part_of_change(
     band = f"{value} %" if low == high else f"{value} % ({low} to {high})"
     several = any(len(group) > 1 for group in classes)
     verb = "explain" if len(classes) > 1 else "explains"
-    told = f"{laws[0].upper()}{laws[1:]} {verb} {band} of {what}"
+    text = f"{laws[0].upper()}{laws[1:]} {verb} {band} of {what}"
     if several:
-        told += "; these data cannot tell which"
+        text += "; these data cannot tell which"
     elif probability < 0.99:
-        told += f", with a probability of {probability_in_words(probability)}"
-    return f"{told}. What is left is more than noise: it is drawn." if left else f"{told}."
+        text += f", with a probability of {probability_in_words(probability)}"
+    return f"{text}. What is left is more than noise: it is drawn." if left else f"{text}."
 
 
 def _most_probable(*, verdict: float, answers: Sequence[tuple[Sequence[str], float]]) -> str:
