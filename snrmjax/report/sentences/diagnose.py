@@ -279,7 +279,8 @@ SENTENCES: dict[str, Wording] = {
     ),
     "phases_unknown": (
         "the phases of {n_states} of {of_states} states are unknown: for these only the size of "
-        "the force is compared, one number in place of two, and the phases are those of the model. "
+        "the force is compared, one number in place of two, and the phases are those of smooth "
+        "curves with the recorded amplitudes. "
         "This hardly separates stiffness from damping: at resonance an amplitude shows the damping "
         "alone, off resonance hardly any of it."
     ),
