@@ -13,7 +13,7 @@ from snrmjax.diagnose import priors
 from snrmjax.diagnose.misfit.predictions import Predictions, predictions_of, scales_of
 from snrmjax.diagnose.misfit.reference import test_states_of
 from snrmjax.diagnose.naming.columns import is_instrument
-from snrmjax.diagnose.naming.evidence import Problem, best_hypotheses
+from snrmjax.diagnose.naming.hypotheses import best_hypotheses
 from snrmjax.diagnose.naming.parts import Naming, naming_of
 from snrmjax.diagnose.naming.phases import likely_dynamic_stiffness
 from snrmjax.diagnose.naming.readings import (
@@ -24,6 +24,7 @@ from snrmjax.diagnose.naming.readings import (
     RecordedHarmonics,
     readings_of,
 )
+from snrmjax.diagnose.naming.rows import Problem
 from snrmjax.diagnose.verdict import Verdict
 from snrmjax.identify.calibrate.calibration_states import ASSUMED_ERROR
 from snrmjax.identify.pointwise.snrm import (

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-SIZES = {0: 0.25, 1: 0.5, 2: 0.25}
-"""Of no effect, one, two: who asks has seen a misfit, and one nonlinearity is the rule."""
+SIZES = (0.25, 0.5, 0.2, 0.04, 0.01)
+"""Of no effect, one, two …: who asks has seen a misfit, and one nonlinearity is the rule."""
 
 RESONANCE, INSTRUMENT = 0.03, 0.2
 """Of an internal resonance and of an instrument's error, over that of a law: modes seldom lie
@@ -19,12 +19,17 @@ NO_REMAINDER = 0.3
 REMAINDERS = np.geomspace(1e-5, 1.0, 9)
 """Sizes of a remainder where there is one, in the units of strengths, all as likely."""
 
-REMAINDER_LENGTH = 1.0
-"""Of ln a, over which a remainder changes: by a factor of e in amplitude."""
+REMAINDER_LENGTHS = (1.0, 3.0, 10.0)
+"""Of ln a, over which remainders may change: within a factor of e in amplitude, as those of joints
+and walls do, or as slowly as another power of it. Of these the most probable is taken."""
 
 FLOOR = 1e-3
 """Relative error of a state's amplitude and phase that is never undercut: what is smooth along a
 sweep and in no model. Half and twice as much give the same answers on measured structures."""
+
+DESCRIBED = 0.01
+"""Relative 1σ of the force of a law that is taken at the fundamental alone: the third harmonic of
+one that changes the stiffness by a tenth is about a hundredth of the motion."""
 
 HARMONIC = 0.02
 """Relative error of a reading of another harmonic: a law's force is taken at the fundamental alone,

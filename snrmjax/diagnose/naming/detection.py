@@ -6,8 +6,9 @@ import numpy as np
 
 from snrmjax.diagnose import priors
 from snrmjax.diagnose.naming.columns import is_instrument, parameters_of
-from snrmjax.diagnose.naming.evidence import Problem, seen_strengths
+from snrmjax.diagnose.naming.evidence import seen_strengths
 from snrmjax.diagnose.naming.parts import Naming
+from snrmjax.diagnose.naming.rows import Problem
 from snrmjax.model.effect_base import AbstractEffect
 from snrmjax.model.effect_metadata import VISIBLE_CHANGE, MotionScales
 from snrmjax.model.effect_shape import shape_of, starts_of

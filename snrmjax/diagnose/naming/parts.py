@@ -8,12 +8,13 @@ from jaxtyping import Float
 
 from snrmjax.diagnose import priors
 from snrmjax.diagnose.naming.columns import is_instrument, parameters_of
-from snrmjax.diagnose.naming.evidence import Cell, Problem, Solved, solved
+from snrmjax.diagnose.naming.rows import Cell, Problem, Solved, solved
 from snrmjax.model.library.free_laws import DisplacementDampingLaw, StiffnessLaw
 
 DRAWN = {"stiffness": StiffnessLaw.kind, "damping": DisplacementDampingLaw.kind}
 """The law that a remainder of a part is."""
 _CELLS = 100  # most probable hypotheses whose strengths are solved for
+_NOT_NOISE = float(np.log(priors.NAMED / (1 - priors.NAMED)))  # of ln odds, as a law's name asks
 _DRAWS = 500  # of fractions
 _POINTS = 60  # of a drawn remainder
 
@@ -215,8 +216,8 @@ def _read(problem: Problem, cell: Cell, weight: float, least: dict[str, _Least])
         change = _changes(problem, cell, solution, part)
         rest, each = change.left, change.of_law * change.strength
         whole = _size(np.sum(each, axis=1) + rest)
-        seen_left = np.max(np.abs(rest) / (change.left_std + 1e-300)) > priors.VISIBLE + 1
-        left[part] = bool(seen_left and np.max(np.abs(rest) / small) > 1)
+        odds = log_odds_of_remainder(problem, cell, solution, part)
+        left[part] = bool(odds > _NOT_NOISE and np.max(np.abs(rest) / small) > 1)
         found = []
         for place, column in enumerate(cell.columns):
             own = each[:, place]
@@ -236,6 +237,20 @@ def _read(problem: Problem, cell: Cell, weight: float, least: dict[str, _Least])
         )
     )
     return _Read(weight, cell, solution, laws, left)
+
+
+def log_odds_of_remainder(problem: Problem, cell: Cell, solution: Solved, part: str) -> float:
+    """ln of how much more probable the rows are with a part's remainder than without it.
+
+    The density of no remainder before the rows are seen over that after: Dickey, Ann. Math. Stat.
+    42 (1971) 204, doi:10.1214/aoms/1177693507.
+    """
+    size, some = cell.sizes[problem.parts.index(part)], _rest(problem, cell, part)
+    if size == 0:
+        return -np.inf
+    mean, covariance = solution.mean[some], solution.covariance[some, some]
+    _, log_det = np.linalg.slogdet(covariance / size**2)
+    return 0.5 * float(log_det + mean @ np.linalg.solve(covariance, mean))
 
 
 def _smallest(problem: Problem, part: str) -> _Least:
@@ -285,7 +300,10 @@ def _part(
         probability >= priors.NAMED
         and explained is not None
         # Most of the change, or all of it that is more than noise.
-        and (explained.low >= priors.EXPLAINED or not remainder.significant)
+        and (
+            (explained.value >= priors.EXPLAINED and explained.low >= 0.5)
+            or not remainder.significant
+        )
     ):
         single = all(len(group) == 1 for group in candidates)
         verdict = "named" if single else "ambiguous"
@@ -344,6 +362,8 @@ def _explained(
         law = (draws[:, :n_laws] * mine) @ change.of_law.T
         other = (draws[:, :n_laws] * ~mine) @ change.of_law.T
         rest = draws[:, _rest(problem, one.cell, part)] @ change.functions.T + other
+        of_a_sine = priors.DESCRIBED * rng.standard_normal((times, 1)) * law
+        law, rest = law + of_a_sine, rest - of_a_sine
         spread = _size_of if part not in DRAWN or _is_flat(law) else _std_of
         fractions.append(1 - spread(rest) / np.maximum(spread(law + rest), 1e-300))
     every = np.clip(np.concatenate(fractions), 0.0, 1.0)

@@ -4,8 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from snrmjax.diagnose.naming.evidence import Problem
 from snrmjax.diagnose.naming.parts import Remainder
+from snrmjax.diagnose.naming.rows import Problem
 from snrmjax.model.library.free_laws import DisplacementDampingLaw, StiffnessLaw
 
 _KNOTS = 16

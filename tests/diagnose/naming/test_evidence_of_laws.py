@@ -5,25 +5,22 @@ import pytest
 from truths.phased_states import OMEGA, linear_motion, named, nothing, readings, states_of
 
 from snrmjax.diagnose import priors
-from snrmjax.diagnose.naming import evidence
+from snrmjax.diagnose.naming import hypotheses, parts
 from snrmjax.diagnose.naming.columns import hypothesis_columns
-from snrmjax.diagnose.naming.evidence import (
-    Cell,
-    hypotheses_of,
-    problem_of,
-    solved,
-)
+from snrmjax.diagnose.naming.evidence import sizes_of_remainders
+from snrmjax.diagnose.naming.hypotheses import hypotheses_of
 from snrmjax.diagnose.naming.readings import readings_of
 from snrmjax.diagnose.naming.remainder_law import remainder_laws
+from snrmjax.diagnose.naming.rows import Cell, problem_of, solved
 
 LAWS = ("cubic_stiffness", "quintic_stiffness", "quadratic_damping", "coulomb_friction")
 
 
 def test_an_evidence_is_that_of_the_dense_gaussian():
     read = readings(lambda x: 0.02 * x**2, nothing)
-    problem = problem_of(read, hypothesis_columns(read, LAWS))
+    problem = problem_of(read, hypothesis_columns(read, LAWS), 1.0)
     sizes = (float(priors.REMAINDERS[4]), 0.0)
-    cells = {c.columns: c for c in evidence._weighed(problem, reach=1e6)[0] if c.sizes == sizes}
+    cells = {c.columns: c for c in hypotheses._weighed(problem, reach=1e6)[0] if c.sizes == sizes}
     (block,) = problem.blocks
     base = block.design * np.sqrt(block.variances(sizes))
     noise = np.eye(len(read.rows)) + base @ base.T
@@ -45,7 +42,7 @@ def test_an_evidence_is_that_of_the_dense_gaussian():
 
 def test_strengths_are_those_of_least_squares_where_nothing_else_is_unknown():
     read = readings(lambda x: 0.02 * x**2, nothing, noise=1e-5)
-    problem = problem_of(read, hypothesis_columns(read, LAWS))
+    problem = problem_of(read, hypothesis_columns(read, LAWS), 1.0)
     found = solved(problem, Cell(0.0, (0,), (0.0, 0.0)))
     assert found.mean[0] == pytest.approx(0.02, rel=0.02)
 
@@ -112,9 +109,9 @@ def test_the_force_of_a_remainder_has_its_describing_function():
 def test_pairs_that_are_left_out_could_not_count():
     """With and without the bound on pairs the probable hypotheses are the same."""
     read = readings(lambda x: 0.02 * x**2, lambda x, om: 0.004 * x * om)
-    problem = problem_of(read, hypothesis_columns(read, LAWS))
+    problem = problem_of(read, hypothesis_columns(read, LAWS), 1.0)
     first = hypotheses_of(problem)
-    few = evidence._sizes(2)
+    few = sizes_of_remainders(2)
     for one in [c for c in first if len(c.columns) == 2][:5]:
         assert set(one.sizes) <= set(few)
     top = first[0]
@@ -134,3 +131,49 @@ def test_readings_do_not_change_with_units_of_force():
         for one in (states, other)
     ]
     np.testing.assert_allclose(rows[0], rows[1], rtol=1e-6, atol=1e-6)
+
+
+def test_three_laws_together_are_found():
+    """The third goes on from the best pair."""
+
+    def damping(x, om):
+        return 0.006 * x * om + 0.002 / (x * om)
+
+    read = readings(lambda x: 0.02 * x**2, damping, levels=12)
+    problem, cells = hypotheses.best_hypotheses(read, LAWS)
+    laws = {problem.columns[k].kind for k in cells[0].columns}
+    assert laws == {"cubic_stiffness", "quadratic_damping", "coulomb_friction"}
+
+
+@pytest.mark.parametrize("power", [0.3, 0.6])
+def test_the_fraction_of_a_law_is_right_beside_another_power_of_the_amplitude(power):
+    """What a law explains is one less the rest over the whole change, by standard deviations."""
+    law, other = 0.02, 0.005
+
+    def stiffness(x):
+        return law * x**2 + other * x**power
+
+    problem, found = named(stiffness, nothing)
+    part, x = found.parts[0], problem.readings.relative_amplitude
+    true = 1 - np.std(other * x**power) / np.std(stiffness(x))
+    assert part.effects == ("cubic_stiffness",)
+    assert part.explained.low < true < part.explained.high
+    assert part.explained.high - part.explained.low < 0.3
+
+
+def test_odds_of_a_remainder_are_those_of_the_dense_gaussian():
+    read = readings(lambda x: 0.02 * x**2 + 0.004 * np.sin(4 * x), nothing)
+    problem = problem_of(read, hypothesis_columns(read, LAWS), 1.0)
+    (block,) = problem.blocks
+
+    def log_density(sizes):
+        base = block.design * np.sqrt(block.variances(sizes))
+        law = block.laws[:, [0]]
+        root = np.linalg.cholesky(np.eye(len(read.rows)) + base @ base.T + law @ law.T)
+        white = np.linalg.solve(root, read.rows)
+        return -0.5 * white @ white - np.sum(np.log(np.diag(root)))
+
+    sizes = (float(priors.REMAINDERS[5]), 0.0)
+    cell = Cell(0.0, (0,), sizes)
+    odds = parts.log_odds_of_remainder(problem, cell, solved(problem, cell), "stiffness")
+    assert odds == pytest.approx(log_density(sizes) - log_density((0.0, 0.0)), rel=1e-6)

@@ -1,0 +1,161 @@
+"""Rows that a test's laws explain: fundamentals and every other harmonic, made triangular once.
+
+Fundamentals and every other harmonic are blocks of rows that have nothing but the laws in common.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.linalg import block_diag, solve_triangular
+
+from snrmjax.diagnose.naming.columns import Column
+from snrmjax.diagnose.naming.readings import Readings
+
+_KNOTS_A_UNIT = 8  # of ln a
+_MOST_KNOTS = 40
+_NO_VARIANCE = 1e-8  # of the largest: a function of the remainder that adds nothing
+
+Sizes = tuple[float, ...]
+
+
+class Cell(NamedTuple):
+    """One hypothesis: some columns with remainders of some sizes."""
+
+    log_evidence: float  # times the prior
+    columns: tuple[int, ...]  # places in `Problem.columns`
+    sizes: Sizes  # σ of the remainders of stiffness, damping and every other harmonic
+
+
+class RowBlock(NamedTuple):
+    """Rows that have errors and remainders of their own, made triangular once."""
+
+    rows: Float[np.ndarray, " row"]
+    design: Float[np.ndarray, "row unknown"]  # errors, then remainders of size 1
+    groups: tuple[int, ...]  # how many unknowns are errors, and functions of every remainder
+    directions: Float[np.ndarray, "row direction"]  # of the design, orthogonal
+    triangle: Float[np.ndarray, "direction unknown"]
+    laws: Float[np.ndarray, "row column"]
+    along: Float[np.ndarray, "direction column"]  # laws and, last, the rows
+    across: Float[np.ndarray, "column column"]  # Gram matrix of what is left of them
+
+    @classmethod
+    def of(
+        cls,
+        rows: Float[np.ndarray, " row"],
+        errors: Float[np.ndarray, "row error"],
+        *remainders: Float[np.ndarray, "row function"],
+    ) -> "RowBlock":
+        """A block without laws."""
+        design = np.hstack([errors, *remainders])
+        groups = errors.shape[1], *(one.shape[1] for one in remainders)
+        none = np.empty((0, 0))
+        return cls(rows, design, groups, *np.linalg.qr(design), none, none, none)
+
+    def with_laws(self, laws: Float[np.ndarray, "row column"]) -> "RowBlock":
+        """The same with the columns of laws."""
+        both = np.column_stack([laws, self.rows])
+        along = self.directions.T @ both
+        left = both - self.directions @ along
+        return self._replace(laws=laws, along=along, across=left.T @ left)
+
+    def variances(self, sizes: Sizes) -> Float[np.ndarray, " unknown"]:
+        """Prior variances of the design's unknowns."""
+        return np.repeat([1.0, *(size**2 for size in sizes)], self.groups)
+
+
+class Problem(NamedTuple):
+    """Rows, and what can explain them."""
+
+    readings: Readings
+    columns: list[Column]
+    functions: Float[np.ndarray, "state function"]  # of a remainder of size 1
+    blocks: tuple[RowBlock, ...]  # fundamentals, then every other harmonic
+    length: float  # of ln a, over which remainders change
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """What of the test may have a remainder."""
+        higher = (f"harmonic_{one.order}" for one in self.readings.harmonics)
+        return ("stiffness", "damping", *higher)
+
+    def with_columns(self, columns: list[Column]) -> "Problem":
+        """The same with other columns."""
+        readings = self.readings
+        unit = readings.natural_frequency**2
+        laws = [readings.whitened(unit * np.array([column.change for column in columns])).T]
+        for place, one in enumerate(readings.harmonics):
+            higher = np.array([column.higher[place] for column in columns])
+            laws.append(one.whitened(unit * higher).T)
+        blocks = [block.with_laws(own) for block, own in zip(self.blocks, laws, strict=True)]
+        return self._replace(columns=columns, blocks=tuple(blocks))
+
+    def remainders(self, at: Float[np.ndarray, " point"]) -> Float[np.ndarray, "point function"]:
+        """The remainder's functions at amplitudes over the largest one."""
+        return _functions(self.readings.relative_amplitude, at, self.length)
+
+
+def problem_of(readings: Readings, columns: list[Column], length: float) -> Problem:
+    """The problem, made triangular once for all hypotheses."""
+    x, natural = readings.relative_amplitude, readings.natural_frequency
+    functions = _functions(x, x, length)
+    curves = natural**2 * functions.T
+    lossy = 1j * readings.relative_frequency * curves
+    remainders = readings.whitened(curves).T, readings.whitened(lossy).T
+    blocks = [RowBlock.of(readings.rows, readings.errors, *remainders)]
+    for one in readings.harmonics:
+        both = np.concatenate([one.whitened(curves), one.whitened(1j * curves)]).T
+        blocks.append(RowBlock.of(one.whitened(one.beyond), one.whitened(one.errors).T, both))
+    return Problem(readings, [], functions, tuple(blocks), length).with_columns(columns)
+
+
+def _functions(
+    measured: Float[np.ndarray, " state"], at: Float[np.ndarray, " point"], length: float
+) -> Float[np.ndarray, "point function"]:
+    """Independent functions of unit variance whose sum is a Matérn 5/2 process in ln a."""
+    low = float(np.log(np.min(measured)))
+    knots = np.linspace(low, 0.0, int(min(_MOST_KNOTS, 8 - _KNOTS_A_UNIT * low)))
+    values, vectors = np.linalg.eigh(_matern(knots, knots, length))
+    kept = values > _NO_VARIANCE * values[-1]
+    inside = np.clip(np.log(at), low, np.inf)
+    return _matern(inside, knots, length) @ (vectors[:, kept] / np.sqrt(values[kept]))
+
+
+def _matern(u: np.ndarray, v: np.ndarray, length: float) -> np.ndarray:
+    r = np.sqrt(5.0) * np.abs(np.subtract.outer(u, v)) / length
+    return (1 + r + r * r / 3) * np.exp(-r)
+
+
+class Solved(NamedTuple):
+    """Most likely strengths of a hypothesis' laws and its remainders, with their covariance."""
+
+    mean: Float[np.ndarray, " unknown"]  # strengths, then the remainders' functions, part by part
+    covariance: Float[np.ndarray, "unknown unknown"]
+    misfit: float  # root-mean-square of what is left of the rows
+    of_fundamentals: float  # that of the fundamentals' rows
+    linear: tuple[float, float]  # errors of the natural frequency and damping ratio, in their 1σ
+
+
+def solved(problem: Problem, cell: Cell) -> Solved:
+    """The unknowns of a hypothesis; a law's strength has no prior but what an instrument's has."""
+    laws, blocks = list(cell.columns), problem.blocks
+    design = block_diag(*(block.design for block in blocks))
+    design = np.hstack([np.vstack([block.laws[:, laws] for block in blocks]), design])
+    rows = np.concatenate([block.rows for block in blocks])
+    variances = [np.ones(len(laws))]  # what is seen at all is far smaller
+    kept, first = [np.ones(len(laws), bool)], 2
+    for place, block in enumerate(blocks):
+        sizes = cell.sizes[:first] if place == 0 else cell.sizes[first + place - 1 :][:1]
+        variances.append(block.variances(sizes))
+        kept.append(np.repeat([False, True], [block.groups[0], sum(block.groups[1:])]))
+    root, remain = np.sqrt(np.concatenate(variances)), np.concatenate(kept)
+    q, r = np.linalg.qr(np.vstack([design * root, np.eye(len(root))]))
+    inverse = root[:, None] * solve_triangular(r, np.eye(len(root)))
+    mean = inverse @ (q[: len(rows)].T @ rows)
+    left = (rows - design @ mean) ** 2
+    misfit = float(np.sqrt(np.mean(left)))
+    of_fundamentals = float(np.sqrt(np.mean(left[: len(blocks[0].rows)])))
+    # The first error is that of the modal mass.
+    linear = float(mean[len(laws) + 1]), float(mean[len(laws) + 2])
+    covariance = (inverse @ inverse.T)[np.ix_(remain, remain)]
+    return Solved(mean[remain], covariance, misfit, of_fundamentals, linear)
