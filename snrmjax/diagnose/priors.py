@@ -31,6 +31,10 @@ DESCRIBED = 0.01
 """Relative 1σ of the force of a law that is taken at the fundamental alone: the third harmonic of
 one that changes the stiffness by a tenth is about a hundredth of the motion."""
 
+ALONG = 0.2
+"""Of a remainder, 1σ of what it has along a law's own curve and no row can tell from the law:
+contributions that grow with amplitude look more like laws than smooth curves at random do."""
+
 HARMONIC = 0.02
 """Relative error of a reading of another harmonic: a law's force is taken at the fundamental alone,
 whose other harmonics change it by about as much."""
@@ -73,8 +77,8 @@ NAMED = 0.9
 """Probability from which on a law is named: a wrong name costs nine times as much as none."""
 
 EXPLAINED = 0.8
-"""Of a part's change, at the lower end of its 95 % band, from which on the law is the answer and
-the remainder a correction."""
+"""Of a part's change, from which on a law is the answer and the remainder a correction; the lower
+end of its 95 % band must not lie below half where the remainder is no noise."""
 
 TOLERATED_NOISE = (-0.38, 0.22)
 """Of that logarithm, overstated and understated: √2 (0.35) lies between the error of a phasor and

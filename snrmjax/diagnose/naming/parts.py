@@ -174,30 +174,25 @@ def _std_along(functions: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 def _changes(problem: Problem, cell: Cell, solution: Solved, part: str) -> _Changes:
     readings, k = problem.readings, len(cell.columns)
     columns = [problem.columns[c] for c in cell.columns]
-    functions = problem.functions
+    functions = problem.functions[part]
     if part == "stiffness":
         changes = [column.change.real for column in columns]
     elif part == "damping":
         changes = [column.change.imag / readings.relative_frequency for column in columns]
     else:
         changes = [column.higher[problem.parts.index(part) - 2] for column in columns]
-        functions = _both_parts(functions)
     some = _rest(problem, cell, part)
     laws = np.array(changes).reshape(k, len(functions)).T
     covariance = solution.covariance[some, some]
     return _Changes(laws, functions, solution.mean[:k], solution.mean[some], covariance)
 
 
-def _both_parts(functions: np.ndarray) -> np.ndarray:
-    """Functions of the real and of the imaginary part."""
-    return np.hstack([functions, 1j * functions])
-
-
 def _rest(problem: Problem, cell: Cell, part: str) -> slice:
     """Where the remainder of a part stands among a hypothesis' unknowns."""
-    n, k = problem.functions.shape[1], problem.parts.index(part)
-    first = len(cell.columns) + n * (k if k < 2 else 2 * k - 2)
-    return slice(first, first + (n if k < 2 else 2 * n))
+    each = [functions.shape[1] for functions in problem.functions.values()]
+    k = problem.parts.index(part)
+    first = len(cell.columns) + sum(each[:k])
+    return slice(first, first + each[k])
 
 
 def _read(problem: Problem, cell: Cell, weight: float, least: dict[str, _Least]) -> _Read:
@@ -259,7 +254,7 @@ def _smallest(problem: Problem, part: str) -> _Least:
     Of stiffness and damping over the damping δ/ω₀.
     """
     if part in DRAWN:
-        return np.full(len(problem.functions), priors.BELOW_BANDWIDTH), lambda _: True
+        return np.full(len(problem.functions[part]), priors.BELOW_BANDWIDTH), lambda _: True
     one = problem.readings.harmonics[problem.parts.index(part) - 2]
     unit = problem.readings.natural_frequency**2
 
@@ -299,11 +294,8 @@ def _part(
     elif (
         probability >= priors.NAMED
         and explained is not None
-        # Most of the change, or all of it that is more than noise.
-        and (
-            (explained.value >= priors.EXPLAINED and explained.low >= 0.5)
-            or not remainder.significant
-        )
+        and explained.value >= priors.EXPLAINED
+        and (explained.low >= 0.5 or not remainder.significant)
     ):
         single = all(len(group) == 1 for group in candidates)
         verdict = "named" if single else "ambiguous"
@@ -362,9 +354,11 @@ def _explained(
         law = (draws[:, :n_laws] * mine) @ change.of_law.T
         other = (draws[:, :n_laws] * ~mine) @ change.of_law.T
         rest = draws[:, _rest(problem, one.cell, part)] @ change.functions.T + other
-        of_a_sine = priors.DESCRIBED * rng.standard_normal((times, 1)) * law
-        law, rest = law + of_a_sine, rest - of_a_sine
         spread = _size_of if part not in DRAWN or _is_flat(law) else _std_of
+        # What neither describing functions nor the rows tell of the law's own curve.
+        unsure = np.hypot(priors.DESCRIBED * spread(law), priors.ALONG * spread(rest))
+        unsure = unsure / np.maximum(spread(law), 1e-300) * rng.standard_normal(times)
+        law, rest = law * (1 + unsure[:, None]), rest - law * unsure[:, None]
         fractions.append(1 - spread(rest) / np.maximum(spread(law + rest), 1e-300))
     every = np.clip(np.concatenate(fractions), 0.0, 1.0)
     return Explained(float(np.median(every)), *np.quantile(every, [0.025, 0.975]).tolist())
@@ -389,7 +383,7 @@ def _remainder(problem: Problem, reads: list[_Read], part: str, best: _Read) -> 
     natural = readings.natural_frequency
     velocity = x * np.max(readings.amplitude) * natural
     change = _changes(problem, best.cell, best.solved, part)
-    functions = problem.remainders(x)
+    functions = problem.remainders(part, x)
     order = np.argsort(readings.relative_amplitude)
     at_states = change.of_law @ change.strength
     laws = np.interp(x, readings.relative_amplitude[order], at_states[order])
@@ -406,7 +400,6 @@ def _remainder(problem: Problem, reads: list[_Read], part: str, best: _Read) -> 
         std = _std_along(functions, change.covariance)
         value = functions @ change.rest
     else:  # sizes, of the velocity at the sensor
-        functions = _both_parts(functions)
         one = readings.harmonics[problem.parts.index(part) - 2]
         unit = velocity * one.order / (one.order**2 - 1)
         unit_of_state = readings.amplitude * natural * one.order / (one.order**2 - 1)

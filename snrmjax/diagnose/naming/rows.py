@@ -6,15 +6,19 @@ Fundamentals and every other harmonic are blocks of rows that have nothing but t
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 from scipy.linalg import block_diag, solve_triangular
 
+from snrmjax.diagnose import priors
 from snrmjax.diagnose.naming.columns import Column
 from snrmjax.diagnose.naming.readings import Readings
 
 _KNOTS_A_UNIT = 8  # of ln a
 _MOST_KNOTS = 40
 _NO_VARIANCE = 1e-8  # of the largest: a function of the remainder that adds nothing
+
+CURVES = "stiffness", "damping"
+"""Parts that are curves of amplitude; the others are harmonics."""
 
 Sizes = tuple[float, ...]
 
@@ -69,15 +73,14 @@ class Problem(NamedTuple):
 
     readings: Readings
     columns: list[Column]
-    functions: Float[np.ndarray, "state function"]  # of a remainder of size 1
+    functions: dict[str, Float[np.ndarray, "state function"]]  # of every part's remainder of size 1
     blocks: tuple[RowBlock, ...]  # fundamentals, then every other harmonic
-    length: float  # of ln a, over which remainders change
+    length: float  # of ln a, over which remainders of stiffness and damping change
 
     @property
     def parts(self) -> tuple[str, ...]:
         """What of the test may have a remainder."""
-        higher = (f"harmonic_{one.order}" for one in self.readings.harmonics)
-        return ("stiffness", "damping", *higher)
+        return tuple(self.functions)
 
     def with_columns(self, columns: list[Column]) -> "Problem":
         """The same with other columns."""
@@ -90,23 +93,45 @@ class Problem(NamedTuple):
         blocks = [block.with_laws(own) for block, own in zip(self.blocks, laws, strict=True)]
         return self._replace(columns=columns, blocks=tuple(blocks))
 
-    def remainders(self, at: Float[np.ndarray, " point"]) -> Float[np.ndarray, "point function"]:
-        """The remainder's functions at amplitudes over the largest one."""
-        return _functions(self.readings.relative_amplitude, at, self.length)
+    def remainders(self, part: str, at: Float[np.ndarray, " point"]) -> np.ndarray:
+        """A part's functions at amplitudes over the largest one."""
+        of_curve = _of_curves if part in CURVES else _of_harmonic
+        return of_curve(self.readings.relative_amplitude, at, self.length)
 
 
 def problem_of(readings: Readings, columns: list[Column], length: float) -> Problem:
     """The problem, made triangular once for all hypotheses."""
     x, natural = readings.relative_amplitude, readings.natural_frequency
-    functions = _functions(x, x, length)
-    curves = natural**2 * functions.T
+    functions = {part: _of_curves(x, x, length) for part in CURVES}
+    curves = natural**2 * functions[CURVES[0]].T
     lossy = 1j * readings.relative_frequency * curves
     remainders = readings.whitened(curves).T, readings.whitened(lossy).T
     blocks = [RowBlock.of(readings.rows, readings.errors, *remainders)]
     for one in readings.harmonics:
-        both = np.concatenate([one.whitened(curves), one.whitened(1j * curves)]).T
-        blocks.append(RowBlock.of(one.whitened(one.beyond), one.whitened(one.errors).T, both))
+        both = _of_harmonic(x, x, length)
+        functions[f"harmonic_{one.order}"] = both
+        own = one.whitened(natural**2 * both.T).T
+        blocks.append(RowBlock.of(one.whitened(one.beyond), one.whitened(one.errors).T, own))
     return Problem(readings, [], functions, tuple(blocks), length).with_columns(columns)
+
+
+def _of_curves(
+    measured: Float[np.ndarray, " state"], at: Float[np.ndarray, " point"], length: float
+) -> Float[np.ndarray, "point function"]:
+    """Functions of stiffness or damping, about their means over the states.
+
+    A constant is the linear mode's, whose errors and changes have columns of their own.
+    """
+    constant = np.mean(_functions(measured, measured, length), axis=0)
+    return _functions(measured, at, length) - constant
+
+
+def _of_harmonic(
+    measured: Float[np.ndarray, " state"], at: Float[np.ndarray, " point"], _: float
+) -> Complex[np.ndarray, "point function"]:
+    """Functions of the real and of the imaginary part of another harmonic."""
+    functions = _functions(measured, at, min(priors.REMAINDER_LENGTHS))
+    return np.hstack([functions, 1j * functions])
 
 
 def _functions(

@@ -153,7 +153,7 @@ def test_the_hidden_damping_is_the_first_law_without_phases():
     assert found.verdict.is_answer
     assert max(found.probabilities, key=found.probabilities.get) == truth
     assert truth in found.candidates[0]
-    assert len(found.candidates) == 1
+    assert set(found.candidates[1:]) <= {("displacement_damping_law",)}
     value, std = found.parameters[f"{truth}.coefficient"]
     expected = key["parameters"][f"{truth}.coefficient"]
     assert abs(value - expected) < 4 * std
