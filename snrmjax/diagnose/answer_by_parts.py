@@ -33,6 +33,7 @@ from snrmjax.model.structures import Structure
 from snrmjax.numerics.facts import Fact
 
 _AS_WELL = 1.5  # times the misfit, up to which two explanations are as good
+_SCATTERED = 2.0  # times the scatter of neighbours, beyond which a misfit is no noise
 _INDEPENDENT = 0.5  # of the states that err by themselves, from which on a misfit may be noise
 
 
@@ -48,8 +49,9 @@ def verdict_of(named: NamedParts, found: FoundEffects) -> tuple[Verdict, tuple[F
     stated = stated and not chosen.phase_unknown.any()
     misstated = stated and not low < np.log(noise) < high
     # Noise of another size shows in all levels, a jump or a drift in some; neither makes it less.
-    scatter = np.quantile(scatter_of_levels(found.misfit, found.fit), 0.25)
-    if misstated and (noise < 1 or np.log(scatter) > high):
+    scatter = float(np.quantile(scatter_of_levels(found.misfit, found.fit), 0.25))
+    as_noise = np.log(scatter) > high and noise < _SCATTERED * scatter
+    if misstated and (noise < 1 or as_noise):
         return Verdict.NOISE_REJECTED, (Fact("noise_misstated", ratio=noise),)
     verdict = overall(named.naming)
     if misstated:  # neighbours scatter as stated: what is left is no function of the amplitude
@@ -170,7 +172,9 @@ def completed_by_parts(
     left = {
         part.part: part.remainder
         for part in naming.parts
-        if part.part in DRAWN and part.remainder is not None and part.remainder.significant
+        if part.part in DRAWN
+        and part.remainder is not None
+        and (part.remainder.significant or part.verdict == "drawn")
     }
     if agrees(naming, diagnosis.gap.after) and not left:
         return diagnosis

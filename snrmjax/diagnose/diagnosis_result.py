@@ -16,7 +16,7 @@ from snrmjax.diagnose.design.discriminating_test import DiscriminatingTest
 from snrmjax.diagnose.drawn_law import DrawnLaw
 from snrmjax.diagnose.fitted_effects import TriedEffect
 from snrmjax.diagnose.misfit.locating import Located
-from snrmjax.diagnose.naming.parts import PartAnswer
+from snrmjax.diagnose.naming.parts import DRAWN, PartAnswer
 from snrmjax.diagnose.verdict import Kinds, Verdict
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
@@ -178,6 +178,8 @@ class Diagnosis(AbstractResult):
         if not verdict.is_answer:
             return self.answer.probabilities.get((verdict.value,), 0.0)
         given = {kind for group in self.candidates for kind in group}
+        if verdict is Verdict.DRAWN:
+            given |= {*DRAWN.values()}
         return float(sum(p for kinds, p in self.answer.probabilities.items() if given >= {*kinds}))
 
     @property

@@ -16,6 +16,7 @@ from snrmjax.diagnose.response_prediction import (
     LevelResponse,
     held_curves,
     holds_response,
+    level_forces,
     predict_levels,
 )
 from snrmjax.diagnose.verdict import Verdict
@@ -99,6 +100,10 @@ def diagnose_test(
         return DiagnosedTest(found, model, where=place)
     _log.info("simulates the responses of all levels")
     simulated = simulated_levels(found, model)
+    n, of = len(simulated.predicted.levels), len(level_forces(data, found.force_misfit.sensor))
+    if n < of:
+        note = Fact("some_levels_simulated", n=n, of=of)
+        found = dataclasses.replace(found, notes=(*found.notes, note))
     levels = tuple(each.level for each in simulated.predicted.levels if not each.complete)
     if levels:
         note = Fact("responses_not_complete", levels=levels)
@@ -111,8 +116,10 @@ def diagnose_test(
 
 
 def _is_missed(level: LevelResponse) -> bool:
-    """Whether the completed model's resonance lies far from the measured one of its level."""
+    """Whether the completed model has no resonance, or one far from the level's measured one."""
     there, after = level.measured, level.completed
+    if np.isfinite(there.frequency) and not np.isfinite(after.frequency):
+        return level.complete
     off = abs(after.frequency - there.frequency) > _FAR_OFF * there.frequency
     return bool(off or abs(np.log(after.velocity / there.velocity)) > _FAR_APART)
 

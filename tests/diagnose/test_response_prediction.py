@@ -169,7 +169,7 @@ def test_a_force_that_drops_at_resonance_holds_no_response():
     row = LevelResponse(0, FORCES[0], *(3 * [PhaseResonance(50.0, 1.0)]), False)
     rows = [row, row._replace(level=1, force=FORCES[1])]
     assert not holds_response(data, rows)
-    cosine = np.cos(np.angle(np.asarray(data.velocity)[:, 0]))
+    cosine, force = np.cos(np.angle(np.asarray(data.velocity)[:, 0])), np.asarray(data.force)
     drops = eqx.tree_at(lambda d: d.force, data, data.force * (1 - 0.3 * cosine))
     assert not holds_response(drops, rows)
     held = eqx.tree_at(
@@ -178,6 +178,20 @@ def test_a_force_that_drops_at_resonance_holds_no_response():
         (data.force / cosine, data.velocity / cosine[:, None]),
     )
     assert holds_response(held, rows)
+    # At phase resonance, with a damping that grows with the amplitude, both change.
+    speed = np.geomspace(1.0, 30.0, len(force))
+    ladder = eqx.tree_at(lambda d: (d.force, d.velocity), data, (speed**1.2, speed[:, None] + 0j))
+    assert not holds_response(ladder, rows)
+
+
+def test_of_many_levels_some_are_simulated_from_the_smallest_to_the_largest_force():
+    forces = {level: float((7 * level) % 71 + 1) for level in range(71)}
+    some = response_prediction._spread(forces, {3})
+    assert {min(forces, key=forces.get), max(forces, key=forces.get), 3} <= {*some}
+    assert 12 <= len(some) <= 13
+    gaps = np.diff(sorted(some[level] for level in some if level != 3))
+    assert gaps.max() <= 7
+    assert response_prediction._spread({1: 2.0, 2: 1.0}, set()) == {1: 2.0, 2: 1.0}
 
 
 def test_the_force_of_a_level_is_that_at_its_resonance():

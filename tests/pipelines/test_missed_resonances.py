@@ -15,6 +15,7 @@ from truths.balanced_sets import (
 )
 
 import snrmjax as sj
+from snrmjax.diagnose.response_prediction import LevelResponse, PhaseResonance
 from snrmjax.pipelines import diagnose
 
 
@@ -51,3 +52,14 @@ def test_levels_that_a_completed_model_misses_are_named(found, monkeypatch):
     note = diagnosed(found, monkeypatch, completed)["resonances_missed"]
     assert list(note["levels"]) == far
     assert str(note).endswith(".")
+
+
+def test_a_completed_model_without_a_resonance_misses_them(found):
+    there = PhaseResonance(50.0, 1.0)
+    nowhere = PhaseResonance(np.nan, np.nan)
+    level = LevelResponse(1, 1.0, there, there, there, False, True, there)
+    assert not diagnose._is_missed(level)
+    assert diagnose._is_missed(level._replace(completed=nowhere))
+    # A jump past the resonance was measured, or the response was not followed to its end.
+    assert not diagnose._is_missed(level._replace(measured=nowhere))
+    assert not diagnose._is_missed(level._replace(completed=nowhere, complete=False))

@@ -1,11 +1,12 @@
 """How large a further effect would have to be to be seen, by the rows of the same problem."""
 
+import itertools
 from collections.abc import Collection
 
 import numpy as np
 
 from snrmjax.diagnose import priors
-from snrmjax.diagnose.naming.columns import is_instrument, parameters_of
+from snrmjax.diagnose.naming.columns import hypothesis_columns, is_instrument, parameters_of
 from snrmjax.diagnose.naming.evidence import seen_strengths
 from snrmjax.diagnose.naming.parts import Naming
 from snrmjax.diagnose.naming.rows import Problem
@@ -23,15 +24,19 @@ def detection_limits(
     By parameter, with the shape that shows best. Not given for the effects of the answer, for those
     `excluded`, and for what the data do not show at all.
     """
-    strength = seen_strengths(problem, naming.cell, priors.DETECTED)
+    known = [problem.columns[k] for k in naming.cell.columns]
+    kinds = (k for k, e in EFFECTS.items() if e.searched and k not in {*excluded, *naming.effects})
+    # Of every shape, not of those alone that might explain these rows.
+    problem = problem.with_columns([*known, *hypothesis_columns(problem.readings, kinds)])
+    cell = naming.cell._replace(columns=tuple(range(len(known))))
+    strength = seen_strengths(problem, cell, priors.DETECTED)
     smallest = 2 * priors.BELOW_BANDWIDTH * problem.readings.damping_ratio  # less is no finding
     limits: dict[str, float] = {}
-    for column, shown in zip(problem.columns, strength.tolist(), strict=True):
+    further = zip(problem.columns, strength.tolist(), strict=True)
+    for column, shown in itertools.islice(further, len(known), None):
         kind, seen = column.kind, shown
         if not (is_instrument(kind) or np.any(column.higher)):
             seen = max(shown, smallest / float(np.max(np.abs(column.change))))
-        if kind in excluded or kind in naming.effects or not EFFECTS[kind].searched:
-            continue
         sign = column.sign or 1
         values = parameters_of(problem.readings, column, sign * seen)
         if values is None or not np.isfinite(seen):

@@ -117,6 +117,10 @@ SENTENCES: dict[str, Wording] = {
         "does not reproduce these responses. Check the model's participation and linear "
         "frequency, and the scale of the force."
     ),
+    "some_levels_simulated": (
+        "the responses of {n} of {of} levels were simulated, from the smallest to the largest "
+        "force."
+    ),
     "responses_not_complete": (
         "the simulated responses of level {levels} were not traced to the end of the frequency "
         "range: a resonance may be missing there."
