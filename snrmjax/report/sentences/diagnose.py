@@ -124,6 +124,10 @@ def _part_of_change(
         return f"No law of the library explains {what}: it is drawn."
     value, low, high = (f"{100 * number:.0f}" for number in explained)
     band = f"{value} %" if low == high else f"{value} % ({low} to {high})"
+    if explained[0] < 0.5:
+        return (
+            f"No law of the library explains most of {what}: it is drawn. Nearest: {laws}, {band}."
+        )
     several = any(len(group) > 1 for group in classes)
     verb = "explain" if len(classes) > 1 else "explains"
     text = f"{laws[0].upper()}{laws[1:]} {verb} {band} of {what}"
