@@ -13,7 +13,7 @@ from .inference.identification import Identification, identify_backbone
 from .inference.optimal_design import (
     next_measurements,
 )
-from .inference.refits import bootstrap
+from .inference.refits import FitInputs, bootstrap, influence, refit
 from .joint.joint_fit import JointFit, corrected_states, fit_jointly
 from .modal.free_decay import fit_free_decay
 from .modal.linear_fit import fit_linear_modes
@@ -44,6 +44,7 @@ __all__ = [
     "Calibration",
     "DayToDay",
     "DrivePoint",
+    "FitInputs",
     "Free",
     "Identification",
     "JointFit",
@@ -66,6 +67,7 @@ __all__ = [
     "fitted_values",
     "identify_backbone",
     "identify_points",
+    "influence",
     "inverse_force",
     "invert_amplitude_phase",
     "invert_phasor",
@@ -76,6 +78,7 @@ __all__ = [
     "predict_response",
     "predicted_resonance",
     "reference_sensor",
+    "refit",
     "relative_to_base",
     "resonances",
     "scale_modes",

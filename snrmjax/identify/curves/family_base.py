@@ -213,11 +213,16 @@ class AbstractFamily(AbstractCurve):
         """See `AbstractCurve`."""
         return packed(self)(amplitude)
 
-    def linearised(self, amplitude: Float[np.ndarray, " point"]) -> Linearised:
-        """See `AbstractCurve`; nothing compiles."""
+    def linearised(
+        self,
+        amplitude: Float[np.ndarray, " point"],
+        parameters: Float[np.ndarray, " parameter"] | None = None,
+    ) -> Linearised:
+        """See `AbstractCurve`; nothing compiles. For other `parameters`, if given."""
         host = jax.tree.map(np.asarray, self)
         scale, terms = float(host.scale), host.terms()
-        drawn = _drawn(np.asarray(amplitude) / scale, host.parameters, terms, np)
+        own = host.parameters if parameters is None else parameters
+        drawn = _drawn(np.asarray(amplitude) / scale, own, terms, np)
         columns = drawn.basis @ terms.mix
         if columns.shape[-1] > 2:
             columns[..., 2] += drawn.by_third
@@ -230,6 +235,11 @@ class AbstractFamily(AbstractCurve):
     def prior_residuals(self) -> Float[Array, " row"]:
         """What is expected to be near zero of a curve, in its own 1σ."""
         return jnp.asarray(self.terms().prior @ self.parameters)
+
+    def expected_std(self) -> Float[np.ndarray, " parameter"]:
+        """1σ about zero of what is expected of every parameter; infinite where nothing is."""
+        rows = np.linalg.norm(np.asarray(self.terms().prior), axis=0)
+        return np.divide(1.0, rows, out=np.full(len(rows), np.inf), where=rows > 0)
 
     @property
     def label(self) -> str:

@@ -19,6 +19,7 @@ from snrmjax.identify.test_model.hyper import (
     LEVELS,
     NOISE,
     bounds_of,
+    end_of_along,
     objective_of,
     point_of,
     prior_variances,
@@ -108,7 +109,7 @@ class Walk:
         places, discrepancy = balance.places, balance.beside.shape[1] > 0
         self.balance, self.straight, self.apart = balance, straight, apart
         self.robust, self.tempered = robust, tempered
-        self.start = starting_point(balance.states, balance.basis, discrepancy)
+        self.start = starting_point(balance.states, balance.terms, discrepancy)
         self.point, self.errors = self.start, np.zeros_like(balance.states.errors)
         self.mean = np.zeros(places.others.stop)
         self.mean[places.damping.start] = 1.0
@@ -151,19 +152,19 @@ class Walk:
         """The same, were so many of the states independent."""
         if self.found is None:
             return -np.inf
-        states, basis, places = self.balance.states, self.balance.basis, self.balance.places
+        states, terms, places = self.balance.states, self.balance.terms, self.balance.places
         equations = self.found.equations._replace(share=share)
-        return objective_of(equations, states, basis, places)(self.found.point)[0]
+        return objective_of(equations, states, terms, places)(self.found.point)[0]
 
     def _round(self) -> None:
-        k, states, basis = self.turn, self.balance.states, self.balance.basis
+        k, states, terms = self.turn, self.balance.states, self.balance.terms
         places, start = self.balance.places, self.start
         if k == _SETTLED:
             self.balance = self.balance.with_discrepancy(self.mean, self.errors)
         this = self.balance.straight(self.mean, self.errors, first=k == 0)
         this = this._replace(equations=this.equations._replace(share=self.share))
-        bounds = bounds_of(states, basis, self.point)
-        along = slice(FIRST_ALONG, FIRST_ALONG + basis.directions.shape[1])
+        bounds = bounds_of(states, terms, self.point)
+        along = slice(FIRST_ALONG, end_of_along(terms))
         if k == 0:  # no level differs from another yet, and bends are of one size
             bounds[LEVELS] = [
                 bound if self.apart and kind == _STIFFNESS else (bound[0], bound[0])
@@ -175,12 +176,12 @@ class Walk:
         # What curves do not follow yet would pass for another modal mass.
         free = k >= _SETTLED or states.mass_std > _GUESS
         held = states if free else states._replace(mass_std=0.0)
-        objective = objective_of(this.equations, held, basis, places)
+        objective = objective_of(this.equations, held, terms, places)
         begin = self.point if k > (_SETTLED if self.straight else 1) else start
         for _ in range(2):
             point = maximised(objective, begin, bounds)
             noise = float(np.exp(point[NOISE]))
-            variance = prior_variances(basis, places, held)(point)
+            variance = prior_variances(terms, places, held)(point)
             goal, covariance = this.equations.posterior(noise, variance)
             if np.all(np.abs(goal[places.levels]) < _FARTHEST):
                 break
