@@ -6,6 +6,7 @@ from .calibrate.calibration import calibrate_model
 from .calibrate.inverse_force import inverse_force
 from .coupled.coupled_modes import coupled_modes
 from .curves.families import FAMILIES
+from .curves.own_family import OwnFamily
 from .inference.contributions import contributions
 from .inference.fitted_curves import fitted_values
 from .inference.fitted_response import fitted_response, predicted_resonance
@@ -50,6 +51,7 @@ __all__ = [
     "JointFit",
     "KnownShape",
     "MeasuredBackbone",
+    "OwnFamily",
     "PointStatus",
     "SensorMasses",
     "bootstrap",

@@ -54,6 +54,7 @@ class WithRemainder(AbstractFamily):
         powers, more = len(terms.exponents), len(self.std)
         mine = xp.concatenate([terms.mix[:powers], xp.zeros((2, n)), self.own @ terms.mix[powers:]])
         theirs = xp.concatenate([xp.zeros((powers, more)), self.mix])
+        known = xp.broadcast_to(terms.offset, (len(terms.mix),))
         first = xp.concatenate([terms.prior, xp.zeros((len(terms.prior), more))], axis=1)
         rest = xp.concatenate([xp.zeros((more, n)), xp.diag(1 / self.std)], axis=1)
         return terms._replace(
@@ -62,6 +63,7 @@ class WithRemainder(AbstractFamily):
             knots=self.knots,
             mix=xp.concatenate([mine, theirs], axis=1),
             prior=xp.concatenate([first, rest]),
+            offset=xp.concatenate([known[:powers], xp.zeros(2), self.own @ known[powers:]]),
         )
 
     def coefficients(self) -> tuple[Coefficient, ...]:
@@ -76,8 +78,9 @@ class WithRemainder(AbstractFamily):
 
     @property
     def largest_remainder(self) -> float:
-        """The largest that the family leaves up to the largest amplitude, over the curve there."""
-        at = np.linspace(0.02, 1.0, 50) * float(self.scale)
+        """The largest that the family leaves at measured amplitudes, over the curve there."""
+        knots = np.asarray(self.knots)
+        at = np.sqrt(knots[(knots > 0) & (knots <= 1)]) * float(self.scale)
         whole = self.linearised(at).value
         n = len(self.family.parameters)
         own = self.family.linearised(at, np.asarray(self.parameters)[:n]).value

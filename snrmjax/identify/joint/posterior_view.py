@@ -290,9 +290,8 @@ def _kept(whole: TestPosterior, which: int) -> CurveTerms:
     terms = whole.terms[which]
     if terms.family is None:
         return terms
-    return terms._replace(
-        family=_member(terms.family, whole, which), smooth=whole.remainders[which]
-    )
+    family = terms.family.at(_parameters(whole, which)[: terms.n_own])
+    return terms._replace(family=family, smooth=whole.remainders[which])
 
 
 def _nearest(posterior: TestPosterior, choice: Choice, which: int) -> AbstractFamily:
@@ -320,12 +319,6 @@ def _nearest(posterior: TestPosterior, choice: Choice, which: int) -> AbstractFa
     if inside:
         return min(inside, key=lambda row: (row[1], row[0]))[2]
     return min(tried, key=lambda row: row[0])[2]
-
-
-def _member(family: AbstractFamily, posterior: TestPosterior, which: int) -> AbstractFamily:
-    """The member of a curve's family at the posterior's mean."""
-    own = _parameters(posterior, which)[: len(family.parameters)]
-    return dataclasses.replace(family, parameters=jax.device_put(own))
 
 
 def _of_curve(posterior: TestPosterior, which: int) -> tuple[CurveTerms, slice]:
@@ -367,7 +360,8 @@ def _curve(posterior: TestPosterior, which: int) -> AbstractFamily:
     if terms.family is None:
         scale = jax.device_put(basis.largest)
         return SmoothingSpline.through(basis.knots, parameters, scale, terms.argument, bends)
-    family, n = _member(terms.family, posterior, which), terms.n_own
+    n = terms.n_own
+    family = terms.family.at(parameters[:n])
     if not terms.smooth:
         return family
     functions = basis.values(basis.largest * np.sqrt(basis.knots))[0][:, 1:]
