@@ -98,7 +98,8 @@ def view_of(
     posterior = fit(states, over_sizes=not named, compare_levels=not named, rounds=start)
     if named:
         terms = _terms(posterior, choices, 0), _terms(posterior, choices, 1)
-        start = start._replace(start=posterior.beginning(terms=terms))
+        # A family with its remainder follows states as well as smooth curves do: as many count.
+        start = start._replace(start=posterior.beginning(terms=terms), same_share=True)
         whole = fit(states, compare_levels=False, rounds=start)
         terms = _kept(whole, 0), _kept(whole, 1)
         start = start._replace(start=whole.beginning(terms=terms))

@@ -56,6 +56,7 @@ class Rounds(NamedTuple):
     levels_apart: bool = False
     start: "TestPosterior | None" = None
     crowded: bool = False  # whether knots crowd where states do
+    same_share: bool = False  # whether as many states count as at the start
 
 
 def likeliest_walk(balance: Balance, rounds: Rounds, *, robust: bool, tempered: bool) -> "Walk":
@@ -71,6 +72,8 @@ def likeliest_walk(balance: Balance, rounds: Rounds, *, robust: bool, tempered: 
     ]
     if rounds.start is not None:
         walks = [walks[0].from_(rounds.start)]
+        if rounds.same_share:
+            walks[0].share, walks[0].share_is_known = rounds.start.share, True
     first = min(_TRIED, rounds.most)
     for walk in walks:
         walk.advance(first)
@@ -114,7 +117,7 @@ class Walk:
         self.mean = np.zeros(places.others.stop)
         self.mean[places.damping.start] = 1.0
         self.found: Reached | None = None
-        self.turn, self.still, self.share = 0, False, 1.0
+        self.turn, self.still, self.share, self.share_is_known = 0, False, 1.0, False
 
     def from_(self, start: "TestPosterior") -> "Walk":
         """The same, going on from what was found for other states."""
@@ -198,7 +201,7 @@ class Walk:
         self.still = k > _SETTLED and np.max(np.abs(moved.unknowns - self.mean) / size) < _STILL
         self.point, self.mean, self.errors = point, moved.unknowns, moved.errors
         self.turn += 1
-        if self.tempered:
+        if self.tempered and not self.share_is_known:
             share = share_told_by(left, states.level, states.frequency)
             self.share = max(share, priors.LEAST_SHARE)
         if self.robust:
