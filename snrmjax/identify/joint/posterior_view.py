@@ -95,7 +95,6 @@ def view_of(
     states = more.of(states)
     named = any(choice.kind not in SMOOTH or choice.argument == "velocity" for choice in choices)
     start = rounds._replace(start=posterior)
-    posterior = fit(states, over_sizes=not named, compare_levels=not named, rounds=start)
     if named:
         terms = _terms(posterior, choices, 0), _terms(posterior, choices, 1)
         # A family with its remainder follows states as well as smooth curves do: as many count.
@@ -103,7 +102,7 @@ def view_of(
         whole = fit(states, compare_levels=False, rounds=start)
         terms = _kept(whole, 0), _kept(whole, 1)
         start = start._replace(start=whole.beginning(terms=terms))
-        posterior = fit(states, over_sizes=True, rounds=start)
+    posterior = fit(states, over_sizes=True, rounds=start)
     require_passive(free, posterior.modal_mass[0])
     if "force_gain" in free:
         posterior = _with_common_gain_in_the_force(posterior)
