@@ -279,8 +279,8 @@ def remainders(
     places: Places,
     point: Float[np.ndarray, " hyper"],
 ) -> tuple[bool, bool]:
-    """Which families leave a remainder that noise does not explain: the most probable of none,
-    one or both, where none has less than `priors.REMAINDER_BY_CHANCE`.
+    """Which families leave a remainder that noise does not explain: where none has a probability
+    below `priors.REMAINDER_BY_CHANCE`, whatever the other curve has.
     """
     named = [one.family is not None and one.smooth for one in terms]
     if not any(named):
@@ -296,11 +296,16 @@ def remainders(
         objective = objective_of(equations, states, terms, places, drawn=drawn)
         best = maximised(objective, point, bounds)
         weights[drawn] = laplace_evidence(objective, best, bounds) + log_odds * sum(drawn)
-    none = (not named[0], not named[1])
     total = np.logaddexp.reduce(list(weights.values()))
-    if weights[none] - total > np.log(priors.REMAINDER_BY_CHANCE):
-        return none
-    return max(weights, key=lambda drawn: weights[drawn])
+    first, second = (
+        np.logaddexp.reduce(
+            [weight for drawn, weight in weights.items() if not drawn[k]] or -np.inf
+        )
+        - total
+        < np.log(priors.REMAINDER_BY_CHANCE)
+        for k in range(2)
+    )
+    return bool(first), bool(second)
 
 
 def differing_levels(
