@@ -85,7 +85,7 @@ def sweeps_apart(seen: CheckedStates, states: TestStates, base: Judged) -> Judge
         return None
     parent = np.array([states.level[sweep == k][0] for k in range(sweep.max() + 1)])
     own = states._replace(level=sweep, level_std=(*states.level_std[:2], 0.0, states.level_std[3]))
-    start = base._replace(posterior=base.posterior.with_levels(parent))
+    start = base._replace(posterior=base.posterior.beginning(parent))
     middle = np.array([seen.order[states.level == k].mean() for k in range(states.n_levels)])
     anew = seen.order - middle[states.level]
     alike = (_moving(states, base, along)[0] for along in (rising, anew))

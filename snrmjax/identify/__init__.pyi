@@ -6,6 +6,7 @@ from .calibrate.calibration import calibrate_model
 from .calibrate.inverse_force import inverse_force
 from .coupled.coupled_modes import coupled_modes
 from .curves.families import FAMILIES
+from .curves.own_family import OwnFamily
 from .inference.contributions import contributions
 from .inference.fitted_curves import fitted_values
 from .inference.fitted_response import fitted_response, predicted_resonance
@@ -13,7 +14,7 @@ from .inference.identification import Identification, identify_backbone
 from .inference.optimal_design import (
     next_measurements,
 )
-from .inference.refits import bootstrap
+from .inference.refits import FitInputs, bootstrap, influence, refit
 from .joint.joint_fit import JointFit, corrected_states, fit_jointly
 from .modal.free_decay import fit_free_decay
 from .modal.linear_fit import fit_linear_modes
@@ -44,11 +45,13 @@ __all__ = [
     "Calibration",
     "DayToDay",
     "DrivePoint",
+    "FitInputs",
     "Free",
     "Identification",
     "JointFit",
     "KnownShape",
     "MeasuredBackbone",
+    "OwnFamily",
     "PointStatus",
     "SensorMasses",
     "bootstrap",
@@ -66,6 +69,7 @@ __all__ = [
     "fitted_values",
     "identify_backbone",
     "identify_points",
+    "influence",
     "inverse_force",
     "invert_amplitude_phase",
     "invert_phasor",
@@ -76,6 +80,7 @@ __all__ = [
     "predict_response",
     "predicted_resonance",
     "reference_sensor",
+    "refit",
     "relative_to_base",
     "resonances",
     "scale_modes",

@@ -25,7 +25,7 @@ from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.status import Status
 
 BAND_POINTS = 200
-_FORMAT = 4
+_FORMAT = 5
 
 
 def write_fitted_backbone(

@@ -152,7 +152,7 @@ def readings_of(
     states = states._replace(off_resonance_std=OFF_RESONANCE)
     found = fit_test(states, compare_levels=False, tempered=tempered)
     balance = Balance(
-        *(states, found.basis, found.places, found.units, found.weight),
+        *(states, found.terms, found.places, found.weight),
         np.zeros((len(states.level), 0), complex),
     )
     now, omega = balance.at(found.mean, found.corrections), states.frequency

@@ -4,8 +4,9 @@ Every member of a family is ω̃²(amplitude) in rad²/s² or 2ζ̃ω̃(amplitud
 what its terms contribute at the largest measured amplitude, so that all have the unit of the value.
 """
 
+import dataclasses
 from abc import abstractmethod
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple, Self
 
 import equinox as eqx
 import jax
@@ -45,6 +46,7 @@ class Terms(NamedTuple):
     knots: Float[Array | np.ndarray, " knot"]
     mix: Float[Array | np.ndarray, "basis parameter"]  # from parameters to coefficients
     prior: Float[Array | np.ndarray, "row parameter"]  # what is expected near zero, in its 1σ
+    offset: Float[Array | np.ndarray, "*basis"] | float = 0.0  # of the coefficients, known
 
     @classmethod
     def of_powers(cls, exponents: list[float], n_parameters: int | None = None) -> "Terms":
@@ -85,7 +87,7 @@ def _drawn(x: Any, parameters: Any, terms: Terms, xp: Any) -> _Drawn:
     rising = xp.where(known, exponents * powers / inside, xp.where(exponents == 1, 1.0, 0.0))
     basis = xp.concatenate([xp.where(known, powers, at_rest), bent], axis=-1)
     slopes = xp.concatenate([rising, 2 * x * by_u], axis=-1)
-    coefficients = terms.mix @ parameters
+    coefficients = terms.mix @ parameters + terms.offset
     by_exponent = xp.where(known & terms.is_free, powers * xp.log(inside), 0.0) @ coefficients[:n]
     by_third = terms.largest_exponent * share * (1 - share) * by_exponent
     # Dry friction: its equivalent damping grows without bound towards rest.
@@ -213,11 +215,16 @@ class AbstractFamily(AbstractCurve):
         """See `AbstractCurve`."""
         return packed(self)(amplitude)
 
-    def linearised(self, amplitude: Float[np.ndarray, " point"]) -> Linearised:
-        """See `AbstractCurve`; nothing compiles."""
+    def linearised(
+        self,
+        amplitude: Float[np.ndarray, " point"],
+        parameters: Float[np.ndarray, " parameter"] | None = None,
+    ) -> Linearised:
+        """See `AbstractCurve`; nothing compiles. For other `parameters`, if given."""
         host = jax.tree.map(np.asarray, self)
         scale, terms = float(host.scale), host.terms()
-        drawn = _drawn(np.asarray(amplitude) / scale, host.parameters, terms, np)
+        own = host.parameters if parameters is None else parameters
+        drawn = _drawn(np.asarray(amplitude) / scale, own, terms, np)
         columns = drawn.basis @ terms.mix
         if columns.shape[-1] > 2:
             columns[..., 2] += drawn.by_third
@@ -230,6 +237,15 @@ class AbstractFamily(AbstractCurve):
     def prior_residuals(self) -> Float[Array, " row"]:
         """What is expected to be near zero of a curve, in its own 1σ."""
         return jnp.asarray(self.terms().prior @ self.parameters)
+
+    def at(self, parameters: Float[np.ndarray, " parameter"]) -> Self:
+        """The member of the same family with other parameters."""
+        return dataclasses.replace(self, parameters=jax.device_put(parameters))
+
+    def expected_std(self) -> Float[np.ndarray, " parameter"]:
+        """1σ about zero of what is expected of every parameter; infinite where nothing is."""
+        rows = np.linalg.norm(np.asarray(self.terms().prior), axis=0)
+        return np.divide(1.0, rows, out=np.full(len(rows), np.inf), where=rows > 0)
 
     @property
     def label(self) -> str:
@@ -260,7 +276,7 @@ def packed(family: AbstractFamily, room: int = 0) -> PackedCurve:
     family = family if traced else jax.tree.map(np.asarray, family)
     terms, parameters = family.terms(), family.parameters
     n, k, h = parameters.shape[0], len(terms.exponents), max(len(terms.knots) - 2, 0)
-    size, powers = (-(-most // _SIZE) * _SIZE for most in (max(n, room), k))
+    size, powers = (-(-most // _SIZE) * _SIZE for most in (max(n, room, h), k))
 
     def filled(rows: Any, *lengths: int) -> Array:
         rows = xp.asarray(rows)
@@ -269,6 +285,7 @@ def packed(family: AbstractFamily, room: int = 0) -> PackedCurve:
 
     far = _FAR * np.arange(1.0, size + 3)[len(terms.knots) :]
     mix = [filled(terms.mix[:k], powers, size), filled(terms.mix[k : k + h], size, size)]
+    offset = xp.broadcast_to(terms.offset, (k + h,))
     curve = PackedCurve(
         parameters=filled(parameters, size),
         scale=xp.asarray(family.scale),
@@ -279,6 +296,7 @@ def packed(family: AbstractFamily, room: int = 0) -> PackedCurve:
             knots=xp.concatenate([terms.knots, far]),
             mix=xp.concatenate(mix),
             prior=filled(terms.prior, size, size),
+            offset=xp.concatenate([filled(offset[:k], powers), filled(offset[k:], size)]),
         ),
         of_velocity=xp.asarray(family.argument == "velocity"),
     )

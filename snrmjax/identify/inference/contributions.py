@@ -1,5 +1,6 @@
 """What the uncertainty of a joint fit comes from: shares of every source of error."""
 
+import dataclasses
 from typing import ClassVar, NamedTuple
 
 import jax
@@ -26,6 +27,7 @@ from snrmjax.numerics.compiled import compiled, on_numbers
 from snrmjax.numerics.least_squares import inverse_of
 
 _LISTED = 8  # sources on one screen
+_OWN = ("stiffness off resonance", "damping off resonance", "modal mass")
 _AMPLITUDES = 25  # at which shares are taken
 
 
@@ -113,6 +115,8 @@ def contributions(fit: JointFit) -> Contributions:
     themselves (`fit.unknowns`).
     """
     program, problem = fit.packed(), padded_problem(fit.problem)
+    as_in_bands = dataclasses.replace(problem.prior, level_ratio=jnp.ones(len(LEVEL_ERRORS)))
+    problem = dataclasses.replace(problem, prior=as_in_bands)
     derivatives = _first_order(program.vector, program.unravel, problem)
     p, n, n_levels = len(program.own), len(fit.data.level), fit.data.n_levels
     jacobian, by_error = np.asarray(derivatives[0])[:, program.own], np.asarray(derivatives[1])[:n]
@@ -140,8 +144,9 @@ def contributions(fit: JointFit) -> Contributions:
     for k in range(n_linear):
         column = inverse[:, p - n_linear + k]
         if linear_std[k] > 0:
-            name = "modal mass" if k == n_linear - 1 else f"linear parameter {k + 1}"
-            kind = "modal mass" if k == n_linear - 1 else "linear parameters"
+            name, kind = f"linear parameter {k + 1}", "linear parameters"
+            if k >= n_linear - len(_OWN):
+                name = kind = _OWN[k - n_linear]
             rows.append((name, kind, column[:, None]))
     name = "smoothness of the curves"
     rows.append((name, name, inverse @ _bend_slopes(fit).T))

@@ -46,7 +46,7 @@ def fitted_values(
     covariance = np.einsum("ocp,pq,odq->ocd", curves.slopes, fit.covariance, curves.slopes)
     squared, damping = curves.values.T
     if of_a_new_level:
-        stiffness, dissipation = np.asarray(fit.prior.level)[2:]
+        stiffness, dissipation = np.asarray(fit.prior.new_level)[2:]
         covariance[:, 0, 0] += (squared * stiffness) ** 2
         covariance[:, 1, 1] += (damping * dissipation) ** 2
     return banded_values(curves.velocity, squared, damping, covariance)

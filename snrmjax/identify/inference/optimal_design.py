@@ -25,6 +25,7 @@ from snrmjax.identify.joint.force_balance import (
 from snrmjax.identify.joint.free_unknowns import Unravel, padded_levels, whitened
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.pointwise.snrm import sensed_mode
+from snrmjax.identify.test_model.balance import off_resonance
 from snrmjax.identify.test_model.states import LEVEL_ERRORS
 from snrmjax.numerics.blocks import padded
 from snrmjax.numerics.compiled import compiled, on_numbers
@@ -282,6 +283,8 @@ def _information(fit: JointFit, states: _States) -> Float[np.ndarray, "state par
     share = np.zeros((n, fit.data.share.shape[1]), dtype=fit.data.share.dtype)
     share[:, sensor] = sensed.to_mode(sensor) if np.iscomplexobj(share) else 1.0
     phase = np.exp(1j * float(fit.unknowns.instrument_phase))
+    constant = float(fit.problem.constant_of(fit.unknowns))
+    z = 1j * states.frequency * constant * states.force / states.velocity
     data = BalanceData(
         level=jnp.asarray(states.level),
         frequency=jnp.asarray(states.frequency),
@@ -292,13 +295,15 @@ def _information(fit: JointFit, states: _States) -> Float[np.ndarray, "state par
         std=jnp.broadcast_to(jnp.asarray(std), (n, len(std))),
         weight=jnp.ones(n),
         correction=jax.device_put(no_errors(n)),
+        away=jax.device_put(off_resonance(z, states.frequency)),
         n_levels=n_levels,
         sensor=fit.data.sensor,
     )
     program, n_padded = fit.packed(), len(padded(states.frequency))
     padded_states = jax.tree.map(lambda rows: filled(rows, n_padded, None), data)
     levels = dataclasses.replace(padded_states, n_levels=padded_levels(n_levels))
-    problem = BalanceProblem(levels, fit.modes, fit.prior)
+    of_new = dataclasses.replace(fit.prior, level=fit.prior.new_level)
+    problem = BalanceProblem(levels, fit.modes, of_new)
     by_unknowns = _slopes(program.vector, program.unravel, problem)
     by_vector, by_level = (np.asarray(part)[:n] for part in by_unknowns)
     rows = np.zeros((n, 2, fit.covariance.shape[0] + n_levels * len(LEVEL_ERRORS)))

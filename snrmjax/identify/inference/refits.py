@@ -1,26 +1,277 @@
-"""The unknowns of a joint fit, fitted anew to resampled states."""
+"""The unknowns of a joint fit as a function of all that it was given, with implicit derivatives.
 
+At the optimum the gradient of half the sum of squares, states' errors and priors, is zero: s(θ, y)
+= 0. Its derivative by an input y is dθ/dy = −(∂s/∂θ)⁻¹ ∂s/∂y, however the optimum was found.
+Hyperparameters (magnitude of the noise, of levels' errors, roughness of the curves, weights of
+outliers) are the fit's and count as given.
+Reference: Griewank & Walther, Evaluating Derivatives (2008), ch. 15, doi:10.1137/1.9780898717761.
+"""
+
+import dataclasses
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
-import lineax as lx
 import numpy as np
-import optimistix as optx
-from jaxtyping import Array, Float
+from jax.scipy.linalg import solve_triangular
+from jaxtyping import Array, Bool, Float
 
-from snrmjax.identify.joint.force_balance import BalanceProblem, filled
-from snrmjax.identify.joint.free_unknowns import Unravel, corrected_residuals, padded_problem
+from snrmjax.identify.joint.force_balance import (
+    BalanceProblem,
+    Unknowns,
+    filled,
+    force_balance,
+    nearest_errors,
+)
+from snrmjax.identify.joint.free_unknowns import (
+    Unravel,
+    all_residuals,
+    padded_problem,
+    prior_residuals,
+)
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.numerics.compiled import compiled, on_numbers
 
-SOLVER: optx.AbstractLeastSquaresSolver = optx.LevenbergMarquardt(
-    rtol=1e-10, atol=1e-10, linear_solver=lx.QR()
-)
-_MOST_STEPS = 200  # of a refit
+_MOST_STEPS = 50  # Gauss–Newton iterations of a refit
+_NO_WEIGHT = 1e-10  # of states that count for nothing, against division by zero
+_ARRIVED = 1e-9  # standard deviations, by which the last one moves
 
 
-@on_numbers(
-    "Differentiate `sj.identify.identify_points`, or the fitted curves themselves (`fit.unknowns`)."
-)
+class FitInputs(eqx.Module):
+    """Changes of all that a joint fit was given: relative ones, and of phases in rad.
+
+    Standard deviations, of the noise and of priors, are changed by their logarithm.
+    """
+
+    amplitude: Float[Array, " state"]  # of the recorded velocities
+    phase: Float[Array, " state"]  # of the recorded velocities, rad
+    force: Float[Array, " state"]
+    natural_frequency: Float[Array, " mode"]  # of the linear modes
+    damping_ratio: Float[Array, " mode"]
+    participation: Float[Array, " mode"]
+    noise: Float[Array, " input"]  # 1σ of force, velocity, phase and wandering stiffness
+    level: Float[Array, " error"]  # 1σ of levels' gain, phase, stiffness and damping
+    linear: Float[Array, " deviation"]  # 1σ as `PriorStd.linear`
+    roughness: Float[Array, " curve"]  # 1σ of what is expected of ω̃² and of 2ζ̃ω̃
+
+    @classmethod
+    def none(cls, fit: JointFit) -> "FitInputs":
+        """No change of anything."""
+        states, modes = jnp.zeros(len(fit.data.level)), jnp.zeros(fit.modes.n_modes)
+        linear, four = jnp.zeros(len(fit.prior.linear)), jnp.zeros(4)
+        return cls(
+            *(states, states, states, modes, modes, modes),
+            *(four, four, linear, jnp.zeros(2)),
+        )
+
+
+class _Refit(eqx.Module):
+    """What a fit makes small, by its own unknowns in their 1σ from where they are."""
+
+    vector: Float[Array, " entry"]
+    unit: Float[Array, " entry"]
+    unravel: Unravel
+    problem: BalanceProblem
+    own: tuple[int, ...] = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, fit: JointFit) -> "_Refit":
+        """With room for more states and parameters: few sizes compile."""
+        program = fit.packed()
+        std = np.sqrt(np.diag(program.padded_covariance(fit.covariance)))
+        unit = jax.device_put(np.where(std > 0, std, 1.0))
+        own = tuple(program.own.tolist())
+        return cls(program.vector, unit, program.unravel, padded_problem(fit.problem), own)
+
+    def changed(self, by: FitInputs) -> "_Refit":
+        """The same of other inputs."""
+        data, modes, prior = self.problem.data, self.problem.modes, self.problem.prior
+        room = (0, len(data.level) - len(by.force))
+        turned = jnp.exp(jnp.pad(by.amplitude + 1j * by.phase, room))
+        data = dataclasses.replace(
+            data,
+            velocity=data.velocity * turned,
+            force=data.force * jnp.exp(jnp.pad(by.force, room)),
+            std=data.std * jnp.exp(by.noise),
+        )
+        modes = dataclasses.replace(
+            modes,
+            natural_frequency=modes.natural_frequency * jnp.exp(by.natural_frequency),
+            damping_ratio=modes.damping_ratio * jnp.exp(by.damping_ratio),
+            participation=modes.participation * jnp.exp(by.participation),
+        )
+        prior = dataclasses.replace(
+            prior,
+            level_ratio=prior.level_ratio * jnp.exp(-by.level),
+            linear_ratio=prior.linear_ratio * jnp.exp(-by.linear),
+        )
+        unravel = self.unravel
+        for k, curve in enumerate(("squared_frequency", "modal_damping")):
+
+            def expected(unravel: Unravel, curve: str = curve) -> Array:
+                return getattr(unravel.unknowns, curve).made_of.prior
+
+            rows = expected(unravel) * jnp.exp(-by.roughness[k])
+            unravel = eqx.tree_at(expected, unravel, rows)
+        problem = BalanceProblem(data, modes, prior)
+        return dataclasses.replace(self, problem=problem, unravel=unravel)
+
+    def entries(self, point: Float[Array, " unknown"]) -> Float[Array, " entry"]:
+        """The whole vector at a point, in 1σ from the fit."""
+        own = jnp.array(self.own)
+        return self.vector.at[own].add(point * self.unit[own])
+
+    def solved(
+        self, start: Float[Array, " unknown"]
+    ) -> tuple[Float[Array, " unknown"], Bool[Array, ""]]:
+        """The optimum by Gauss–Newton iterations, and whether it was reached."""
+
+        def step(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+            point, _, count = state
+            errors, weighting = nearest_errors(self.unravel(self.entries(point)), self.problem)
+            at = self.problem.with_data(correction=errors)
+
+            def left(point: Array) -> tuple[Array, Array]:
+                rows = all_residuals(self.entries(point), self.unravel, at, weighting)
+                return rows, rows
+
+            slopes, now = jax.jacfwd(left, has_aux=True)(point)
+            directions, triangle = jnp.linalg.qr(slopes)
+            moved = solve_triangular(triangle, directions.T @ now)
+            return point - moved, jnp.max(jnp.abs(moved)), count + 1
+
+        def goes_on(state: tuple[Array, Array, Array]) -> Array:
+            return (state[1] > _ARRIVED) & (state[2] < _MOST_STEPS)
+
+        first = (start, jnp.array(jnp.inf), jnp.array(0))
+        point, moved, _ = jax.lax.while_loop(goes_on, step, first)
+        return point, moved <= _ARRIVED
+
+    def balances(
+        self, point: Float[Array, " unknown"], errors: Float[Array, "state input"]
+    ) -> Float[Array, "state part"]:
+        """The states' balances with errors in their 1σ."""
+        data = self.problem.data
+        unit = data.std / jnp.sqrt(jnp.maximum(data.weight, _NO_WEIGHT))[:, None]
+        unknowns = self.unravel(self.entries(point))
+        return force_balance(unknowns, self.problem, unit * errors)
+
+    def stationary(
+        self,
+        point: Float[Array, " unknown"],
+        errors: Float[Array, "state input"],
+        multipliers: Float[Array, "state part"],
+    ) -> tuple[Array, Array, Array]:
+        """What is zero at the optimum: slopes of ½ (errors² + priors²) + multipliers · balances by
+        the unknowns and by the errors, and the balances.
+        """
+
+        def lagrangian(point: Array, errors: Array) -> tuple[Array, Array]:
+            left = self.balances(point, errors)
+            expected = prior_residuals(self.unravel(self.entries(point)), self.problem.prior)
+            squares = jnp.sum(expected**2) + jnp.sum(errors**2)
+            return 0.5 * squares + jnp.sum(multipliers * left), left
+
+        by, left = jax.grad(lagrangian, argnums=(0, 1), has_aux=True)(point, errors)
+        return *by, left
+
+
+@eqx.filter_custom_jvp
+def _optimum(problem: _Refit) -> Float[Array, " unknown"]:
+    """The unknowns at the optimum, in 1σ from where they begin."""
+    point, good = problem.solved(jnp.zeros(len(problem.own)))
+    return jnp.where(good, point, jnp.nan)
+
+
+@_optimum.def_jvp
+def _implicit(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    """By the implicit function theorem, errors and multipliers eliminated state by state."""
+    (problem,), (moved,) = primals, tangents
+    point = _optimum(problem)
+    errors = nearest_errors(problem.unravel(problem.entries(point)), problem.problem)[0]
+    std, weight = problem.problem.data.std, problem.problem.data.weight
+    errors = errors * jnp.sqrt(jnp.maximum(weight, _NO_WEIGHT))[:, None]
+    errors = jnp.where(std > 0, errors / jnp.where(std > 0, std, 1.0), 0.0)
+    kinds = jnp.broadcast_to(jnp.eye(errors.shape[1])[:, None], (errors.shape[1], *errors.shape))
+    # Balances by errors: (state, part, input).
+    by_error = jax.vmap(lambda d: jax.jvp(lambda e: problem.balances(point, e), (errors,), (d,))[1])
+    slopes = jnp.moveaxis(by_error(kinds), 0, 2)
+    square = slopes @ slopes.mT
+    multipliers = -jnp.linalg.solve(square, (slopes @ errors[:, :, None]))[:, :, 0]
+
+    def by_errors(direction: Array) -> Array:
+        given = lambda e: problem.stationary(point, e, multipliers)[1]  # noqa: E731
+        return jax.jvp(given, (errors,), (direction,))[1]
+
+    inner = jnp.moveaxis(jax.vmap(by_errors)(kinds), 0, 2)
+    none = jnp.zeros((len(errors), 2, 2))
+    blocks = jnp.block([[inner, slopes.mT], [slopes, none]])
+    hessian, *arms = jax.jacfwd(lambda p: problem.stationary(p, errors, multipliers))(point)
+    arms = jnp.concatenate(arms, axis=1)  # (state, input and part, unknown)
+    solved = jnp.linalg.solve(blocks, arms)
+    whole = hessian - jnp.einsum("sie,sif->ef", arms, solved)
+    right = eqx.filter_jvp(
+        lambda given: given.stationary(point, errors, multipliers), (problem,), (moved,)
+    )[1]
+    of_states = jnp.concatenate(right[1:], axis=1)
+    change = right[0] - jnp.einsum("sie,si->e", solved, of_states)
+    return point, -jnp.linalg.solve(whole, change)
+
+
+def refit(fit: JointFit, changes: FitInputs) -> Unknowns:
+    """The unknowns of a joint fit whose inputs are changed, at the fit's hyperparameters.
+
+    Solves s(θ, y) = 0, the gradient of half the sum of squares that the fit makes small, by
+    Gauss–Newton iterations from the fit's unknowns on; derivatives are implicit, dθ/dy =
+    −(∂s/∂θ)⁻¹ ∂s/∂y, of first order, forward and reverse. Works inside `jax.jit` and `jax.vmap`.
+
+    Arguments: `changes` as `FitInputs.none(fit)`, with other numbers.
+    Returns both curves, functions of amplitude, and everything else that was unknown; NaN where 50
+    iterations are not enough: make the changes smaller.
+    Validity: `fit_jointly` finds magnitudes of noise, levels' errors and roughness anew for other
+    states; here they stay. What several sensors say of one motion is weighted as in the fit.
+    Reference: Griewank & Walther, Evaluating Derivatives (2008), ch. 15,
+    doi:10.1137/1.9780898717761.
+    """
+    return Unravel(fit.unknowns, fit.free)(_own(fit, _optimum(_Refit.of(fit).changed(changes))))
+
+
+def _own(fit: JointFit, point: Array | np.ndarray) -> Array:
+    vector, std = fit.vector()[0], np.sqrt(np.diag(fit.covariance))
+    return vector + point * np.where(std > 0, std, 1.0)
+
+
+class Influence(eqx.Module):
+    """Derivatives of a fit's free unknowns by all that it was given, at its hyperparameters."""
+
+    names: tuple[str, ...] = eqx.field(static=True)  # of the unknowns
+    by: FitInputs  # with one more axis, the first: unknowns
+
+
+@on_numbers("Differentiate `sj.identify.refit`.")
+def influence(fit: JointFit) -> Influence:
+    """How much every measured state, linear parameter and prior moves what a joint fit found.
+
+    Implicit derivatives at the optimum, as those of `refit`. Those of the curves follow from
+    `values_at_displacement(fit, x).slopes @ influence(fit).by.amplitude` and so on.
+
+    Returns derivatives of the free unknowns, in their units (`fit.names`, `fit.units`), by relative
+    changes of inputs and by phases in rad.
+    Not differentiable: differentiate `sj.identify.refit`.
+    """
+    none = FitInputs.none(fit)
+    slopes = _slopes(_Refit.of(fit), none)
+    std = np.sqrt(np.diag(fit.covariance))
+    unit = np.where(std > 0, std, 1.0)[:, None]
+    return Influence(fit.names(), jax.tree.map(lambda rows: np.asarray(rows) * unit, slopes))
+
+
+@compiled
+def _slopes(refit: _Refit, none: FitInputs) -> FitInputs:
+    return jax.jacrev(lambda changes: _optimum(refit.changed(changes)))(none)
+
+
+@on_numbers("Differentiate `sj.identify.refit`.")
 def bootstrap(
     fit: JointFit, n_samples: int = 200, *, seed: int = 0, levels: bool = False
 ) -> Float[np.ndarray, "sample unknown"]:
@@ -29,8 +280,7 @@ def bootstrap(
     With `levels` whole levels are drawn instead, which needs more of them than a curve has
     parameters. A refit that does not converge is a row of NaN.
 
-    Not differentiable: differentiate `snrmjax.identify.identify_points`, or the fitted curves
-    themselves (`fit.unknowns`).
+    Not differentiable: differentiate `sj.identify.refit`.
     """
     rng = np.random.default_rng(seed)
     level = np.asarray(fit.data.level)
@@ -43,30 +293,18 @@ def bootstrap(
             for number in range(fit.data.n_levels):
                 mine = np.flatnonzero(level == number)
                 np.add.at(row, rng.choice(mine, size=mine.size), 1.0)
-    program, problem = fit.packed(), padded_problem(fit.problem)
-    std = np.sqrt(np.diag(program.padded_covariance(fit.covariance)))
-    room, weights = len(problem.data.level), weights * np.asarray(fit.data.weight)
-    rows = jnp.asarray(np.stack([filled(row, room, 0.0) for row in weights]))
-    unit = jnp.asarray(np.where(std > 0, std, 1.0))
-    found = _resampled(program.vector, program.unravel, problem, unit, rows)
-    return np.asarray(found)[:, program.own]
+    refit = _Refit.of(fit)
+    room, weights = len(refit.problem.data.level), weights * np.asarray(fit.data.weight)
+    rows = jax.device_put(np.stack([filled(row, room, 0.0) for row in weights]))
+    points = np.asarray(_resampled(refit, rows))
+    return np.asarray(_own(fit, points))
 
 
 @compiled
-def _resampled(
-    vector: Array, unravel: Unravel, problem: BalanceProblem, unit: Array, weights: Array
-) -> Float[Array, "sample entry"]:
-    """Unknowns that make the residuals of weighted states least; NaN where none are found."""
+def _resampled(refit: _Refit, weights: Array) -> Float[Array, "sample unknown"]:
+    def again(weight: Array) -> Array:
+        weighted = dataclasses.replace(refit, problem=refit.problem.with_data(weight=weight))
+        point, good = weighted.solved(jnp.zeros(len(refit.own)))
+        return jnp.where(good, point, jnp.nan)
 
-    def refit(weight: Array) -> Array:
-        weighted = problem.with_data(weight=weight)
-        solution: optx.Solution = optx.least_squares(
-            lambda y, _: corrected_residuals(vector + y * unit, unravel, weighted),
-            *(SOLVER, jnp.zeros_like(vector)),
-            max_steps=_MOST_STEPS,
-            throw=False,
-        )
-        good = solution.result == optx.RESULTS.successful
-        return jnp.where(good, vector + solution.value * unit, jnp.nan)
-
-    return jax.lax.map(refit, weights)
+    return jax.lax.map(again, weights)

@@ -18,7 +18,7 @@ from jaxtyping import Array, Complex, Float, Int, Shaped
 from snrmjax.identify.curves.family_base import AbstractFamily, PackedCurve
 from snrmjax.identify.pointwise.backbone_points import modal_filter, off_resonance_error_factor
 from snrmjax.identify.pointwise.snrm import participation_of, reference_sensor, sensed_mode
-from snrmjax.identify.test_model.priors import FORCE_TO_VELOCITY
+from snrmjax.identify.test_model.priors import FORCE_TO_VELOCITY, OFF_RESONANCE
 from snrmjax.identify.test_model.states import LEVEL_ERRORS
 from snrmjax.measure.states import SteadyStates, check_phases, relative_errors
 from snrmjax.model.modes import UNSTATED_MODAL_MASS_STD, LinearModes, residual_velocity
@@ -28,6 +28,9 @@ from snrmjax.numerics.compiled import as_numpy, compiled
 
 STATE_ERRORS = ("force", "velocity", "phase", "stiffness")
 """What every state may err in at random, relative or in rad; stiffness is never stated."""
+
+EXPONENTS = slice(-3, -1)
+"""Where in `Unknowns.linear` the exponents of the forcing frequency stand."""
 
 _FEWEST_STATES = 48  # that programs have room for
 _STEPS = 4  # towards every state's most likely errors
@@ -46,6 +49,7 @@ class BalanceData(eqx.Module):
     std: Float[Array, "state input"]  # of `STATE_ERRORS`
     weight: Float[Array, " state"]  # 1, or less for an outlier under the robust loss
     correction: Float[Array, "state input"]  # of `STATE_ERRORS`, what a fit adds to every record
+    away: Float[Array, " state"]  # ln of the forcing frequency over the record's natural one
     n_levels: int = eqx.field(static=True)
     sensor: int = eqx.field(static=True)  # the one whose motion is meant
 
@@ -68,13 +72,20 @@ class Unknowns(eqx.Module):
 class PriorStd(eqx.Module):
     """Prior standard deviations (1σ) of the unknowns that have one."""
 
-    level: Float[Array, " error"]  # of `LEVEL_ERRORS`, stated or estimated
-    # Of the residual modes' natural frequencies (rad/s) and damping ratios, then, relative, of the
-    # modal mass of the mode of interest.
+    level: Float[Array, " error"]  # of `LEVEL_ERRORS`, stated or as the covariance has them
+    # Of the residual modes' natural frequencies (rad/s) and damping ratios, then of the exponents
+    # with which both curves go with the forcing frequency (`priors.OFF_RESONANCE`), and, relative,
+    # of the modal mass of the mode of interest.
     linear: Float[Array, " deviation"]
     # 1 where a gain of the force is free: gains of levels are then the force's, and the measured
     # velocities stay what they are; 0 where the force is known.
     gain_of_force: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.asarray(0.0))
+    # Both over those with which the unknowns were found: few levels tell badly by how much levels
+    # differ, and the covariance has them wider (Student's t).
+    level_ratio: Float[Array, " error"] = eqx.field(default_factory=lambda: jnp.ones(4))
+    linear_ratio: Float[Array, "*deviation"] = eqx.field(default_factory=lambda: jnp.ones(()))
+    # Of a further level.
+    new_level: Float[Array, " error"] = eqx.field(default_factory=lambda: jnp.zeros(4))
 
 
 class BalanceProblem(eqx.Module):
@@ -141,7 +152,8 @@ def stated_prior(
     stated = modes.modal_mass_std
     mass = UNSTATED_MODAL_MASS_STD if stated is None else stated.item(modes.mode_of_interest)
     each = (modes.natural_frequency_std, modes.damping_ratio_std)
-    linear = [*(np.asarray(std)[keep] for std in each), [0.0 if "force_gain" in free else mass]]
+    own = [*OFF_RESONANCE, 0.0 if "force_gain" in free else mass]
+    linear = [*(np.asarray(std)[keep] for std in each), own]
     of_force = float("force_gain" in free)
     values = map(np.asarray, (level_std, np.concatenate(linear), of_force))
     return PriorStd(*jax.device_put(list(values)))
@@ -186,6 +198,7 @@ def balance_data(
         "std": errors[keep],
         "weight": np.ones(int(keep.sum())),
         "correction": no_errors(int(keep.sum())),
+        "away": np.zeros(int(keep.sum())),
     }
     # All at once: one by one they compile, a copy of every shape.
     measured = BalanceData(**jax.device_put(columns), n_levels=len(levels), sensor=r)
@@ -303,8 +316,11 @@ def force_balance(
     level = (unknowns.level * problem.prior.level)[data.level]
     squared = unknowns.squared_frequency(motion.amplitude(unknowns.squared_frequency))
     damping = unknowns.modal_damping(motion.amplitude(unknowns.modal_damping))
-    squared = squared * (1 + level[:, 2] + error[:, 3])
-    damping = damping * (1 + level[:, 3])
+    softer, faster = (unknowns.linear * problem.prior.linear)[EXPONENTS]
+    at_rest = unknowns.squared_frequency(jnp.zeros(()))
+    added = jnp.where(jnp.isfinite(at_rest), squared - at_rest, squared)
+    squared = squared * (1 + level[:, 2] + error[:, 3]) + softer * data.away * added
+    damping = damping * (1 + level[:, 3] + faster * data.away)
     omega = data.frequency
     stiffness = squared - omega**2 + 1j * omega * damping
     constant = problem.constant_of(unknowns) * data.participation

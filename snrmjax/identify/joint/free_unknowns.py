@@ -15,11 +15,11 @@ from snrmjax.identify.curves.family_base import packed
 from snrmjax.identify.joint.force_balance import (
     BalanceData,
     BalanceProblem,
+    PriorStd,
     Unknowns,
     Weighting,
     filled,
     force_balance,
-    nearest_errors,
     with_room,
 )
 from snrmjax.identify.test_model.states import LEVEL_ERRORS
@@ -157,7 +157,8 @@ def named_unknowns(
         ),
         *((name, unit) for name, unit in measurement.items() if name in free),
         *((f"level_{k}.{e}", "std") for k in levels for e in LEVEL_ERRORS),
-        *((f"linear_{k}", "std") for k in range(unknowns.linear.shape[0] - 1)),
+        *((f"linear_{k}", "std") for k in range(unknowns.linear.shape[0] - 3)),
+        *((name, "std") for name in ("stiffness_off_resonance", "damping_off_resonance")),
         ("modal_mass", "std"),
     )
 
@@ -183,18 +184,12 @@ def all_residuals(
     """Whitened residuals of the states, then the priors of levels, linear parameters and curves."""
     unknowns = unravel(vector)
     points = whitened(unknowns, problem, weighting).reshape(-1)
+    return jnp.concatenate([points, prior_residuals(unknowns, problem.prior)])
+
+
+def prior_residuals(unknowns: Unknowns, prior: PriorStd) -> Float[Array, " residual"]:
+    """What is expected near zero of levels, linear parameters and curves, in its own 1σ."""
     curves = (unknowns.squared_frequency, unknowns.modal_damping)
-    priors = [unknowns.level.reshape(-1), unknowns.linear, *(c.prior_residuals() for c in curves)]
-    return jnp.concatenate([points, *priors])
-
-
-def corrected_residuals(
-    vector: Array, unravel: Unravel, problem: BalanceProblem
-) -> Float[Array, " residual"]:
-    """`all_residuals`, the states corrected for their most likely errors.
-
-    The residuals are then those errors in units of their 1σ, whose slopes need no derivative of
-    the errors themselves.
-    """
-    errors, weighting = nearest_errors(unravel(jax.lax.stop_gradient(vector)), problem)
-    return all_residuals(vector, unravel, problem.with_data(correction=errors), weighting)
+    level = (unknowns.level * prior.level_ratio).reshape(-1)
+    linear = unknowns.linear * prior.linear_ratio
+    return jnp.concatenate([level, linear, *(curve.prior_residuals() for curve in curves)])

@@ -15,9 +15,7 @@ from snrmjax.identify.checks.residual_autocorrelation import (
 )
 from snrmjax.identify.curves.families import parse_family
 from snrmjax.identify.curves.splines import SmoothingSpline
-from snrmjax.identify.joint.family_fit import FamilyFit, FitStatus, fit_families
 from snrmjax.identify.joint.force_balance import (
-    STATE_ERRORS,
     BalanceData,
     BalanceProblem,
     Motion,
@@ -39,6 +37,7 @@ from snrmjax.identify.joint.free_unknowns import (
 from snrmjax.identify.joint.notes import (
     NoiseEstimate,
     notes_on_autocorrelation,
+    notes_on_families,
     notes_on_level_errors,
     notes_on_modal_mass,
     notes_on_noise,
@@ -46,7 +45,6 @@ from snrmjax.identify.joint.notes import (
     notes_on_stated_errors,
 )
 from snrmjax.identify.joint.posterior_view import (
-    SMOOTH,
     view_of,
     viewed_covariance,
     viewed_unknowns,
@@ -60,7 +58,19 @@ from snrmjax.numerics.blocks import on_one_core
 from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
+from snrmjax.numerics.status import Status
 from snrmjax.numerics.units import HERTZ
+
+
+class FitStatus(Status):
+    """How a joint fit ended."""
+
+    CONVERGED = 0, "converged"
+    NOT_SETTLED = (
+        1,
+        "not converged: fit and noise estimate still changed one another in the last round",
+    )
+
 
 _MOVED = 2.0  # standard deviations of a level's error, from which on the fit says so
 
@@ -71,7 +81,7 @@ class JointFit(AbstractResult):
     `covariance` belongs to the free unknowns in the order of `names`, and includes the correlation
     of neighbouring states' residuals. `noise.level_std` belongs
     to `LEVEL_ERRORS`, stated or estimated: what was estimated from few levels counts for more in
-    `prior`, as Student's t does.
+    `prior` and in the covariance, as Student's t does.
     """
 
     coordinates = ("parameter",)
@@ -254,12 +264,15 @@ def fit_jointly(
     The model of a test (`identify.test_model`) says how smooth the curves are, how large the noise
     is and by how much levels differ in gain, phase, stiffness and damping, each with a stated prior
     and by the largest probability of the data; smooth curves, their bands and all else are its
-    posterior. Families by name start there and are fitted to the balance by Levenberg–Marquardt.
-    Both correct the states for their most likely errors (orthogonal distance regression), and take
-    other modes' frequencies and dampings for unknowns with their stated errors. Where states exceed
-    the stated noise the bands are wider for it. The modal mass is an unknown with its stated 1σ
-    (`LinearModesStd.modal_mass`); where none is stated it is the model's, unless states away from
-    resonance ask for another. A free force gain is one with it.
+    posterior. A family by name takes the place of smooth functions in it, with a smooth remainder:
+    what its terms leave is a curve too, whose magnitude is exactly zero where noise explains it
+    (`family_leaves` among the notes where it does not, and the bands include it).
+    States are corrected for their most likely errors (orthogonal distance regression); other modes'
+    frequencies and dampings, and how both curves go with the forcing frequency at equal amplitude,
+    are unknowns too. Where states exceed the stated noise the bands are wider for it. The modal
+    mass is an unknown with its stated 1σ (`LinearModesStd.modal_mass`); where none is stated it is
+    the model's, unless states away from resonance ask for another. A free force gain is one with
+    it.
 
     Arguments: `backbone` and `damping` name a family of `FAMILIES`, with a size if wanted
     ("polynomial:2", "spline:5") and the amplitude ("polynomial:2@velocity"); what is left out is
@@ -271,9 +284,8 @@ def fit_jointly(
     first two.
     Returns a `JointFit`, whose `status` says whether it converged.
     Raises `ValueError` for too few states, an unknown family or name, a family with more parameters
-    than there are data, a gain, an offset or a phase that the data do not determine, a fit that
-    needs a modal mass or a damping below zero, and one whose residuals become infinite or
-    undefined.
+    than there are data, a gain, an offset or a phase that the data do not determine, and a fit that
+    needs a modal mass or a damping below zero.
     Validity: one nonlinear mode whose ω̃ and 2ζ̃ω̃ are functions of amplitude alone.
     Not differentiable: differentiate `snrmjax.identify.identify_points`, or the fitted curves
     themselves (`fit.unknowns`).
@@ -305,36 +317,28 @@ def fit_jointly(
             f"and {max(knots)}."
         )
     problem = BalanceProblem(measured, modes, stated_prior(modes, level_std, released))
-    view = view_of(problem, released, stated, robust=robust, knots=max(knots, default=None))
-    posterior, unknowns = view.posterior, viewed_unknowns(view, choices)
-    best = FamilyFit(
-        *(unknowns, viewed_covariance(view), view.problem, view.noise, posterior.residuals),
-        FitStatus.CONVERGED if posterior.settled else FitStatus.NOT_SETTLED,
-    )
-    if not all(choice.kind in SMOOTH and choice.argument != "velocity" for choice in choices):
-        own = posterior.states.errors
-        errors = np.column_stack([own, np.zeros((n, len(STATE_ERRORS) - own.shape[1]))])
-        best = fit_families(
-            *(unknowns, view.problem, released, view.noise, errors), believed=view.believed
-        )
+    size = max(knots, default=None)
+    view = view_of(problem, choices, released, stated, robust=robust, knots=size)
+    posterior, unknowns = view.posterior, viewed_unknowns(view)
+    covariance = viewed_covariance(view)
     level, frequency = np.asarray(measured.level), np.asarray(measured.frequency)
-    autocorrelation = residual_autocorrelation(best.residuals, along_resonance(level, frequency))
+    autocorrelation = residual_autocorrelation(
+        posterior.residuals, along_resonance(level, frequency)
+    )
     # What levels differ by is said where the data ask for it or the fit made use of it, and stays
     # possible elsewhere.
-    differ = np.array(posterior.differing) | _moved(best)
-    level_std_said = np.where(level_std > 0, level_std, np.where(differ, best.noise.level_std, 0.0))
+    differ = np.array(posterior.differing) | _moved(unknowns, covariance)
+    said = np.where(level_std > 0, level_std, np.where(differ, view.noise.level_std, 0.0))
     fit = JointFit(
-        unknowns=best.unknowns,
-        covariance=best.covariance,
-        problem=best.problem,
-        noise=dataclasses.replace(
-            best.noise, level_std=level_std_said, autocorrelation=autocorrelation
-        ),
-        residuals=best.residuals,
+        unknowns=unknowns,
+        covariance=covariance,
+        problem=view.problem,
+        noise=dataclasses.replace(view.noise, level_std=said, autocorrelation=autocorrelation),
+        residuals=posterior.residuals,
         drive_known_only=driven,
         free=released,
         notes=(),
-        status=best.status,
+        status=FitStatus.CONVERGED if posterior.settled else FitStatus.NOT_SETTLED,
         level_numbers=numbers,
     )
     notes = notes_on_instruments(fit, LEVEL_ERRORS)
@@ -385,7 +389,7 @@ def _notes(
         notes.append(Fact("fit_not_converged", reason=reason, named=named, **is_stated))
     level, n_levels = np.asarray(fit.data.level), fit.data.n_levels
     notes += notes_on_noise(
-        fit.noise, frequency_jitter_std, stated, np.asarray(fit.prior.level), n_levels
+        fit.noise, frequency_jitter_std, stated, np.asarray(fit.prior.new_level), n_levels
     )
     if np.any((stated == 0) & (fit.noise.level_std > 0)):
         shifts = np.asarray(fit.unknowns.level) * np.asarray(fit.prior.level)
@@ -398,14 +402,17 @@ def _notes(
         *notes,
         *notes_on_stated_errors(np.asarray(fit.unknowns.level), stated),
         *notes_on_modal_mass(fit.unknowns, fit.problem, fit.covariance),
+        *notes_on_families(fit.unknowns),
         *notes_on_autocorrelation(fit.noise.autocorrelation),
         *notes_on_reach(fit.motion(), level),
     ]
 
 
-def _moved(fit: FamilyFit) -> Bool[np.ndarray, " error"]:
+def _moved(
+    unknowns: Unknowns, covariance: Float[np.ndarray, "unknown unknown"]
+) -> Bool[np.ndarray, " error"]:
     """In which kinds of error a fit moved a level by more than chance does."""
-    level, end = np.asarray(fit.unknowns.level), len(fit.covariance) - len(fit.unknowns.linear)
-    std = np.sqrt(np.diag(fit.covariance))[end - level.size : end].reshape(level.shape)
+    level, end = np.asarray(unknowns.level), len(covariance) - len(unknowns.linear)
+    std = np.sqrt(np.diag(covariance))[end - level.size : end].reshape(level.shape)
     beyond = np.abs(level) > _MOVED * np.where(std > 0, std, np.inf)
     return np.any(beyond, axis=0)

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import chdtri, ndtri
 
+from snrmjax.identify.curves.remainder import WithRemainder
 from snrmjax.identify.joint.force_balance import BalanceProblem, Motion, Unknowns
 from snrmjax.identify.test_model.states import LEVEL_ERRORS
 from snrmjax.numerics.facts import Fact
@@ -105,6 +106,25 @@ def notes_on_modal_mass(
     masses = {"found_kg": mass, "std_kg": std, "model_kg": model, "model_std": prior}
     stated, beyond = problem.modes.modal_mass_std is not None, bool(away > _BREACH * prior)
     return [Fact("modal_mass_moved", **masses, std_stated=stated, beyond_std=beyond)]
+
+
+def notes_on_families(unknowns: Unknowns) -> list[Fact]:
+    """Which families leave more of a curve than noise explains."""
+    curves = {
+        "natural frequency": unknowns.squared_frequency,
+        "damping": unknowns.modal_damping,
+    }
+    return [
+        Fact(
+            "family_leaves",
+            curve=name,
+            family=curve.family.words,
+            # Of ω̃², of which a frequency has half.
+            largest=curve.largest_remainder * (0.5 if name == "natural frequency" else 1.0),
+        )
+        for name, curve in curves.items()
+        if isinstance(curve, WithRemainder)
+    ]
 
 
 def notes_on_autocorrelation(correlation: Float[np.ndarray, " part"]) -> list[Fact]:

@@ -11,9 +11,11 @@ from scipy.optimize import nnls
 
 from snrmjax.identify.checks.instruments import require_passive
 from snrmjax.identify.curves.families import ARGUMENTS, FAMILIES, Choice
-from snrmjax.identify.curves.family_base import AbstractFamily, Argument
+from snrmjax.identify.curves.family_base import AbstractFamily
+from snrmjax.identify.curves.remainder import WithRemainder
 from snrmjax.identify.curves.splines import SmoothingSpline
 from snrmjax.identify.joint.force_balance import (
+    EXPONENTS,
     STATE_ERRORS,
     BalanceProblem,
     Unknowns,
@@ -21,8 +23,10 @@ from snrmjax.identify.joint.force_balance import (
 )
 from snrmjax.identify.joint.notes import NoiseEstimate
 from snrmjax.identify.joint.state_noise import StateNoise, noise_of_states
-from snrmjax.identify.test_model.curve_basis import MOST_KNOTS
-from snrmjax.identify.test_model.hyper import MASS, OFFSET, PHASE
+from snrmjax.identify.test_model.balance import off_resonance
+from snrmjax.identify.test_model.curve_basis import MOST_KNOTS, CurveBasis
+from snrmjax.identify.test_model.curve_terms import CurveTerms
+from snrmjax.identify.test_model.hyper import MASS, OFFSET, PHASE, WITH_FREQUENCY
 from snrmjax.identify.test_model.posterior import TestPosterior, fit_test, students_factor
 from snrmjax.identify.test_model.priors import OFF_RESONANCE
 from snrmjax.identify.test_model.states import TestStates
@@ -48,21 +52,20 @@ class View(NamedTuple):
     noise: NoiseEstimate
     more_noise: StateNoise  # of the states, of kinds that nobody stated
 
-    @property
-    def believed(self) -> bool:
-        """Whether the noise is stated, and not contradicted by the states."""
-        return self.noise.stated and not self.noise.exceeded
-
 
 def view_of(
     problem: BalanceProblem,
+    choices: tuple[Choice, Choice],
     free: tuple[str, ...],
     stated: bool,
     *,
     robust: bool,
     knots: int | None = None,
 ) -> View:
-    """The posterior of a joint fit's states.
+    """The posterior of a joint fit's states, with curves of the families asked for.
+
+    A family by name begins where it is nearest to the smooth curves, which the states are fitted
+    by first.
 
     Stated noise that the states exceed widens the bands by as much. A modal mass of which
     nobody stated an error is the model's, unless the states ask for another; a frequency that
@@ -90,7 +93,16 @@ def view_of(
         posterior = fit(states, compare_levels=False, rounds=rounds._replace(start=posterior))
     more = noise_of_states(posterior)
     states = more.of(states)
-    posterior = fit(states, over_sizes=True, rounds=rounds._replace(start=posterior))
+    named = any(choice.kind not in SMOOTH or choice.argument == "velocity" for choice in choices)
+    start = rounds._replace(start=posterior)
+    if named:
+        terms = _terms(posterior, choices, 0), _terms(posterior, choices, 1)
+        # A family with its remainder follows states as well as smooth curves do: as many count.
+        start = start._replace(start=posterior.beginning(terms=terms), same_share=True)
+        whole = fit(states, compare_levels=False, rounds=start)
+        terms = _kept(whole, 0), _kept(whole, 1)
+        start = start._replace(start=whole.beginning(terms=terms))
+    posterior = fit(states, over_sizes=True, rounds=start)
     require_passive(free, posterior.modal_mass[0])
     if "force_gain" in free:
         posterior = _with_common_gain_in_the_force(posterior)
@@ -105,15 +117,25 @@ def view_of(
         size * posterior.states.errors,
         posterior.corrections,
     )
-    unstated = students_factor(posterior.states.n_levels - 1) * noise.level_std
-    level = np.where(np.asarray(problem.prior.level) > 0, problem.prior.level, unstated)
+    new_level = np.where(
+        np.array(states.level_std) > 0,
+        states.level_std,
+        students_factor(states.n_levels - 1) * noise.level_std,
+    )
+    ratio = posterior.level_std / noise.level_std
+    of_levels = map(jax.device_put, (posterior.level_std, ratio, new_level))
+    z = 1j * states.frequency * states.constant * states.force / states.velocity
     problem = dataclasses.replace(
         problem.with_data(
             std=jax.device_put(errors),
             weight=jax.device_put(posterior.weight),
             correction=jax.device_put(corrections),
+            away=jax.device_put(off_resonance(z, states.frequency)),
         ),
-        prior=dataclasses.replace(problem.prior, level=jax.device_put(level)),
+        prior=dataclasses.replace(
+            problem.prior,
+            **dict(zip(("level", "level_ratio", "new_level"), of_levels, strict=True)),
+        ),
     )
     posterior = posterior._replace(covariance=wider**2 * posterior.covariance)
     return View(posterior, problem, guess, free, noise, more)
@@ -129,8 +151,9 @@ def _with_common_gain_in_the_force(posterior: TestPosterior) -> TestPosterior:
     common = float(np.mean(posterior.level_errors[:, 0]))
     mean[places.levels[:, 0]] -= common
     mean[MASS] = (1 + mean[MASS]) * np.exp(common) - 1
-    for scaled in (places.stiffness, places.damping, OFFSET):
-        mean[scaled] *= np.exp(common)
+    mean[OFFSET] *= np.exp(common)
+    for terms, functions in zip(posterior.terms, (places.stiffness, places.damping), strict=True):
+        mean[functions] *= np.where(terms.scaled, np.exp(common), 1.0)
     return posterior._replace(mean=mean)
 
 
@@ -141,15 +164,16 @@ def _test_states(
     data, prior = problem.data, problem.prior
     force = abs(guess) * np.asarray(data.force)
     spread = np.asarray(prior.linear)
+    others = spread[: EXPONENTS.start]
 
     def beside(deviation: np.ndarray) -> Complex[np.ndarray, " state"]:
-        return velocity_of_others(problem, np.append(deviation, 0.0), force)
+        return velocity_of_others(problem, np.append(deviation, np.zeros(3)), force)
 
     constant = float(problem.modal_constant)
     sign = np.sign(constant)
-    known = np.zeros(len(spread) - 1)
+    known = np.zeros(len(others))
     velocity = np.asarray(data.velocity) * np.exp(-1j * np.angle(guess)) - beside(known)
-    moved = [beside(unit) - beside(known) for unit in np.eye(len(known))[spread[:-1] > 0]]
+    moved = [beside(unit) - beside(known) for unit in np.eye(len(known))[others > 0]]
     return TestStates(
         level=np.asarray(data.level),
         frequency=np.asarray(data.frequency),
@@ -168,19 +192,20 @@ def _test_states(
     )
 
 
-def viewed_unknowns(view: View, choices: tuple[Choice, Choice]) -> Unknowns:
-    """Unknowns of a joint fit at the posterior's mean, with curves of the families asked for."""
+def viewed_unknowns(view: View) -> Unknowns:
+    """Unknowns of a joint fit at the posterior's mean."""
     posterior, prior = view.posterior, view.problem.prior
     level, spread = np.asarray(prior.level), np.asarray(prior.linear)
     mass = posterior.modal_mass[0]
     gain, is_free = abs(view.gain), "force_gain" in view.free
     linear = np.zeros(len(spread))
-    linear[:-1][spread[:-1] > 0] = posterior.mean[posterior.places.others]
+    linear[np.flatnonzero(spread[: EXPONENTS.start] > 0)] = posterior.mean[posterior.places.others]
+    linear[EXPONENTS] = posterior.mean[WITH_FREQUENCY] / spread[EXPONENTS]
     if spread[-1] > 0:
         linear[-1] = np.log(mass) / spread[-1]
     return Unknowns(
-        squared_frequency=_curve(posterior, choices[0], 0),
-        modal_damping=_curve(posterior, choices[1], 1),
+        squared_frequency=_curve(posterior, 0),
+        modal_damping=_curve(posterior, 1),
         log_force_gain=jax.device_put(np.log(gain / mass) if is_free else 0.0),
         force_offset=jax.device_put(posterior.force_offset * (gain / mass if is_free else 1.0)),
         instrument_phase=jax.device_put(float(np.angle(view.gain)) + posterior.instrument_phase),
@@ -195,11 +220,9 @@ def _sign_of_gain(view: View) -> Float[np.ndarray, " error"]:
 
 
 def viewed_covariance(view: View) -> Float[np.ndarray, "unknown unknown"]:
-    """Covariance of a fit's free unknowns, with the posterior's own curves: in their order."""
+    """Covariance of a fit's free unknowns, in their order."""
     posterior, prior = view.posterior, view.problem.prior
     places, mass = posterior.places, posterior.modal_mass[0]
-    knots = posterior.basis.largest * np.sqrt(posterior.basis.knots)
-    curves = posterior.slopes(knots)
     n = len(posterior.mean)
 
     def by(**places_and_slopes: float) -> np.ndarray:
@@ -222,10 +245,12 @@ def viewed_covariance(view: View) -> Float[np.ndarray, "unknown unknown"]:
     )
     spread = np.asarray(prior.linear)
     linear = np.zeros((len(spread), n))
-    linear[np.flatnonzero(spread[:-1] > 0), np.arange(n)[places.others]] = 1.0
+    others = np.flatnonzero(spread[: EXPONENTS.start] > 0)
+    linear[others, np.arange(n)[places.others]] = 1.0
+    linear[EXPONENTS, WITH_FREQUENCY] = np.diag(1 / spread[EXPONENTS])
     if spread[-1] > 0:
         linear[-1] = by(mass=1 / (mass * spread[-1]))
-    rows = [curves[:, 0], curves[:, 1]]
+    rows = [_slopes(posterior, 0), _slopes(posterior, 1)]
     rows += [row[None] for name, row in measurement.items() if name in view.free]
     slopes = np.concatenate([*rows, levels, linear])
     covariance = slopes @ posterior.covariance @ slopes.T
@@ -244,10 +269,33 @@ def _noise_of(posterior: TestPosterior, stated: bool) -> NoiseEstimate:
     return NoiseEstimate(noise, std, np.array(posterior.hyper.level_std), stated)
 
 
-def _curve(posterior: TestPosterior, choice: Choice, which: int) -> AbstractFamily:
-    """A curve of the family asked for, near what the posterior has."""
-    if choice.kind in SMOOTH:
-        return _smooth(posterior, choice.argument or "displacement", which)
+def _terms(posterior: TestPosterior, choices: tuple[Choice, Choice], which: int) -> CurveTerms:
+    """The terms of a curve as they were asked for, near what the smooth posterior has."""
+    terms, choice = posterior.terms[which], choices[which]
+    family = None
+    if choice.kind not in SMOOTH:
+        family = _nearest(posterior, choice, which)
+    argument = choice.argument or "displacement" if family is None else family.argument
+    basis = terms.basis
+    if argument == "velocity":
+        displacement = basis.largest * np.sqrt(basis.knots)
+        speed = displacement * np.sqrt(posterior.curves(displacement).squared_frequency)
+        largest = float(np.max(np.abs(posterior.states.velocity)))
+        basis = CurveBasis.at(largest, (speed / largest) ** 2)
+    return CurveTerms(basis, terms.unit, argument, family)
+
+
+def _kept(whole: TestPosterior, which: int) -> CurveTerms:
+    """The terms of a curve, of which a family leaves no remainder that noise explains."""
+    terms = whole.terms[which]
+    if terms.family is None:
+        return terms
+    family = terms.family.at(_parameters(whole, which)[: terms.n_own])
+    return terms._replace(family=family, smooth=whole.remainders[which])
+
+
+def _nearest(posterior: TestPosterior, choice: Choice, which: int) -> AbstractFamily:
+    """A member of the family asked for, near the smooth curve."""
     x = posterior.states.amplitude
     curves = posterior.curves(x)
     values = (curves.squared_frequency, curves.modal_damping)[which]
@@ -273,19 +321,52 @@ def _curve(posterior: TestPosterior, choice: Choice, which: int) -> AbstractFami
     return min(tried, key=lambda row: row[0])[2]
 
 
-def _smooth(posterior: TestPosterior, argument: Argument, which: int) -> SmoothingSpline:
-    """The posterior's own curve, with bends of the sizes that it found."""
-    basis = posterior.basis
-    displacement = basis.largest * np.sqrt(basis.knots)
-    curves = posterior.curves(displacement)
-    values = (curves.squared_frequency, curves.modal_damping)[which]
-    knots, scale = basis.knots, basis.largest
-    if argument == "velocity":
-        speed = displacement * np.sqrt(curves.squared_frequency)
-        knots, scale = (speed / speed[-1]) ** 2, float(speed[-1])
-    size = posterior.units[which] * posterior.hyper.bends[which] / posterior.modal_mass[0]
-    std = size * np.exp(basis.directions @ posterior.hyper.along)
-    return SmoothingSpline.through(knots, values, jax.device_put(scale), argument, std)
+def _of_curve(posterior: TestPosterior, which: int) -> tuple[CurveTerms, slice]:
+    places = posterior.places
+    return posterior.terms[which], (places.stiffness, places.damping)[which]
+
+
+def _parameters(posterior: TestPosterior, which: int) -> Float[np.ndarray, " parameter"]:
+    """A curve's parameters: a family's and its remainder's, or values at knots."""
+    terms, functions = _of_curve(posterior, which)
+    own, mass = posterior.mean[functions], posterior.modal_mass[0]
+    if terms.family is not None:
+        return terms.units * own / np.where(terms.scaled, mass, 1.0)
+    reference = posterior.places.reference if which == 0 else 0.0
+    return terms.curve(terms.basis.largest * np.sqrt(terms.basis.knots), own)[0] / mass + reference
+
+
+def _slopes(posterior: TestPosterior, which: int) -> Float[np.ndarray, "parameter unknown"]:
+    """Derivatives of `_parameters` by all unknowns."""
+    terms, functions = _of_curve(posterior, which)
+    own, mass = posterior.mean[functions], posterior.modal_mass[0]
+    columns = np.diag(terms.units)
+    if terms.family is None:
+        columns = terms.columns(terms.basis.largest * np.sqrt(terms.basis.knots), own)
+    scaled = terms.scaled if terms.family is not None else np.ones(len(columns), dtype=bool)
+    columns = columns / np.where(scaled, mass, 1.0)[:, None]
+    rows = np.zeros((len(columns), len(posterior.mean)))
+    rows[:, functions] = columns
+    rows[:, MASS] = -np.where(scaled, columns @ own, 0.0) / mass
+    return rows
+
+
+def _curve(posterior: TestPosterior, which: int) -> AbstractFamily:
+    """A curve as the posterior has it: its smooth functions are of the sizes that it found."""
+    terms, hyper = posterior.terms[which], posterior.hyper
+    basis, parameters = terms.basis, _parameters(posterior, which)
+    size = terms.unit * hyper.bends[which] / posterior.modal_mass[0]
+    bends = size * np.exp(basis.directions @ hyper.along)
+    if terms.family is None:
+        scale = jax.device_put(basis.largest)
+        return SmoothingSpline.through(basis.knots, parameters, scale, terms.argument, bends)
+    n = terms.n_own
+    family = terms.family.at(parameters[:n])
+    if not terms.smooth:
+        return family
+    functions = basis.values(basis.largest * np.sqrt(basis.knots))[0][:, 1:]
+    std = np.append(size * basis.reach, bends)
+    return WithRemainder.of(family, basis.knots, functions, parameters[n:], std)
 
 
 def _complex_gain(problem: BalanceProblem) -> complex:

@@ -81,7 +81,7 @@ def new_level(
     Not differentiable: differentiate `snrmjax.identify.identify_points`, or the fitted curves
     themselves (`fit.unknowns`).
     """
-    std = np.array(fit.prior.level, dtype=float)
+    std = np.array(fit.prior.new_level, dtype=float)
     forced = None if at is None else fit.modes.forced_at(at)
     new = NewLevel(std, another_day=day is not None, forced=forced)
     as_in_test = force * abs(new.over_test(fit))

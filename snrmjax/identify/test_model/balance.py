@@ -9,10 +9,10 @@ Reference: Boggs, Byrd & Schnabel, SIAM J. Sci. Stat. Comput. 8 (1987) 1052, doi
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Bool, Complex, Float
 
 from snrmjax.identify.test_model import priors
-from snrmjax.identify.test_model.curve_basis import CurveBasis
+from snrmjax.identify.test_model.curve_terms import CurveTerms
 from snrmjax.identify.test_model.hyper import (
     ALONG,
     MASS,
@@ -36,9 +36,8 @@ class Balance(NamedTuple):
     """Z − (κ(K − Ω²) + iΩκδ) of every state, by its errors and by the unknowns."""
 
     states: TestStates
-    basis: CurveBasis
+    terms: tuple[CurveTerms, CurveTerms]  # of stiffness and damping
     places: Places
-    units: tuple[float, float]  # of both curves' coefficients
     weight: Float[np.ndarray, " state"]  # 1, or less for an outlier
     beside: Complex[np.ndarray, "state function"]  # what a discrepancy is made of
     in_order: tuple[bool, ...] = (False,) * 4  # which of `LEVEL_ERRORS` would run with the levels
@@ -55,11 +54,12 @@ class Balance(NamedTuple):
         force = states.force * np.exp(errors[:, 0] - (gain if states.force_is_free else 0.0))
         force = force + unknowns[OFFSET] * np.min(states.force)
         z = 1j * omega * states.constant * force / velocity
-        mass, units = 1 + unknowns[MASS], np.array(self.units)
-        pair = units * np.stack([unknowns[places.stiffness], unknowns[places.damping]], axis=1)
-        (curve, lost), (slope, rate) = self.basis.curves(np.abs(velocity) / omega, pair)
+        mass, own = 1 + unknowns[MASS], unknowns[places.stiffness]
+        (stiff, lossy), (x, v) = self.terms, self.amplitudes(velocity)
+        curve, slope = stiff.curve(x, own)
+        lost, rate = lossy.curve(v, unknowns[places.damping])
         stiffness, damping = curve + mass * places.reference, 1j * omega * lost
-        added = curve - self.basis.at_rest @ pair[:, 0]
+        added = curve - stiff.at_rest(own)[0]
         away = self.away
         with_frequency = np.stack([added, damping], axis=1) * away[:, None]
         softer, faster = away * unknowns[WITH_FREQUENCY, None]
@@ -73,12 +73,24 @@ class Balance(NamedTuple):
         )
 
     @property
+    def flat(self) -> Bool[np.ndarray, " unknown"]:
+        """Which unknowns have no prior."""
+        flat = np.zeros(self.places.others.stop, dtype=bool)
+        flat[self.places.stiffness], flat[self.places.damping] = (one.flat for one in self.terms)
+        return flat
+
+    def amplitudes(self, velocity: Complex[np.ndarray, " state"]) -> tuple[np.ndarray, np.ndarray]:
+        """Of each curve its own, for the states' velocities."""
+        frequency = self.states.frequency
+        displacement = np.abs(velocity) / frequency
+        stiff, lossy = (terms.amplitude(displacement, frequency) for terms in self.terms)
+        return stiff, lossy
+
+    @property
     def away(self) -> Float[np.ndarray, " state"]:
         """ln of the forcing frequency over the natural one that the record itself has."""
-        states = self.states
-        z = 1j * states.frequency * states.constant * states.force / states.velocity
-        natural = np.maximum(1 + z.real / states.frequency**2, _SOFTEST)
-        return -0.5 * np.log(natural)
+        states, omega = self.states, self.states.frequency
+        return off_resonance(1j * omega * states.constant * states.force / states.velocity, omega)
 
     def stiffer(self, unknowns: np.ndarray, errors: np.ndarray) -> Float[np.ndarray, " state"]:
         """Relative deviations of the stiffness: of levels, along a trend, and of states whose own
@@ -110,7 +122,7 @@ class Balance(NamedTuple):
         turn = np.where((np.arange(n) % 2 == 0) & (order > 0), 0.5 * np.pi, 0.0)
         waves = np.cos(order * theta - turn)
         waves = waves * np.exp(-0.25 * (order * priors.DISCREPANCY_LENGTH) ** 2)
-        along = np.log(states.amplitude / self.basis.largest)[:, None]
+        along = np.log(states.amplitude / np.max(states.amplitude))[:, None]
         beside = damping[:, None] * np.sin(theta) * np.hstack([waves, waves * along])
         share = (weight * mass) @ beside / max((weight * mass) @ mass, 1e-300)
         return self._replace(beside=np.hstack([beside - np.outer(mass, share), 1j * beside]))
@@ -168,12 +180,14 @@ class Balance(NamedTuple):
         design[:, OFFSET] = -z * np.min(states.force) / now.force
         design[:, TREND] = states.trend * now.stiffness
         design[:, WITH_FREQUENCY] = now.with_frequency
-        (softer, faster), (k, d) = unknowns[WITH_FREQUENCY], self.units
-        away, (values, _) = self.away, self.basis.values(np.abs(now.velocity) / omega)
-        added = softer * away[:, None] * (values - self.basis.at_rest)
-        design[:, places.stiffness] = k * ((1 + stiffer)[:, None] * values + added)
-        lossier = 1 + lossier + faster * away
-        design[:, places.damping] = (1j * omega * d * lossier)[:, None] * values
+        (softer, faster), (stiff, lossy) = unknowns[WITH_FREQUENCY], self.terms
+        away, (x, v) = self.away, self.amplitudes(now.velocity)
+        own = unknowns[places.stiffness]
+        values, at_rest = stiff.columns(x, own), stiff.at_rest(own)[1]
+        added = softer * away[:, None] * (values - at_rest)
+        design[:, places.stiffness] = (1 + stiffer)[:, None] * values + added
+        lossier = 1j * omega * (1 + lossier + faster * away)
+        design[:, places.damping] = lossier[:, None] * lossy.columns(v, unknowns[places.damping])
         if states.beside is not None:
             moved = -states.beside / self.own_velocity(unknowns)[:, None]
             design[:, places.others] = z[:, None] * moved + slope[:, None] * moved.real
@@ -197,13 +211,20 @@ class Balance(NamedTuple):
         # Of the rows to what was recorded: |∂Z/∂X| a state.
         jacobian = float(np.sum(np.log(np.abs(now.z) * np.abs(now.z + slope))))
         matrix, vector = white.reshape(-1, len(unknowns)), goal.reshape(-1)
-        stiff = np.stack([now.stiffness, np.zeros_like(now.stiffness)], axis=1)
+        of_stiffness = np.stack([now.stiffness, np.zeros_like(now.stiffness)], axis=1)
         return Straight(
-            LinearRows.of(matrix, vector, jacobian - 0.5 * log_det),
+            LinearRows.of(matrix, vector, jacobian - 0.5 * log_det, self.flat),
             matrix,
             vector,
-            np.einsum("nij,nj->ni", root, stiff),
+            np.einsum("nij,nj->ni", root, of_stiffness),
         )
+
+
+def off_resonance(
+    z: Complex[np.ndarray, " state"], frequency: Float[np.ndarray, " state"]
+) -> Float[np.ndarray, " state"]:
+    """ln of the forcing frequency over the natural one, by records' Z = FA/X."""
+    return -0.5 * np.log(np.maximum(1 + z.real / frequency**2, _SOFTEST))
 
 
 class BalancedStates(NamedTuple):

@@ -47,7 +47,11 @@ class CurveBasis(NamedTuple):
         largest = float(np.max(amplitude))
         most = max(most_knots - 1 - len(_BEYOND), 1)
         inside = amplitudes_apart(amplitude / largest, most, _NEAREST, crowded=crowded)
-        knots = np.array([0.0, *inside, *_BEYOND]) ** 2
+        return cls.at(largest, np.array([0.0, *inside, *_BEYOND]) ** 2)
+
+    @classmethod
+    def at(cls, largest: float, knots: Float[np.ndarray, " knot"]) -> "CurveBasis":
+        """For knots of (a/largest)²."""
         bends = bends_of(knots)
         functions = np.column_stack([np.ones_like(knots), knots, np.linalg.pinv(bends)])
         apart_by = np.subtract.outer(np.arange(len(bends)), np.arange(len(bends))) / SIZES_ALIKE
@@ -61,6 +65,11 @@ class CurveBasis(NamedTuple):
     def at_rest(self) -> Float[np.ndarray, " function"]:
         """The functions at the first knot, zero."""
         return self.pieces[-1, 0]
+
+    @property
+    def reach(self) -> float:
+        """1σ of what bends of size one add up to at the largest amplitude."""
+        return float(np.linalg.norm(self.values(np.array([self.largest]))[0][0, N_POWERS:]))
 
     @property
     def n_functions(self) -> int:

@@ -7,6 +7,7 @@ Reference: for a grid of hyperparameters about their mode, Rue, Martino & Chopin
 71 (2009) 319, section 3.1, doi:10.1111/j.1467-9868.2008.00700.x.
 """
 
+import itertools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -14,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from snrmjax.identify.test_model import priors
-from snrmjax.identify.test_model.curve_basis import CurveBasis
+from snrmjax.identify.test_model.curve_terms import CurveTerms
 from snrmjax.identify.test_model.linear_gaussian import (
     LinearRows,
     Objective,
@@ -65,13 +66,16 @@ class Places(NamedTuple):
         return slice(self.discrepancy[0].start, self.discrepancy[1].stop)
 
 
+Pair = tuple[CurveTerms, CurveTerms]
+
+
 def places_of(
-    basis: CurveBasis, n_levels: int, discrepancy: bool, reference: float, n_others: int = 0
+    terms: Pair, n_levels: int, discrepancy: bool, reference: float, n_others: int = 0
 ) -> Places:
     """The places for so many levels and parameters of others, with or without a discrepancy."""
     start = WITH_FREQUENCY.stop
-    middle = start + basis.n_functions
-    first = middle + basis.n_functions
+    middle = start + terms[0].n_functions
+    first = middle + terms[1].n_functions
     levels = first + np.arange(4 * n_levels).reshape(n_levels, 4)
     end, wide = first + 4 * n_levels, ALONG * discrepancy
     two = slice(end, end + wide), slice(end + wide, end + 2 * wide)
@@ -84,9 +88,14 @@ def places_of(
 NOISE, BENDS, LEVELS, FIRST_ALONG = 0, slice(1, 3), slice(3, 7), 7
 
 
-def hyper_at(point: np.ndarray, basis: CurveBasis) -> Hyper:
+def end_of_along(terms: Pair) -> int:
+    """Where in a point the numbers end that say how the bends' size changes."""
+    return FIRST_ALONG + terms[0].basis.directions.shape[1]
+
+
+def hyper_at(point: np.ndarray, terms: Pair) -> Hyper:
     """The hyperparameters of a point: logarithms of sizes, and how those of bends change."""
-    end = FIRST_ALONG + basis.directions.shape[1]
+    end = end_of_along(terms)
     noise, first, second, *levels = np.exp(point[:FIRST_ALONG]).tolist()
     more = np.exp(point[end:]).tolist() or (0.0, 0.0)
     return Hyper(
@@ -104,7 +113,7 @@ def point_of(hyper: Hyper) -> np.ndarray:
     return np.concatenate([sizes, hyper.along])
 
 
-def starting_point(states: TestStates, basis: CurveBasis, discrepancy: bool) -> np.ndarray:
+def starting_point(states: TestStates, terms: Pair, discrepancy: bool) -> np.ndarray:
     """The point from which the most likely one is looked for."""
     noise = priors.STATED_NOISE if states.stated else priors.UNSTATED_NOISE
     levels = [
@@ -113,24 +122,23 @@ def starting_point(states: TestStates, basis: CurveBasis, discrepancy: bool) -> 
     ]
     more = [0.3 * priors.DISCREPANCY.scale] * (2 * discrepancy)
     sizes = np.log([noise.median, *[priors.CURVE_BENDS.median] * 2, *levels])
-    return np.concatenate([sizes, np.zeros(basis.directions.shape[1]), np.log(more)])
+    return np.concatenate([sizes, np.zeros(end_of_along(terms) - FIRST_ALONG), np.log(more)])
 
 
-def bounds_of(
-    states: TestStates, basis: CurveBasis, point: np.ndarray
-) -> list[tuple[float, float]]:
-    """Between which points lie; what is stated is held."""
-    size = (np.log(1e-7), np.log(2.0))
+def bounds_of(states: TestStates, terms: Pair, point: np.ndarray) -> list[tuple[float, float]]:
+    """Between which points lie; what is stated is held, and so is the size of no bends."""
+    low = np.log(_STRAIGHT)
+    sizes = [(np.log(1e-7), np.log(2.0)) if one.smooth else (low, low) for one in terms]
     noise = (np.log(0.02), np.log(1e6)) if states.stated else (np.log(1e-5), np.log(1.0))
     levels = []
     for stated, prior in zip(states.level_std, priors.LEVELS, strict=True):
         held = np.log(stated) if stated > 0 else None
         wide = (np.log(_SMALLEST_SIZE * prior.scale), np.log(_MOST))
         levels.append(wide if held is None else (held, held))
-    n = basis.directions.shape[1]
+    n = end_of_along(terms) - FIRST_ALONG
     left = len(point) - FIRST_ALONG - n
     more = [(np.log(_SMALLEST_SIZE * priors.DISCREPANCY.scale), 0.0)] * left
-    return [noise, size, size, *levels, *[(-_FARTHEST, _FARTHEST)] * n, *more]
+    return [noise, *sizes, *levels, *[(-_FARTHEST, _FARTHEST)] * n, *more]
 
 
 class PriorVariances(NamedTuple):
@@ -147,16 +155,16 @@ class PriorVariances(NamedTuple):
         return np.exp(self.constant + self.slopes @ point)
 
 
-def prior_variances(basis: CurveBasis, places: Places, states: TestStates) -> PriorVariances:
+def prior_variances(terms: Pair, places: Places, states: TestStates) -> PriorVariances:
     """Those of a test's unknowns."""
-    n, end = places.others.stop, FIRST_ALONG + basis.directions.shape[1]
+    n, end = places.others.stop, end_of_along(terms)
     with_more = places.discrepancy[0].stop > places.discrepancy[0].start
     constant, slopes = np.zeros(n), np.zeros((n, end + 2 * with_more))
     held = (states.mass_std, states.phase_std, states.offset_std, states.trend_std)
     with np.errstate(divide="ignore"):
         constant[: WITH_FREQUENCY.stop] = 2 * np.log([*held, *states.off_resonance_std])
     for k, functions in enumerate((places.stiffness, places.damping)):
-        constant[functions], by = basis.log_variances()
+        constant[functions], by = terms[k].log_variances()
         slopes[functions, BENDS.start + k], slopes[functions, FIRST_ALONG:end] = by[:, 0], by[:, 1:]
     for k in range(4):
         slopes[places.levels[:, k], LEVELS.start + k] = 2.0
@@ -168,21 +176,28 @@ def prior_variances(basis: CurveBasis, places: Places, states: TestStates) -> Pr
 def objective_of(
     equations: LinearRows,
     states: TestStates,
-    basis: CurveBasis,
+    terms: Pair,
     places: Places,
     *,
     flat: bool = False,
+    drawn: tuple[bool, bool] = (True, True),
 ) -> Objective:
-    """Likelihood times prior; with `flat` that of levels' errors alone is left out."""
+    """Likelihood times prior; with `flat` that of levels' errors alone is left out, and that of
+    bends that are not `drawn`.
+    """
     noise = priors.STATED_NOISE if states.stated else priors.UNSTATED_NOISE
-    variances = prior_variances(basis, places, states)
+    variances = prior_variances(terms, places, states)
     n = variances.slopes.shape[1]
     of_levels = [
         None if stated > 0 or flat else prior
         for stated, prior in zip(states.level_std, priors.LEVELS, strict=True)
     ]
-    along = [priors.BENDS_VARY] * basis.directions.shape[1]
-    densities = [noise, *[priors.CURVE_BENDS] * 2, *of_levels, *along, *[priors.DISCREPANCY] * 2]
+    along = [priors.BENDS_VARY] * (end_of_along(terms) - FIRST_ALONG)
+    bends = [
+        priors.CURVE_BENDS if one.smooth and kept else None
+        for one, kept in zip(terms, drawn, strict=True)
+    ]
+    densities = [noise, *bends, *of_levels, *along, *[priors.DISCREPANCY] * 2]
     prior = priors.JointDensity.of(densities[:n])
 
     def value(point: np.ndarray) -> tuple[float, np.ndarray]:
@@ -203,6 +218,7 @@ class Gaussian(NamedTuple):
     mean: Float[np.ndarray, " unknown"]
     covariance: Float[np.ndarray, "unknown unknown"]
     told: float  # how many unknowns the states, and not their priors, tell
+    level_std: Float[np.ndarray, " error"]  # 1σ of levels' errors that the covariance has
 
 
 class SizedPoint(NamedTuple):
@@ -252,7 +268,44 @@ def averaged(
     off = means - mean
     point = weight @ np.array([point.point for point in points])
     effective = float(weight @ np.array([one.told for one in each]))
-    return point, Gaussian(mean, within + (off * weight[:, None]).T @ off, effective)
+    level_std = weight @ np.array([one.level_std for one in each])
+    return point, Gaussian(mean, within + (off * weight[:, None]).T @ off, effective, level_std)
+
+
+def remainders(
+    equations: LinearRows,
+    states: TestStates,
+    terms: Pair,
+    places: Places,
+    point: Float[np.ndarray, " hyper"],
+) -> tuple[bool, bool]:
+    """Which families leave a remainder that noise does not explain: where none has a probability
+    below `priors.REMAINDER_BY_CHANCE`, whatever the other curve has.
+    """
+    named = [one.family is not None and one.smooth for one in terms]
+    if not any(named):
+        return True, True
+    log_odds = np.log(1 / priors.NO_REMAINDER - 1)
+    weights: dict[tuple[bool, bool], float] = {}
+    either = [(False, True) if own else (True,) for own in named]
+    for drawn in itertools.product(either[0], either[1]):
+        bounds = bounds_of(states, terms, point)
+        for k, kept in enumerate(drawn):
+            if not kept:
+                bounds[BENDS.start + k] = (bounds[BENDS.start + k][0],) * 2
+        objective = objective_of(equations, states, terms, places, drawn=drawn)
+        best = maximised(objective, point, bounds)
+        weights[drawn] = laplace_evidence(objective, best, bounds) + log_odds * sum(drawn)
+    total = np.logaddexp.reduce(list(weights.values()))
+    first, second = (
+        np.logaddexp.reduce(
+            [weight for drawn, weight in weights.items() if not drawn[k]] or -np.inf
+        )
+        - total
+        < np.log(priors.REMAINDER_BY_CHANCE)
+        for k in range(2)
+    )
+    return bool(first), bool(second)
 
 
 def differing_levels(

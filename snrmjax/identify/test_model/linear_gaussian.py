@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.linalg import solve_triangular
 from scipy.linalg.lapack import dpotrf, dtrtrs
 from scipy.optimize import minimize
@@ -31,6 +31,7 @@ class LinearRows(NamedTuple):
     n_rows: int
     offset: float = 0.0  # ln of the Jacobian from the rows to what was recorded
     share: float = 1.0  # of the rows that tell something of their own: a power of their likelihood
+    n_flat: int = 0  # directions, the first, that unknowns without a prior take
 
     @classmethod
     def of(
@@ -38,12 +39,22 @@ class LinearRows(NamedTuple):
         design: Float[np.ndarray, "row unknown"],
         rows: Float[np.ndarray, " row"],
         offset: float = 0.0,
+        flat: Bool[np.ndarray, " unknown"] | None = None,
     ) -> "LinearRows":
-        """Of a design H and rows r."""
-        directions, triangle = np.linalg.qr(design)
+        """Of a design H and rows r.
+
+        Unknowns that are `flat` have no prior: the likelihood is that of what they leave of the
+        rows (restricted likelihood), whatever their variances are.
+        """
+        flat = np.zeros(design.shape[1], dtype=bool) if flat is None else flat
+        order = np.argsort(~flat, kind="stable")
+        directions, triangle = np.linalg.qr(design[:, order])
         along = directions.T @ rows
         left = rows - directions @ along
-        return cls(triangle, along, float(left @ left), len(rows), offset)
+        whole = np.empty_like(triangle)
+        whole[:, order] = triangle
+        square, n_flat = float(left @ left), min(int(flat.sum()), len(along))
+        return cls(whole, along, square, len(rows), offset, n_flat=n_flat)
 
     def posterior(
         self, scale: float, variance: Float[np.ndarray, " unknown"]
@@ -63,8 +74,8 @@ class LinearRows(NamedTuple):
         self, scale: float, variance: Float[np.ndarray, " unknown"]
     ) -> tuple[float, float, Float[np.ndarray, " unknown"]]:
         """ln p of the rows, and its slopes by ln s and by the logarithms of the variances."""
-        by_root = self.triangle * np.sqrt(variance)
-        n, m = self.share * self.n_rows, len(by_root)
+        by_root = self.triangle[self.n_flat :] * np.sqrt(variance)
+        n, m = self.share * (self.n_rows - self.n_flat), len(by_root)
         constant = n * np.log(2 * np.pi * scale**2)
         if not m:  # which lapack refuses
             square = self.across * self.share / scale**2
@@ -80,7 +91,7 @@ class LinearRows(NamedTuple):
         if failed:
             raise np.linalg.LinAlgError("the matrix is not positive definite.")
         both = np.empty((m, by_root.shape[1] + 1), order="F")
-        both[:, :-1], both[:, -1] = by_root, self.along
+        both[:, :-1], both[:, -1] = by_root, self.along[self.n_flat :]
         both *= unit[:, None]
         both, _ = dtrtrs(factor, both, lower=True, overwrite_b=True)
         arms, along = both[:, :-1], both[:, -1]

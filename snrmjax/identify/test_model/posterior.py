@@ -26,6 +26,7 @@ from scipy.special import fdtrc, ndtri, stdtrit
 from snrmjax.identify.test_model import priors
 from snrmjax.identify.test_model.balance import Balance
 from snrmjax.identify.test_model.curve_basis import CurveBasis
+from snrmjax.identify.test_model.curve_terms import CurveTerms
 from snrmjax.identify.test_model.hyper import (
     ALONG,
     MASS,
@@ -43,6 +44,7 @@ from snrmjax.identify.test_model.hyper import (
     objective_of,
     places_of,
     prior_variances,
+    remainders,
     sizes_of_bends,
 )
 from snrmjax.identify.test_model.linear_gaussian import (
@@ -69,8 +71,7 @@ class TestPosterior(NamedTuple):
     """What the states say together; `fit_test` makes it."""
 
     states: TestStates
-    basis: CurveBasis
-    units: tuple[float, float]  # rad²/s² and 1/s, of the two curves' coefficients
+    terms: tuple[CurveTerms, CurveTerms]  # of ω̃² and δ
     mean: Float[np.ndarray, " unknown"]
     covariance: Float[np.ndarray, "unknown unknown"]
     hyper: Hyper
@@ -86,6 +87,8 @@ class TestPosterior(NamedTuple):
     share: float  # of the states that count, where neighbours err alike
     settled: bool  # whether the last round moved nothing by more than its error
     in_order: tuple[bool, ...]  # which errors of levels run with their forces: curves do
+    remainders: tuple[bool, bool]  # whether noise does not explain what a family leaves
+    level_std: Float[np.ndarray, " error"]  # 1σ of levels' errors as the covariance has them
 
     @property
     def modal_mass(self) -> tuple[float, float]:
@@ -114,38 +117,52 @@ class TestPosterior(NamedTuple):
         """
         return self.mean[self.places.levels]
 
-    def with_levels(self, parent: Int[np.ndarray, " level"]) -> "TestPosterior":
-        """Where a fit begins of the same states in other levels, each a part of one of these."""
+    def beginning(
+        self,
+        parent: Int[np.ndarray, " level"] | None = None,
+        terms: tuple[CurveTerms, CurveTerms] | None = None,
+    ) -> "TestPosterior":
+        """Where a fit begins of the same states in other levels, each a part of a `parent` of
+        these, or by other terms: from a family as it is, and from smooth functions near these.
+        """
+        parent = np.arange(len(self.places.levels)) if parent is None else parent
+        terms = self.terms if terms is None else terms
         n_others = self.places.others.stop - self.places.others.start
-        places = places_of(self.basis, len(parent), False, self.places.reference, n_others)
-        mean = np.zeros(places.others.stop)
-        first = int(self.places.levels.min())
-        mean[:first], mean[places.others] = self.mean[:first], self.mean[self.places.others]
-        mean[places.levels] = self.level_errors[parent]
-        return self._replace(mean=mean, places=places)
+        reference = 0.0 if terms[0].family is not None else self.places.reference
+        places = places_of(terms, len(parent), False, reference, n_others)
+        mean, own = np.zeros(places.others.stop), self.places
+        mean[: places.stiffness.start] = self.mean[: places.stiffness.start]
+        mean[places.others], mean[places.levels] = self.mean[own.others], self.level_errors[parent]
+        was = (own.stiffness, own.damping)
+        for k, (now, functions) in enumerate(
+            zip(terms, (places.stiffness, places.damping), strict=True)
+        ):
+            if now.n_functions == self.terms[k].n_functions and now.family is None:
+                mean[functions] = self.mean[was[k]]
+            elif now.family is not None:
+                # A family that goes on without its remainder, or is new to the states.
+                start = now.family.parameters / now.units[: now.n_own]
+                scaled = np.where(now.scaled[: now.n_own], self.modal_mass[0], 1.0) * start
+                mean[functions.start : functions.start + now.n_own] = scaled
+        return self._replace(mean=mean, places=places, terms=terms)
 
     def curves(self, amplitude: Float[np.ndarray, " point"]) -> CurveValues:
         """ω̃² and δ at displacement amplitudes (m), with their covariance."""
-        values, by_log = self.basis.values(amplitude)
-        values_at, steep = (self._rows(terms) @ self.mean for terms in (values, by_log))
+        both = zip(self.terms, (self.places.stiffness, self.places.damping), strict=True)
+        pairs = [terms.curve(amplitude, self.mean[functions]) for terms, functions in both]
+        values, steep = np.moveaxis(np.array(pairs), 0, 2) / (1 + self.mean[MASS])
         rows = self.slopes(amplitude)
         covariance = np.einsum("npi,ij,nqj->npq", rows, self.covariance, rows)
-        return CurveValues(
-            values_at[:, 0] + self.places.reference, values_at[:, 1], covariance, steep
-        )
+        return CurveValues(values[:, 0] + self.places.reference, values[:, 1], covariance, steep)
 
     def slopes(self, amplitude: Float[np.ndarray, " point"]) -> Float[np.ndarray, "point two n"]:
         """Derivatives of ω̃² and δ at displacement amplitudes (m) by all unknowns."""
-        rows = self._rows(self.basis.values(amplitude)[0])
-        rows[:, :, MASS] = -(rows @ self.mean) / (1 + self.mean[MASS])
-        return rows
-
-    def _rows(self, terms: Float[np.ndarray, "point function"]) -> Float[np.ndarray, "point two n"]:
-        """Curves of these functions by the unknowns, at their modal mass."""
-        rows = np.zeros((len(terms), 2, len(self.mean)))
-        both = zip((self.places.stiffness, self.places.damping), self.units, strict=True)
-        for k, (functions, unit) in enumerate(both):
-            rows[:, k, functions] = unit * terms / (1 + self.mean[MASS])
+        rows = np.zeros((len(amplitude), 2, len(self.mean)))
+        both = zip(self.terms, (self.places.stiffness, self.places.damping), strict=True)
+        for k, (terms, functions) in enumerate(both):
+            own, mass = self.mean[functions], 1 + self.mean[MASS]
+            rows[:, k, functions] = terms.columns(amplitude, own) / mass
+            rows[:, k, MASS] = -terms.curve(amplitude, own)[0] / mass**2
         return rows
 
 
@@ -180,13 +197,14 @@ def fit_test(
         float(np.quantile(np.abs(z.imag / omega), 0.9) + 1e-12 * np.sqrt(reference)),
     )
     basis = CurveBasis.of(states.amplitude, rounds.most_knots, crowded=rounds.crowded)
+    terms = CurveTerms(basis, units[0]), CurveTerms(basis, units[1])
     start = rounds.start
     if start is not None:
-        basis, units, reference = start.basis, start.units, start.places.reference
+        terms, reference = start.terms, start.places.reference
     n_others = 0 if states.beside is None else states.beside.shape[1]
-    places = places_of(basis, states.n_levels, discrepancy, reference, n_others)
+    places = places_of(terms, states.n_levels, discrepancy, reference, n_others)
     beside = np.zeros((n, 2 * ALONG * discrepancy), dtype=complex)
-    balance = Balance(states, basis, places, units, np.ones(n), beside)
+    balance = Balance(states, terms, places, np.ones(n), beside)
     if start is not None:
         balance = balance._replace(in_order=start.in_order)
     walk = likeliest_walk(balance, rounds, robust=robust, tempered=tempered)
@@ -212,7 +230,7 @@ def fit_test(
         anew = free.straight(reached.mean, reached.errors, apart=False)
         exchanged = anew.equations._replace(share=equations.share)
 
-    variances = prior_variances(basis, places, states)
+    variances = prior_variances(terms, places, states)
 
     def gaussian(point: np.ndarray) -> Gaussian:
         noise, variance = np.exp(point[NOISE]), variances(point)
@@ -225,22 +243,21 @@ def fit_test(
                 1.0 if std > 0 else students_factor(float(np.sum(informed[errors_of_kind]))) ** 2
             )
         wide = exchanged.posterior(noise, variance)[1]
-        return Gaussian(mean, wide, float(np.sum(informed)))
+        return Gaussian(mean, wide, float(np.sum(informed)), np.sqrt(variance[places.levels[0]]))
 
-    objective = objective_of(reached.equations, states, basis, places)
-    bounds = bounds_of(states, basis, reached.point)
+    objective = objective_of(reached.equations, states, terms, places)
+    bounds = bounds_of(states, terms, reached.point)
     point, summary = reached.point, gaussian(reached.point)
     if over_sizes:
         sized = sizes_of_bends(objective, reached.point, bounds)
         point, summary = averaged(sized, gaussian)
-    flat = objective_of(reached.equations, states, basis, places, flat=True)
+    flat = objective_of(reached.equations, states, terms, places, flat=True)
     posterior = TestPosterior(
         states,
-        basis,
-        units,
+        terms,
         summary.mean,
         summary.covariance,
-        hyper_at(point, basis),
+        hyper_at(point, terms),
         laplace_evidence(objective, reached.point, bounds),
         _log_likelihood(reached),
         reached.errors,
@@ -253,6 +270,8 @@ def fit_test(
         reached.equations.share,
         walk.still,
         walk.balance.in_order,
+        remainders(reached.equations, states, terms, places, reached.point),
+        summary.level_std,
     )
     if states.linear is None:
         return posterior

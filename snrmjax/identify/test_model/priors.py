@@ -155,6 +155,12 @@ CURVE_SLOPES = 1.0
 CURVE_BENDS = LogNormalSize(1e-3, 2.0)
 """Size of the bends at some twenty knots, over the same: nothing to as much as the curve."""
 
+NO_REMAINDER = 0.3
+"""Probability that a family of curves leaves nothing: real structures are hardly in a library."""
+
+REMAINDER_BY_CHANCE = 0.05
+"""Probability that a family leaves nothing, below which its remainder is drawn."""
+
 BENDS_VARY = NormalNumber(1.0)
 """Of the logarithm of that size along a curve: where joints open a curve bends thrice as much."""
 

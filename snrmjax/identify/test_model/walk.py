@@ -19,6 +19,7 @@ from snrmjax.identify.test_model.hyper import (
     LEVELS,
     NOISE,
     bounds_of,
+    end_of_along,
     objective_of,
     point_of,
     prior_variances,
@@ -55,6 +56,7 @@ class Rounds(NamedTuple):
     levels_apart: bool = False
     start: "TestPosterior | None" = None
     crowded: bool = False  # whether knots crowd where states do
+    same_share: bool = False  # whether as many states count as at the start
 
 
 def likeliest_walk(balance: Balance, rounds: Rounds, *, robust: bool, tempered: bool) -> "Walk":
@@ -70,6 +72,8 @@ def likeliest_walk(balance: Balance, rounds: Rounds, *, robust: bool, tempered: 
     ]
     if rounds.start is not None:
         walks = [walks[0].from_(rounds.start)]
+        if rounds.same_share:
+            walks[0].share, walks[0].share_is_known = rounds.start.share, True
     first = min(_TRIED, rounds.most)
     for walk in walks:
         walk.advance(first)
@@ -108,12 +112,12 @@ class Walk:
         places, discrepancy = balance.places, balance.beside.shape[1] > 0
         self.balance, self.straight, self.apart = balance, straight, apart
         self.robust, self.tempered = robust, tempered
-        self.start = starting_point(balance.states, balance.basis, discrepancy)
+        self.start = starting_point(balance.states, balance.terms, discrepancy)
         self.point, self.errors = self.start, np.zeros_like(balance.states.errors)
         self.mean = np.zeros(places.others.stop)
         self.mean[places.damping.start] = 1.0
         self.found: Reached | None = None
-        self.turn, self.still, self.share = 0, False, 1.0
+        self.turn, self.still, self.share, self.share_is_known = 0, False, 1.0, False
 
     def from_(self, start: "TestPosterior") -> "Walk":
         """The same, going on from what was found for other states."""
@@ -151,19 +155,19 @@ class Walk:
         """The same, were so many of the states independent."""
         if self.found is None:
             return -np.inf
-        states, basis, places = self.balance.states, self.balance.basis, self.balance.places
+        states, terms, places = self.balance.states, self.balance.terms, self.balance.places
         equations = self.found.equations._replace(share=share)
-        return objective_of(equations, states, basis, places)(self.found.point)[0]
+        return objective_of(equations, states, terms, places)(self.found.point)[0]
 
     def _round(self) -> None:
-        k, states, basis = self.turn, self.balance.states, self.balance.basis
+        k, states, terms = self.turn, self.balance.states, self.balance.terms
         places, start = self.balance.places, self.start
         if k == _SETTLED:
             self.balance = self.balance.with_discrepancy(self.mean, self.errors)
         this = self.balance.straight(self.mean, self.errors, first=k == 0)
         this = this._replace(equations=this.equations._replace(share=self.share))
-        bounds = bounds_of(states, basis, self.point)
-        along = slice(FIRST_ALONG, FIRST_ALONG + basis.directions.shape[1])
+        bounds = bounds_of(states, terms, self.point)
+        along = slice(FIRST_ALONG, end_of_along(terms))
         if k == 0:  # no level differs from another yet, and bends are of one size
             bounds[LEVELS] = [
                 bound if self.apart and kind == _STIFFNESS else (bound[0], bound[0])
@@ -175,12 +179,12 @@ class Walk:
         # What curves do not follow yet would pass for another modal mass.
         free = k >= _SETTLED or states.mass_std > _GUESS
         held = states if free else states._replace(mass_std=0.0)
-        objective = objective_of(this.equations, held, basis, places)
+        objective = objective_of(this.equations, held, terms, places)
         begin = self.point if k > (_SETTLED if self.straight else 1) else start
         for _ in range(2):
             point = maximised(objective, begin, bounds)
             noise = float(np.exp(point[NOISE]))
-            variance = prior_variances(basis, places, held)(point)
+            variance = prior_variances(terms, places, held)(point)
             goal, covariance = this.equations.posterior(noise, variance)
             if np.all(np.abs(goal[places.levels]) < _FARTHEST):
                 break
@@ -197,7 +201,7 @@ class Walk:
         self.still = k > _SETTLED and np.max(np.abs(moved.unknowns - self.mean) / size) < _STILL
         self.point, self.mean, self.errors = point, moved.unknowns, moved.errors
         self.turn += 1
-        if self.tempered:
+        if self.tempered and not self.share_is_known:
             share = share_told_by(left, states.level, states.frequency)
             self.share = max(share, priors.LEAST_SHARE)
         if self.robust:

@@ -338,6 +338,11 @@ SENTENCES: dict[str, Wording] = {
     # Joint fits.
     "as_in_file": "{text}",
     "fit_not_converged": _fit_not_converged,
+    "family_leaves": lambda curve, family, largest: (
+        f"{family} does not describe the {curve} within the noise: what it leaves, up to "
+        f"{max(100 * largest, 0.01):.2g} % of the {curve}, is drawn as a smooth curve, which bands "
+        "and predictions include."
+    ),
     "noise_exceeded": (
         "the fit misses the data by {scale:.2g} ± {scale_std:.1g} times the stated noise: either "
         "that noise is too small or the model is wrong; the bands are {scale:.2g} times wider for "

@@ -14,7 +14,7 @@ import snrmjax as sj
 from snrmjax.identify.inference.fitted_curves import as_backbone
 from snrmjax.identify.inference.located_points import Place, solved_point
 from snrmjax.identify.inference.optimal_design import AdviceStatus
-from snrmjax.identify.joint.family_fit import FitStatus
+from snrmjax.identify.joint.joint_fit import FitStatus
 from snrmjax.identify.prediction.new_level import ON_THE_CURVES
 from snrmjax.io.joint_results import write_next
 
@@ -156,7 +156,7 @@ def test_band_of_a_curve_is_the_spread_of_drawn_curves(fit):
 
 
 def test_a_new_level_has_a_wider_band(fit):
-    prior = dataclasses.replace(fit.prior, level=np.array([0.01, 0.0, 0.004, 0.05]))
+    prior = dataclasses.replace(fit.prior, new_level=np.array([0.01, 0.0, 0.004, 0.05]))
     problem = dataclasses.replace(fit.problem, prior=prior)
     scattering = dataclasses.replace(fit, problem=problem)
     speeds = np.array([0.3, 0.8])

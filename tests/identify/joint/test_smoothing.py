@@ -91,7 +91,9 @@ def test_bands_hold_a_curve_that_few_knots_cannot_follow(fits):
     few = fit_jointly(
         near_resonance(0), modes(), level_gain_std=0.01, backbone="spline:4", damping="constant"
     )
-    assert np.mean(inside(few)) < 0.5
+    # What four knots cannot follow is drawn, and a note says so.
+    assert "family_leaves" in {note.kind for note in few.notes}
+    assert np.mean(inside(few)) > 0.9
 
 
 @pytest.mark.long

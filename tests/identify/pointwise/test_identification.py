@@ -82,7 +82,7 @@ class TestMeasuredBeam:
         values = backbone.values(np.clip(speed / frequency, backbone.smallest, backbone.largest))
         # What levels may differ by, if curves do not bend for it: runs repeat to 0.1 to 0.15 Hz, as
         # those who measured them say.
-        apart = 0.5 * float(found.fit.prior.level[2]) * frequency
+        apart = 0.5 * float(found.fit.prior.new_level[2]) * frequency
         assert apart.max() / HERTZ < 0.15
         std = np.hypot(values.natural_frequency_std, apart)
         assert np.abs((values.natural_frequency - frequency) / std).max() < 1.96

@@ -35,7 +35,8 @@ def fit():
 
 def with_levels(fit, std, deviations=None):
     """The fit with levels that differ by 1σ of so much, and have some deviations."""
-    prior = dataclasses.replace(fit.prior, level=jnp.asarray(std))
+    of_levels = jnp.asarray(std)
+    prior = dataclasses.replace(fit.prior, level=of_levels, new_level=of_levels)
     scattering = dataclasses.replace(fit, problem=dataclasses.replace(fit.problem, prior=prior))
     if deviations is None:
         return scattering

@@ -6,6 +6,7 @@ import pytest
 from snrmjax.identify.test_model import states as measured
 from snrmjax.identify.test_model.balance import Balance
 from snrmjax.identify.test_model.curve_basis import CurveBasis
+from snrmjax.identify.test_model.curve_terms import CurveTerms
 from snrmjax.identify.test_model.hyper import ALONG, OFFSET, PHASE, TREND, places_of
 
 LEVELS, OMEGA, CONSTANT = 3, 500.0, 6.0
@@ -27,9 +28,10 @@ def balance(*, force_is_free=False, discrepancy=True, others=0):
         *(np.linspace(-0.5, 0.5, n), 0.1, None if beside is None else beside.T),
     )
     basis = CurveBasis.of(states.amplitude, 8)
-    places = places_of(basis, LEVELS, discrepancy, OMEGA**2, others)
+    terms = CurveTerms(basis, 1e4), CurveTerms(basis, 10.0)
+    places = places_of(terms, LEVELS, discrepancy, OMEGA**2, others)
     beside = np.zeros((n, 2 * ALONG * discrepancy), dtype=complex)
-    own = Balance(states, basis, places, (1e4, 10.0), np.ones(n), beside)
+    own = Balance(states, terms, places, np.ones(n), beside)
     unknowns = np.zeros(places.others.stop)
     unknowns[places.others] = 0.5
     unknowns[places.stiffness] = 0.1 * rng.normal(size=basis.n_functions)
