@@ -157,7 +157,8 @@ def _clipped(states: TestStates, base: Judged) -> Iterator[TestCorrection]:
         true, stretch = unclipped(size, limit * size.max())
         if np.sum(size > limit * size.max()) <= _OWN_OF_CURVES:
             continue
-        errors = states.errors * np.column_stack([np.ones_like(size), stretch, np.ones_like(size)])
+        errors = states.errors.copy()
+        errors[:, 1] *= stretch
         moved = states._replace(velocity=states.velocity * true / size, errors=errors)
         tried.append(Tried(limit, moved, float(np.sum(np.log(stretch)))))
     value, judged = likeliest(base, tried)
@@ -216,7 +217,8 @@ def _unsettled(seen: CheckedStates, states: TestStates, base: Judged) -> Iterato
             left = np.where(before < 0, 0.0, np.exp(-np.log(share) * decay))
             true = (states.velocity - left * states.velocity[before]) / (1 - left)
             stretch = np.abs(states.velocity / (true * (1 - left)))
-            errors = states.errors * np.column_stack([np.ones_like(stretch), stretch, stretch])
+            errors = states.errors.copy()
+            errors[:, 1:3] *= stretch[:, None]
             moved = states._replace(velocity=true, errors=errors)
             tried.append(Tried(share, moved, 2 * float(np.sum(np.log(stretch)))))
         value, judged = likeliest(base, tried)
@@ -231,7 +233,8 @@ def _noisy_force(states: TestStates, base: Judged) -> Iterator[TestCorrection]:
     least = float(states.force.min())
     for ratio in (4.0, 12.0, 40.0):  # the cell's noise over that of all else, at the least force
         floor = ratio * least / states.force
-        errors = np.hypot(states.errors, np.stack([floor, 0 * floor, floor], axis=1))
+        errors = states.errors.copy()
+        errors[:, [0, 2]] = np.hypot(errors[:, [0, 2]], floor[:, None])
         tried.append(Tried(ratio, states._replace(errors=errors)))
     ratio, judged = likeliest(base, tried)
     yield TestCorrection("force_dropout", judged, ratio * least * judged.noise)

@@ -17,7 +17,7 @@ from snrmjax.identify.checks.residual_autocorrelation import share_told_by
 from snrmjax.identify.pointwise.snrm import participation_of, sensed_mode
 from snrmjax.identify.test_model.posterior import TestPosterior, fit_test
 from snrmjax.identify.test_model.priors import LEAST_SHARE
-from snrmjax.identify.test_model.states import TestStates, state_errors
+from snrmjax.identify.test_model.states import TestStates, at_controlled_phase, state_errors
 from snrmjax.identify.test_model.walk import Rounds
 from snrmjax.measure.states import SteadyStates, relative_errors
 from snrmjax.model.modes import residual_velocity
@@ -301,7 +301,16 @@ def checked_states(
     if data.base is not None and model is not None:
         moving = data.base._replace(motion="absolute").own_velocity(data.sensors, omega, force)
         own = sign * moving[:, sensor], data.base.motion == "relative"
-    return CheckedStates(test, at, sign * beside, order, noise, files, own, to_mode)
+    return CheckedStates(
+        at_controlled_phase(test, mass_stated=False),
+        at,
+        sign * beside,
+        order,
+        noise,
+        files,
+        own,
+        to_mode,
+    )
 
 
 def usable_rows(data: SteadyStates, sensor: int) -> Bool[np.ndarray, " state"]:

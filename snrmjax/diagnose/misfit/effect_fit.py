@@ -216,7 +216,7 @@ def at_reference(old: Predictions, data: SteadyStates) -> Predictions:
     found, error = reference.posterior, np.asarray(old.chosen.states.error)
     n_sensors = (error.shape[1] - 1) // 2
     added, level = np.zeros_like(error), found.states.level
-    errors = found.corrections[:, 1:] - found.level_errors[level][:, :2]
+    errors = found.corrections[:, 1:3] - found.level_errors[level][:, :2]
     added[reference.rows, 1 : n_sensors + 1] = errors[:, [0]]
     added[reference.rows, n_sensors + 1 :] = errors[:, [1]]
     return old.of_records(data, added)

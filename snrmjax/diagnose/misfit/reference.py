@@ -22,7 +22,7 @@ from snrmjax.identify.checks.instruments import force_gain_undetermined
 from snrmjax.identify.pointwise.snrm import participation_of, sensed_mode
 from snrmjax.identify.test_model.posterior import TestPosterior, fit_test
 from snrmjax.identify.test_model.priors import INSTRUMENT_PHASE
-from snrmjax.identify.test_model.states import TestStates, state_errors
+from snrmjax.identify.test_model.states import TestStates, at_controlled_phase, state_errors
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.modes import residual_velocity
 from snrmjax.model.structures import Structure
@@ -87,7 +87,7 @@ def test_states_of(predictions: Predictions, rows: np.ndarray) -> TestStates:
     natural = modes.natural_frequency.item(j)
     ratio = modes.damping_ratio.item(j)
     mass_std = 0.0 if modes.modal_mass_std is None else modes.modal_mass_std.item(j)
-    return TestStates(
+    test = TestStates(
         level=np.asarray(states.level),
         frequency=np.asarray(states.frequency),
         force=np.asarray(states.force),
@@ -103,6 +103,7 @@ def test_states_of(predictions: Predictions, rows: np.ndarray) -> TestStates:
         # What all levels share is a hypothesis of its own: it must not pass for levels that differ.
         phase_std=INSTRUMENT_PHASE,
     )
+    return at_controlled_phase(test, mass_stated=modes.modal_mass_std is not None)
 
 
 def with_reference(predictions: Predictions) -> Predictions:

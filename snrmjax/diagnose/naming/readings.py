@@ -157,8 +157,9 @@ def readings_of(
     )
     now, omega = balance.at(found.mean, found.corrections), states.frequency
     slopes = now.by_error
-    floor = np.array([0.0, priors.FLOOR**2, priors.FLOOR**2])
-    std = np.sqrt((found.hyper.noise * states.errors) ** 2 + floor) / np.sqrt(found.share)
+    std = found.hyper.noise * states.errors
+    std[:, 1:3] = np.hypot(std[:, 1:3], priors.FLOOR)
+    std = std / np.sqrt(found.share)
     root, _ = whitening(slopes, std, found.weight)
     # Records less the model's, by their straight line about the corrected motion.
     motion = model(now.velocity, omega)

@@ -29,7 +29,7 @@ from snrmjax.identify.test_model.curve_terms import CurveTerms
 from snrmjax.identify.test_model.hyper import MASS, OFFSET, PHASE, WITH_FREQUENCY
 from snrmjax.identify.test_model.posterior import TestPosterior, fit_test, students_factor
 from snrmjax.identify.test_model.priors import OFF_RESONANCE
-from snrmjax.identify.test_model.states import TestStates
+from snrmjax.identify.test_model.states import TestStates, at_controlled_phase
 from snrmjax.identify.test_model.walk import Rounds
 
 _FREE = 3.0  # 1σ of what nobody knows of the instruments, once its size is guessed
@@ -77,15 +77,16 @@ def view_of(
     guess = _complex_gain(problem) if {"force_gain", "instrument_phase"} & set(free) else 1.0 + 0j
     gain = abs(guess) if "force_gain" in free else 1.0
     guess = gain * np.exp(1j * np.angle(guess)) if "instrument_phase" in free else gain + 0j
+    assumed = "force_gain" not in free and problem.modes.modal_mass_std is None
     states = _test_states(problem, free, stated, guess)
+    states = at_controlled_phase(states, mass_stated=not assumed)
     rounds = Rounds(most_knots=MOST_KNOTS if knots is None else knots)
     fit = functools.partial(fit_test, robust=robust, tempered=True)
     posterior = fit(states, compare_levels=False, rounds=rounds)
     if _noise_of(posterior, stated).exceeded:  # curves may be steeper than their knots let them
         posterior = fit(states, compare_levels=False, rounds=rounds._replace(crowded=True))
     mass, std = posterior.modal_mass
-    assumed = "force_gain" not in free and problem.modes.modal_mass_std is None
-    if assumed and abs(mass - 1) < _ASKED * std:
+    if assumed and abs(mass - 1) <= _ASKED * std:
         linear = np.append(np.asarray(problem.prior.linear)[:-1], 0.0)
         known = dataclasses.replace(problem.prior, linear=jax.device_put(linear))
         problem = dataclasses.replace(problem, prior=known)

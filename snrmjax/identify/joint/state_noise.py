@@ -16,6 +16,7 @@ from snrmjax.identify.test_model.posterior import TestPosterior
 from snrmjax.identify.test_model.states import TestStates
 
 _CLEARLY = 20.0  # of −2 ln p, to believe in noise of a kind that nobody stated
+_LEAST = 0.05  # of the noise, that is never of another kind: others are in units of it
 _START = 0.5  # of the noise, from which a part is looked for
 
 
@@ -28,11 +29,12 @@ class StateNoise(NamedTuple):
 
     def of(self, states: TestStates) -> TestStates:
         """The states with these errors too, over the noise that is left."""
-        errors = states.errors.copy()
+        errors = states.errors[:, :3].copy()
+        wander = states.errors[:, 3:].sum(axis=1)
         floor = self.floor / (self.noise * np.abs(states.velocity))
         errors[:, 1:3] = np.hypot(errors[:, 1:3], floor[:, None])
-        if self.stiffness > 0:
-            wander = np.full(len(errors), self.stiffness / self.noise)
+        wander = np.hypot(wander, self.stiffness / self.noise)
+        if np.any(wander > 0):
             errors = np.column_stack([errors, wander])
         return states._replace(errors=errors)
 
@@ -53,6 +55,7 @@ def noise_of_states(posterior: TestPosterior) -> StateNoise:
     def parts(point: np.ndarray, kinds: tuple[bool, bool]) -> np.ndarray:
         found = np.zeros(3)
         found[[True, *kinds]] = np.exp(2 * point)
+        found[0] = max(found[0], _LEAST**2)
         return found
 
     def criterion(point: np.ndarray, kinds: tuple[bool, bool]) -> float:

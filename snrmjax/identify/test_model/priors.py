@@ -139,6 +139,13 @@ LEVELS: tuple[HalfNormalSize, ...] = (
 ONE_FORCE = 0.1
 """Of the logarithm of levels' forces: closer levels repeat one another."""
 
+ONE_PHASE = 0.17
+"""rad, from their mean, up to which states count as all of one phase: 10°, where a mode's frequency
+is within a tenth of its half-power bandwidth of the one at that phase."""
+
+LEAST_SCATTER = 1e-3
+"""Relative: states that are smoother than that along their amplitude were computed or filtered."""
+
 IN_ORDER = 0.01
 """Probability by chance of a line over the levels' forces, below which their errors run with it:
 they are then no errors of levels, which know nothing of one another."""
