@@ -36,7 +36,11 @@ from snrmjax.identify.pointwise.snrm import (
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.effect_base import AbstractAddedMode
 from snrmjax.model.effects import EFFECTS
-from snrmjax.model.library.measurement_chain import ModeShapeChange
+from snrmjax.model.library.measurement_chain import (
+    CloseMode,
+    ModeShapeChange,
+    ResidualMode,
+)
 from snrmjax.model.modes import linear_response, residual_velocity
 from snrmjax.numerics.blocks import padded
 
@@ -64,6 +68,8 @@ def named_parts(predictions: Predictions, data: SteadyStates, kinds: Iterable[st
     if not predictions.chosen.orders or unknown.any():
         kinds = [k for k in kinds if not issubclass(EFFECTS[k], _SEEN_BY_HARMONICS)]
     readings = _readings(predictions, data, unknown)
+    if readings.posterior.states.of_one_phase:  # which no gain, phase or mode beside it shows in
+        kinds = [k for k in kinds if not _seen_by_phases(k)]
     gain, phase, *_ = readings.posterior.hyper.level_std
     # What all levels have in common is theirs where their own errors are about as large.
     if gain > priors.OF_LEVELS * priors.GAIN:
@@ -72,6 +78,13 @@ def named_parts(predictions: Predictions, data: SteadyStates, kinds: Iterable[st
         kinds = [k for k in kinds if not (is_instrument(k) and EFFECTS[k].only_phase)]
     problem, cells = best_hypotheses(readings, kinds)
     return NamedParts(naming_of(problem, cells), problem)
+
+
+def _seen_by_phases(kind: str) -> bool:
+    """Whether states of one phase do not show an effect."""
+    effect = EFFECTS[kind]
+    by_instrument = is_instrument(kind) and (effect.like_force_gain or effect.only_phase)
+    return by_instrument or issubclass(effect, (AbstractAddedMode, CloseMode, ResidualMode))
 
 
 def _with_likely_phases(predictions: Predictions, data: SteadyStates) -> Predictions:

@@ -12,6 +12,7 @@ from snrmjax.diagnose import priors
 from snrmjax.diagnose.diagnosis_result import Diagnosis
 from snrmjax.identify.calibrate.inverse_force import inverse_force
 from snrmjax.identify.pointwise.missing_resonance import jump_at_resonance
+from snrmjax.identify.test_model.priors import ONE_PHASE
 from snrmjax.measure.states import SteadyStates, steady_states
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.compiled import on_numbers
@@ -174,6 +175,8 @@ def measured_resonance(data: SteadyStates, level: int, sensor: int) -> PhaseReso
         if frequency[top] in (frequency[rows].min(), frequency[rows].max()):
             return _NOWHERE
         return PhaseResonance(float(frequency[top]) / _HERTZ, float(abs(velocity[top])))
+    if np.sum(rows) > 2 and np.max(np.abs(np.angle(velocity[rows]))) < ONE_PHASE:
+        return _NOWHERE  # the phase was controlled: every state is a resonance
     rows = np.flatnonzero(rows & (velocity.real > 0))
     rows = rows[np.argsort(np.angle(velocity[rows]), kind="stable")]
     phase, size, frequency = np.angle(velocity[rows]), np.abs(velocity[rows]), frequency[rows]

@@ -227,7 +227,7 @@ def _unsettled(seen: CheckedStates, states: TestStates, base: Judged) -> Iterato
 
 def _noisy_force(states: TestStates, base: Judged) -> Iterator[TestCorrection]:
     """A force that falls at resonance into its cell's noise, which is of one size in newtons."""
-    if deepest_fall(states) < FORCE_FALLS:
+    if states.of_one_phase or deepest_fall(states) < FORCE_FALLS:
         return
     tried = []
     least = float(states.force.min())

@@ -18,6 +18,7 @@ from snrmjax.diagnose.naming.columns import Column, odds_of
 from snrmjax.diagnose.naming.rows import Cell, Problem, RowBlock, Sizes
 from snrmjax.model.library.measurement_chain import ForceHarmonics
 
+_ALIKE = 2 * (priors.BAND * priors.DESCRIBED) ** 2  # of a column, that errors of two laws may be
 PRIOR_OF_PAIRS = np.log(priors.SIZES[2]) + 5 * np.log(2)  # at most, with both signs known
 
 
@@ -120,12 +121,13 @@ class LawSums(NamedTuple):
         known = np.linalg.solve(self.gram[np.ix_(own, own)] + np.diag(wide**-2.0), self.gram[own])
         b = self.b - known.T @ self.b[own]
         square = np.diag(self.gram) - np.sum(known * self.gram[own], axis=0)
-        square = np.maximum(square, 1e-9 * np.diag(self.gram))
+        least = _ALIKE * np.diag(self.gram)
+        apart, square = square > least, np.maximum(square, least)
         value = self.gains(b, square, 2) + np.log(n_laws * self.prior)
         value += cell.log_evidence + np.log(priors.SIZES[n_laws] / priors.SIZES[n_laws - 1])
         further = ~np.isin(self.kind, self.kind[own]) | (self.kind == ForceHarmonics.kind)
         further[own] = False
-        seen = b**2 > priors.VISIBLE**2 * square
+        seen = apart & (b**2 > priors.VISIBLE**2 * square)
         some = np.flatnonzero(further & seen & (value > least)).tolist()
         return [Cell(float(value[k]), (*cell.columns, k), cell.sizes) for k in some]
 
@@ -146,7 +148,8 @@ class LawSums(NamedTuple):
     def _likely(self, i: np.ndarray, j: np.ndarray) -> np.ndarray:
         """What pairs may reach: with the strengths' best prior, a half nat of slack for each.
 
-        A pair of which one is not seen reads as the other alone, and is left out.
+        A pair of which one is not seen reads as the other alone, and is left out; so is one whose
+        laws differ by less than describing functions are right.
         """
         s, t, b, c, g = *np.diag(self.gram)[[i, j]], *self.b[[i, j]], self.gram[i, j]
         s, t = s + 1.0, t + 1.0
@@ -155,7 +158,8 @@ class LawSums(NamedTuple):
         occam = np.log(np.maximum(first, 1.0)) + np.log(np.maximum(second, 1.0))
         prior = np.log(self.prior[i] * self.prior[j]) + PRIOR_OF_PAIRS
         value = 0.5 * both - 0.5 * occam + self.base + prior + 1.0
-        return np.where(np.minimum(first, second) > priors.VISIBLE**2, value, -np.inf)
+        apart = s * t - g * g > _ALIKE * s * t
+        return np.where(apart & (np.minimum(first, second) > priors.VISIBLE**2), value, -np.inf)
 
     def _pair(self, i: np.ndarray, j: np.ndarray) -> np.ndarray:
         first = self.strengths(i, 2)[:, :, None] ** -2.0
