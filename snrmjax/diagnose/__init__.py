@@ -8,9 +8,11 @@
    force, has beyond the model, whitened by all errors. `explained_parts` puts both together.
 4. `naming.laws` has what every kind of effect changes there, to first order: columns
    (`naming.columns`), one for each value of a parameter that is not linear.
-5. `naming.evidence` weighs all single laws and pairs in closed form, each with remainders of every
-   size, and refines shapes that count. `naming.parts` makes these hypotheses an answer by parts:
-   laws with their probability, the fraction of the change that they explain, what is left.
+5. `naming.rows` makes these a linear problem, `naming.evidence` has the probabilities of laws in
+   closed form, and `naming.hypotheses` weighs all single laws and pairs, and more laws from the
+   best of these, each with remainders of every size; it refines shapes that count. `naming.parts`
+   makes these hypotheses an answer by parts: laws with their probability, the fraction of the
+   change that they explain, what is left.
 6. `answer_by_parts` fits the named laws together by harmonic balance at the measured motions
    (`misfit`, `fitted_effects`), makes the verdict, and completes the model with laws and remainder.
 

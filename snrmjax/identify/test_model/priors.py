@@ -139,9 +139,9 @@ LEVELS: tuple[HalfNormalSize, ...] = (
 ONE_FORCE = 0.1
 """Of the logarithm of levels' forces: closer levels repeat one another."""
 
-ONE_PHASE = 0.17
-"""rad, from their mean, up to which states count as all of one phase: 10°, where a mode's frequency
-is within a tenth of its half-power bandwidth of the one at that phase."""
+ONE_PHASE = 0.03
+"""rad, from their mean, up to which states count as all of one phase: 1.7°, as phase controllers
+keep it. Steps of that size say less on a modal mass than phases' own errors."""
 
 LEAST_SCATTER = 1e-3
 """Relative: states that are smoother than that along their amplitude were computed or filtered."""

@@ -87,11 +87,12 @@ def at_controlled_phase(states: TestStates, *, mass_stated: bool) -> TestStates:
     as a relative stiffness that wanders from state to state. Its 1σ is that of second differences
     along the amplitude. Taken for an error of the phase, the scatter would be the smaller the
     larger the damping, and so the smaller the modal mass, which such states do not determine: where
-    nobody stated its 1σ it is the model's. Other states are returned as they are.
+    nobody stated its 1σ it is the model's. Other states, and those of which only the drive is
+    known, are returned as they are.
     """
     phase = np.angle(states.velocity)
     turned = np.angle(np.exp(1j * phase) / np.mean(np.exp(1j * phase)))
-    if len(phase) < _FEWEST or np.max(np.abs(turned)) > ONE_PHASE:
+    if states.force_is_free or len(phase) < _FEWEST or np.max(np.abs(turned)) > ONE_PHASE:
         return states
     omega, order = states.frequency, np.argsort(states.amplitude, kind="stable")
     z = 1j * omega * states.constant * states.force / states.velocity
@@ -106,8 +107,7 @@ def at_controlled_phase(states: TestStates, *, mass_stated: bool) -> TestStates:
         1.0 if states.stated else max(lossy, LEAST_SCATTER) / float(np.median(states.errors[:, 1]))
     )
     errors = np.column_stack([states.errors[:, :_RECORDED], np.full(len(phase), wander / unit)])
-    known = states.mass_std if mass_stated or states.force_is_free else 0.0
-    return states._replace(errors=errors, mass_std=known)
+    return states._replace(errors=errors, mass_std=states.mass_std if mass_stated else 0.0)
 
 
 def state_errors(
