@@ -154,11 +154,6 @@ class Shape(NamedTuple):
         )
 
     @property
-    def is_drag(self) -> bool:
-        """Whether it is damping that grows with the velocity and depends on nothing else."""
-        return self.grows and self.argument is Argument.VELOCITY and self.symmetry is Symmetry.ODD
-
-    @property
     def grows(self) -> bool:
         """Whether it is a damping that grows with amplitude."""
         return self.part is Part.DAMPING and self.power is not None and self.power > 0

@@ -15,10 +15,3 @@ def root_of_inverse(jacobian: np.ndarray) -> np.ndarray:
     size = np.where(size > 0, size, 1.0)
     _, values, rows = np.linalg.svd(jacobian / size, full_matrices=False)
     return (rows.T / values) / size[:, None]
-
-
-def degrees_spent(jacobian: np.ndarray, n_rows: int) -> float:
-    """Degrees of freedom that the unknowns take from the first rows."""
-    size = np.linalg.norm(jacobian, axis=0)
-    basis = np.linalg.qr(jacobian / np.where(size > 0, size, 1.0))[0]
-    return float(np.sum(basis[:n_rows] ** 2))

@@ -22,14 +22,13 @@ from truths.balanced_sets import (
 
 import snrmjax as sj
 from snrmjax.diagnose.checks.residuals import held_out
-from snrmjax.diagnose.misfit.candidates import candidate, parameter_labels
+from snrmjax.diagnose.misfit.candidates import candidate
 from snrmjax.diagnose.misfit.effect_fit import (
     baseline_fit,
     fit_effect,
-    unfitted,
     with_errors_passed_on,
 )
-from snrmjax.diagnose.misfit.predictions import Predictions, predictions_of, scales_of
+from snrmjax.diagnose.misfit.predictions import predictions_of, scales_of
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit, weighted_misfit
 from snrmjax.diagnose.response_prediction import (
     level_forces,
@@ -186,25 +185,6 @@ def test_a_law_is_drawn_where_an_imitation_misses_the_level_left_out():
     assert np.sum(np.gradient(law.at)[inside]) > 0.9 * law.at[-1]
 
 
-def test_a_start_that_is_too_strong_to_have_a_motion_is_known_by_a_weaker_one(monkeypatch):
-    predictions = predictions_of(linear_model(), balanced(quadratic))
-    one = candidate("cubic_damping", scales_of(predictions))
-    usual = weighted_misfit(predictions).first_change(one)
-    whole, (place,) = Predictions.of, predictions.group.places([parameter_labels(one.kind)[0]])
-
-    def only_weak(self, values, along=()):
-        found = whole(self, values, along)
-        strong = values[0, place] > 0.5 * one.unit[0]
-        return found._replace(columns=np.where(strong, np.nan, 1) * found.columns)
-
-    misfit = weighted_misfit(predictions)
-    monkeypatch.setattr(Predictions, "of", only_weak)
-    # A force of first order: what is left is what its harmonics do to each other.
-    np.testing.assert_allclose(
-        misfit.first_change(one), usual, rtol=0, atol=5e-3 * np.abs(usual).max()
-    )
-
-
 def test_a_step_that_promises_nothing_is_taken_without_a_look(monkeypatch):
     predictions = predictions_of(linear_model(), balanced(quadratic))
     one, misfit = (
@@ -341,7 +321,7 @@ def test_errors_of_the_baseline_are_passed_on_as_the_effect_passes_them():
     predictions = predictions_of(linear_model(), balanced(lambda v: 0.0 * v))
     misfit = weighted_misfit(predictions)
     turned = candidate("sensor_phase_error", scales_of(predictions))
-    fit = unfitted(misfit, turned._replace(starts=((10.0,),)))
+    fit = fit_effect(misfit, turned)._replace(values=np.array([10.0]))
     own, other = (one.passed_on.slopes for one in (misfit, with_errors_passed_on(misfit, fit)))
     before, after = (part[:, 0] + 1j * part[:, 1] for part in (own, other))
     # The motion is the recorded one turned back by 10°, and so is the force that it needs. Slopes

@@ -178,7 +178,6 @@ class OwnAsymmetry(AbstractMemoryless):
 def test_what_a_user_does_not_state_follows_from_the_force():
     drag, even = shape_of(OwnDrag), shape_of(OwnAsymmetry)
     assert drag == Shape(Part.DAMPING, Symmetry.ODD, Argument.VELOCITY, pytest.approx(0.5))
-    assert drag.is_drag
     assert drag.lowest_harmonic == 3
     wanted = Shape(Part.STIFFNESS, Symmetry.EVEN, Argument.DISPLACEMENT, strength_order=2)
     assert even == wanted

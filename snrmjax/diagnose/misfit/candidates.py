@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from snrmjax.identify.calibrate.calibration_states import ComparedColumns
 from snrmjax.model.effect_metadata import Confusion, MotionScales
-from snrmjax.model.effect_shape import shape_of, starts_of
+from snrmjax.model.effect_shape import starts_of
 from snrmjax.model.effects import EFFECTS, effect_parameters
 from snrmjax.model.library.confusions import CONFUSIONS
 from snrmjax.model.modes import LinearModes
@@ -24,7 +24,6 @@ class EffectCandidate(NamedTuple):
     unit: tuple[float, ...]  # a change that is clearly detectable
     lower: tuple[float, ...]
     upper: tuple[float, ...]
-    strength_order: int = 1  # power of its strength with which the fundamental changes
 
 
 def candidate(kind: str, scales: MotionScales) -> EffectCandidate:
@@ -33,9 +32,7 @@ def candidate(kind: str, scales: MotionScales) -> EffectCandidate:
     starts = tuple(tuple(float(v) for v in start) for start in starts_of(effect, scales))
     lower, upper = zip(*effect.bounds(scales), strict=True)
     unit = effect.steps(tuple(abs(v) if v else 1.0 for v in starts[0]))
-    shape = shape_of(effect)
-    order = 1 if shape is None else shape.strength_order
-    return EffectCandidate(kind, starts, unit, lower, upper, order)
+    return EffectCandidate(kind, starts, unit, lower, upper)
 
 
 def parameter_labels(kind: str) -> tuple[str, ...]:

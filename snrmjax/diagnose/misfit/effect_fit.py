@@ -83,23 +83,6 @@ def baseline_fit(misfit: WeightedMisfit) -> EffectFit:
     return EffectFit((), (), none, square, misfit.base, empty, none, none)
 
 
-def started(candidate: EffectCandidate) -> EffectFit:
-    """A candidate at its first starting point, where its misfit is not known yet."""
-    values, none = np.array(candidate.starts[0]), np.zeros(0)
-    bounds = np.array(candidate.lower), np.array(candidate.upper)
-    labels = parameter_labels(candidate.kind)
-    return EffectFit((candidate.kind,), labels, values, np.inf, none, none[:, None], *bounds)
-
-
-def unfitted(misfit: WeightedMisfit, candidate: EffectCandidate) -> EffectFit:
-    """A candidate at its first starting point."""
-    one = started(candidate)
-    (rows,), (slopes,) = misfit.evaluated(one.labels, one.values[None])
-    square = misfit.chi_square(rows)
-    square = square if np.isfinite(square) else np.inf
-    return one._replace(chi_square=square, rows=rows, slopes=slopes)
-
-
 def fit_effect(
     misfit: WeightedMisfit,
     candidate: EffectCandidate,

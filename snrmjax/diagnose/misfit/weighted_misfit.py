@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from snrmjax.diagnose.misfit.candidates import EffectCandidate, parameter_labels
 from snrmjax.diagnose.misfit.noise_model import NoiseModel, shared_covariance
 from snrmjax.diagnose.misfit.predictions import Predicted, Predictions
 from snrmjax.identify.calibrate.calibration_states import ComparedColumns, whitened_columns
@@ -48,8 +47,6 @@ class WeightedMisfit:
     noise: NoiseModel
     base: Float[np.ndarray, " row"]
     by_linear: Float[np.ndarray, "row two"]  # by natural frequency and damping ratio
-    # What starting points of candidates change: of all weightings, for it does not depend on them.
-    starts: dict[tuple, Float[np.ndarray, "trial state column"]]
 
     @property
     def model(self) -> Structure:
@@ -69,31 +66,6 @@ class WeightedMisfit:
     def chi_square(self, rows: Float[np.ndarray, " row"]) -> float:
         """χ² of misfits in units of noise."""
         return float(np.sum(self.noise.decorrelated(rows) ** 2))
-
-    def start_changes(self, candidate: EffectCandidate) -> Float[np.ndarray, "trial state column"]:
-        """Columns of every starting point of a candidate less those of the baseline."""
-        key = (candidate.kind, candidate.starts)
-        if key in self.starts:
-            return self.starts[key]
-
-        def changed(starts: np.ndarray) -> np.ndarray:
-            labels, predictions = parameter_labels(candidate.kind), self.predictions
-            found = predictions.of(predictions.group.at(labels, starts))
-            return found.columns - self.baseline.columns
-
-        starts = np.array(candidate.starts)
-        changes = changed(starts)
-        lost = ~np.isfinite(self.noise.noise_units(changes)).all(axis=1)
-        if lost.any():  # too strong to have a motion: what a weaker one does, scaled up
-            weak = 0.1
-            starts[:, 0] *= weak
-            changes[lost] = changed(starts[lost]) / weak**candidate.strength_order
-        self.starts[key] = changes
-        return changes
-
-    def first_change(self, candidate: EffectCandidate) -> Float[np.ndarray, " row"]:
-        """What the first starting point of a candidate changes, in units of noise."""
-        return self.noise.noise_units(self.start_changes(candidate))[0]
 
     def baseline_parameters(
         self, rows: Float[np.ndarray, " row"], kept: Bool[np.ndarray, " row"] | None = None
@@ -123,7 +95,7 @@ class WeightedMisfit:
     def reweighted(self, passed_on: ErrorPropagation) -> "WeightedMisfit":
         """The same misfit with errors passed on in another way."""
         passed_on = _by_reference(self.predictions, passed_on)
-        return _weighted(self.predictions, self.baseline, self.errors, passed_on, self.starts)
+        return _weighted(self.predictions, self.baseline, self.errors, passed_on)
 
     def about(
         self, predictions: Predictions, values: Float[np.ndarray, " parameter"]
@@ -143,12 +115,12 @@ class WeightedMisfit:
         slopes_there = np.where(np.isfinite(there.slopes[0]), there.slopes[0], slopes)
         errors = self.errors._replace(slopes=slopes)
         passed_on = ErrorPropagation(by_error, phasors, slopes_there)
-        return _weighted(predictions, baseline, errors, passed_on, {})
+        return _weighted(predictions, baseline, errors, passed_on)
 
     def with_states(self, chosen: ComparedColumns) -> "WeightedMisfit":
         """The same states under other errors."""
         predictions = dataclasses.replace(self.predictions, chosen=chosen)
-        return _weighted(predictions, self.baseline, self.errors, self.passed_on, self.starts)
+        return _weighted(predictions, self.baseline, self.errors, self.passed_on)
 
 
 def weighted_misfit(predictions: Predictions) -> WeightedMisfit:
@@ -165,7 +137,7 @@ def weighted_misfit(predictions: Predictions) -> WeightedMisfit:
     if np.any(plain.added):
         plain = plain.carried_back(passed_on.by_error)
         baseline, _ = _baseline_of(plain)
-    return _weighted(plain, baseline, errors, passed_on, {})
+    return _weighted(plain, baseline, errors, passed_on)
 
 
 def _baseline_of(
@@ -227,13 +199,12 @@ def _weighted(
     baseline: BaselinePrediction,
     errors: ErrorPropagation,
     passed_on: ErrorPropagation,
-    starts: dict[tuple, Float[np.ndarray, "trial state column"]],
 ) -> WeightedMisfit:
     """Weighted as errors are `passed_on`."""
     noise = _noise(predictions, passed_on)
     base = noise.noise_units(baseline.columns[None])[0]
     linear = noise.noise_units(np.moveaxis(passed_on.slopes[:, :, -2:], 2, 0)).T
-    return WeightedMisfit(predictions, baseline, errors, passed_on, noise, base, linear, starts)
+    return WeightedMisfit(predictions, baseline, errors, passed_on, noise, base, linear)
 
 
 def _noise(predictions: Predictions, passed_on: ErrorPropagation) -> NoiseModel:

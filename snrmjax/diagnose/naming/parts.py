@@ -161,11 +161,6 @@ class _Changes(NamedTuple):
         """The remainder."""
         return self.functions @ self.rest
 
-    @property
-    def left_std(self) -> np.ndarray:
-        """1σ of the remainder."""
-        return _std_along(self.functions, self.covariance)
-
 
 def _std_along(functions: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     return np.sqrt(np.einsum("si,ij,sj->s", functions, covariance, functions.conj()).real)
