@@ -28,13 +28,22 @@ def even_record(
         raise ValueError("times must be evenly spaced and rise, but are not.")
     largest = np.abs(signal).max()
     flat = np.abs(signal) >= largest * (1 - 1e-9)
-    run = np.convolve(flat, np.ones(_CLIPPED), "valid").max()
-    if largest > 0 and run >= _CLIPPED:
+    ends = np.flatnonzero(np.diff(np.concatenate([[0], flat, [0]])))
+    run = int(np.max(ends[1::2] - ends[::2]))
+    if largest > 0 and run >= _CLIPPED + _at_an_extreme(signal, largest):
         raise ValueError(
-            f"the record stays at its largest value, {largest:.4g} m/s, for "
-            f"{_CLIPPED} samples or more: it is clipped."
+            f"the record stays at its largest value, {largest:.4g}, for {run} samples: it is "
+            "clipped."
         )
     return times, signal
+
+
+def _at_an_extreme(signal: Float[np.ndarray, " sample"], largest: float) -> float:
+    """Samples for which a cosine stays within one digit of its extreme, as converters round it."""
+    steps, crossings = np.abs(np.diff(signal)), np.sum(np.diff(signal > 0))
+    digit = np.min(steps[steps > 0], initial=largest)
+    cycle = 2 * len(signal) / max(crossings, 1)
+    return cycle / np.pi * float(np.sqrt(2 * digit / largest))
 
 
 def require_cycles(signal: Float[np.ndarray, " sample"], cycles: float) -> None:
