@@ -31,7 +31,7 @@ DESCRIBED = 0.01
 """Relative 1σ of the force of a law that is taken at the fundamental alone: the third harmonic of
 one that changes the stiffness by a tenth is about a hundredth of the motion."""
 
-ALONG = 0.2
+ALONG = 0.4
 """Of a remainder, 1σ of what it has along a law's own curve and no row can tell from the law:
 contributions that grow with amplitude look more like laws than smooth curves at random do."""
 
