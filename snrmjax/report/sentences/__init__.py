@@ -72,6 +72,15 @@ def enumerated(words: Sequence[Any]) -> str:
     return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
 
 
+def of_levels(levels: Sequence[int]) -> str:
+    """Levels by their numbers.
+
+    >>> of_levels([3]), of_levels([1, 2])
+    ('level 3', 'levels 1 and 2')
+    """
+    return f"level{'' if len(levels) == 1 else 's'} {enumerated(levels)}"
+
+
 def number_of(number: int, noun: str) -> str:
     """A number with its noun.
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from snrmjax.numerics.units import unit_in_print
-from snrmjax.report.sentences import Wording, number_of
+from snrmjax.report.sentences import Wording, number_of, of_levels
 
 _PEOPLE = ("Coulomb", "Jenkins", "Iwan", "Van der Pol")
 _PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"))
@@ -322,8 +322,8 @@ SENTENCES: dict[str, Wording] = {
         "there is no completed model: {reason} The parameters that fit best are none that a "
         "structure can have."
     ),
-    "not_physical_without": (
-        "without level {levels} the parameters are none that a structure can have."
+    "not_physical_without": lambda *, levels: (
+        f"without {of_levels(levels)} the parameters are none that a structure can have."
     ),
     "answer_not_converged": "the fit of the answer itself had not converged when it ended.",
     "effects_not_fitted": lambda *, effects: (

@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Sequence
 
 from snrmjax.numerics.status import Status
-from snrmjax.report.sentences import Wording, enumerated
+from snrmjax.report.sentences import Wording, enumerated, of_levels
 
 _NOT_LOCATED = {
     "branch": (
@@ -112,18 +112,18 @@ SENTENCES: dict[str, Wording] = {
         "{relative_std:%.2g}); if the model's modal mass is wrong, so is the gain."
     ),
     "fewer_advised": "{n} of {wanted} further measurements are advised: {why}.",
-    "resonances_missed": (
-        "the completed model's resonances lie far from the measured ones at level {levels}: it "
-        "does not reproduce these responses. Check the model's participation and linear "
-        "frequency, and the scale of the force."
+    "resonances_missed": lambda *, levels: (
+        "the completed model's resonances lie far from the measured ones at "
+        f"{of_levels(levels)}: it does not reproduce these responses. Check the model's "
+        "participation and linear frequency, and the scale of the force."
     ),
     "some_levels_simulated": (
         "the responses of {n} of {of} levels were simulated, from the smallest to the largest "
         "force."
     ),
-    "responses_not_complete": (
-        "the simulated responses of level {levels} were not traced to the end of the frequency "
-        "range: a resonance may be missing there."
+    "responses_not_complete": lambda *, levels: (
+        f"the simulated responses of {of_levels(levels)} were not traced to the end of the "
+        "frequency range: a resonance may be missing there."
     ),
     "diagnosis_left_out": (
         "The diagnosis was left out, as it would explain an error of the columns by effects that "
