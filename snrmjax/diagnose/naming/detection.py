@@ -25,7 +25,8 @@ def detection_limits(
     `excluded`, and for what the data do not show at all.
     """
     known = [problem.columns[k] for k in naming.cell.columns]
-    kinds = (k for k, e in EFFECTS.items() if e.searched and k not in {*excluded, *naming.effects})
+    tried = {column.kind for column in problem.columns} - {*excluded, *naming.effects}
+    kinds = (kind for kind, effect in EFFECTS.items() if effect.searched and kind in tried)
     # Of every shape, not of those alone that might explain these rows.
     problem = problem.with_columns([*known, *hypothesis_columns(problem.readings, kinds)])
     cell = naming.cell._replace(columns=tuple(range(len(known))))

@@ -111,6 +111,15 @@ class LawSums(NamedTuple):
         keep = np.flatnonzero(value > least)
         return [Cell(float(value[k]), (int(i[k]), int(j[k])), self.sizes) for k in keep]
 
+    def together(self, columns: tuple[int, ...]) -> Cell | None:
+        """Several laws as one hypothesis; None where one of them is not seen beside the others."""
+        first, second, *further = columns
+        found = self.pairs(np.array([first]), np.array([second]), -np.inf)
+        for column in further:
+            more = self.with_one_more(found[0], -np.inf) if found else []
+            found = [cell for cell in more if cell.columns[-1] == column]
+        return found[0] if found else None
+
     def with_one_more(self, cell: Cell, least: float) -> list[Cell]:
         """A hypothesis with every further law that is seen, where it is as probable as `least`.
 
@@ -121,8 +130,8 @@ class LawSums(NamedTuple):
         known = np.linalg.solve(self.gram[np.ix_(own, own)] + np.diag(wide**-2.0), self.gram[own])
         b = self.b - known.T @ self.b[own]
         square = np.diag(self.gram) - np.sum(known * self.gram[own], axis=0)
-        least = _ALIKE * np.diag(self.gram)
-        apart, square = square > least, np.maximum(square, least)
+        smallest = _ALIKE * np.diag(self.gram)
+        apart, square = square > smallest, np.maximum(square, smallest)
         value = self.gains(b, square, 2) + np.log(n_laws * self.prior)
         value += cell.log_evidence + np.log(priors.SIZES[n_laws] / priors.SIZES[n_laws - 1])
         further = ~np.isin(self.kind, self.kind[own]) | (self.kind == ForceHarmonics.kind)

@@ -27,7 +27,7 @@ _ROUNDS = 3  # of finer shapes
 _COARSE = 40.0  # nats that a coarse shape may lack
 _REACH = 16.0  # nats below the best, down to which a column is kept while shapes are refined
 _COUNTS = 0.02  # probability from which on a shape is divided
-_GONE_ON = 12  # hypotheses of some laws, from which those of one more go on
+_GONE_ON = 4  # sets of laws, from which those of one more go on
 _LEAST = 8.0  # of ln p below the most probable answer: what is less likely is left out
 
 
@@ -152,18 +152,22 @@ def _weighed(
 
 
 def _with_one_more(cells: list[Cell], grid: _Grid, n_laws: int, least: float) -> list[Cell]:
-    """The likeliest hypotheses of one law less, with every further law, as probable as `least`."""
-    fewer = sorted(
-        (c for c in cells if len(c.columns) == n_laws - 1), key=lambda c: -c.log_evidence
-    )
+    """The likeliest sets of one law less with every further law, where as probable as `least`.
+
+    With remainders of every size: one law more may leave far less than the fewer do.
+    """
+    fewer: dict[tuple[int, ...], Cell] = {}
+    for cell in sorted(cells, key=lambda cell: -cell.log_evidence):
+        if len(cell.columns) == n_laws - 1:
+            fewer.setdefault(tuple(sorted(cell.columns)), cell)
     found: dict[tuple[tuple[int, ...], Sizes], Cell] = {}
-    for own, other in itertools.product(grid.coarse(), grid.higher):
-        sizes = own.sizes if other is None else (*own.sizes, *other.sizes)
-        of_these = [cell for cell in fewer[:_GONE_ON] if cell.sizes == sizes]
-        if of_these:
+    for one in itertools.islice(fewer.values(), _GONE_ON):
+        (other,) = (h for h in grid.higher if (() if h is None else h.sizes) == one.sizes[2:])
+        for own in grid.coarse():
             whole = own if other is None else own.with_rows_of(other)
-            for cell in (cell for one in of_these for cell in whole.with_one_more(one, least)):
-                found.setdefault((tuple(sorted(cell.columns)), sizes), cell)
+            again = whole.together(one.columns)
+            for cell in () if again is None else whole.with_one_more(again, least):
+                found.setdefault((tuple(sorted(cell.columns)), cell.sizes), cell)
     return list(found.values())
 
 
