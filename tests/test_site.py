@@ -28,7 +28,9 @@ def test_commands_of_a_page_run_and_say_what_it_shows(page, tmp_path):
     program = tmp_path / "bin" / "snrmjax"
     program.parent.mkdir()
     program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m snrmjax "$@"\n')
-    program.chmod(program.stat().st_mode | stat.S_IXUSR)
+    program.with_name("python").write_text(f'#!/bin/sh\nexec "{sys.executable}" "$@"\n')
+    for one in program.parent.iterdir():
+        one.chmod(one.stat().st_mode | stat.S_IXUSR)
     work = tmp_path / "work"
     work.mkdir()
     path = f"{program.parent}:{os.environ['PATH']}"
