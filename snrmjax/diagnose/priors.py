@@ -76,7 +76,7 @@ resonance moves by so much of its bandwidth, and describing functions leave out 
 NAMED = 0.9
 """Probability from which on a law is named: a wrong name costs nine times as much as none."""
 
-EXPLAINED = 0.8
+EXPLAINED, AT_LEAST = 0.8, 0.5
 """Of a part's change, from which on a law is the answer and the remainder a correction; the lower
 end of its 95 % band must not lie below half where the remainder is no noise."""
 

@@ -449,3 +449,12 @@ def test_data_of_another_mode_and_of_one_level_are_said():
     one = sj.diagnose_model(linear_model(), balanced(quadratic, levels=1, per_level=20))
     assert Fact("no_level_left_out", n_levels=1) in one.notes
     assert one.gap.interpolated is None
+
+
+def test_a_drawn_answer_without_a_completed_model_is_as_probable_as_its_sets():
+    """Laws that are drawn are no candidates there, and part of the answer all the same."""
+    found, _ = blind("blind_12")
+    drawn = (*found.effects, "stiffness_law")
+    answer = found.answer._replace(probabilities={drawn: 0.9, ("coulomb_friction",): 0.1})
+    one = dataclasses.replace(found, verdict="drawn", answer=answer)
+    assert one.probability == pytest.approx(0.9)

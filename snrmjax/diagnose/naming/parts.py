@@ -290,7 +290,7 @@ def _part(
         probability >= priors.NAMED
         and explained is not None
         and explained.value >= priors.EXPLAINED
-        and (explained.low >= 0.5 or not remainder.significant)
+        and (explained.low >= priors.AT_LEAST or not remainder.significant)
     ):
         single = all(len(group) == 1 for group in candidates)
         verdict = "named" if single else "ambiguous"
