@@ -77,8 +77,9 @@ NAMED = 0.9
 """Probability from which on a law is named: a wrong name costs nine times as much as none."""
 
 EXPLAINED, AT_LEAST = 0.8, 0.5
-"""Of a part's change, from which on a law is the answer and the remainder a correction; the lower
-end of its 95 % band must not lie below half where the remainder is no noise."""
+"""Of a part's change, from which on a law is the answer and the remainder a correction, and what
+the lower end of its 95 % band must reach. Where the remainder may be noise the band need only
+reach the first."""
 
 TOLERATED_NOISE = (-0.38, 0.22)
 """Of that logarithm, overstated and understated: √2 (0.35) lies between the error of a phasor and

@@ -207,7 +207,8 @@ def _read(problem: Problem, cell: Cell, weight: float, least: dict[str, _Least])
         rest, each = change.left, change.of_law * change.strength
         whole = _size(np.sum(each, axis=1) + rest)
         odds = log_odds_of_remainder(problem, cell, solution, part)
-        left[part] = bool(odds > _NOT_NOISE and np.max(np.abs(rest) / small) > 1)
+        shown = odds > _NOT_NOISE and visible(rest)
+        left[part] = bool(shown and np.max(np.abs(rest) / small) > 1)
         found = []
         for place, column in enumerate(cell.columns):
             own = each[:, place]
@@ -286,17 +287,19 @@ def _part(
         verdict, effects, candidates, probability, explained = "none", (), (), silent, None
     elif not effects:
         verdict, probability = "drawn", none
-    elif (
-        probability >= priors.NAMED
-        and explained is not None
-        and explained.value >= priors.EXPLAINED
-        and (explained.low >= priors.AT_LEAST or not remainder.significant)
-    ):
+    elif probability >= priors.NAMED and explained is not None and _is_most(explained, remainder):
         single = all(len(group) == 1 for group in candidates)
         verdict = "named" if single else "ambiguous"
     else:
         verdict = "drawn"
     return PartAnswer(part, verdict, effects, candidates, probability, explained, remainder)
+
+
+def _is_most(explained: Explained, remainder: Remainder) -> bool:
+    """Whether laws explain most of a change, or may explain it where the rest may be noise."""
+    if not remainder.significant:
+        return explained.high >= priors.EXPLAINED
+    return explained.value >= priors.EXPLAINED and explained.low >= priors.AT_LEAST
 
 
 def _classes(reads: list[_Read], part: str) -> tuple[Laws, tuple[Laws, ...], float]:
