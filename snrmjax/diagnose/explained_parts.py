@@ -68,8 +68,8 @@ def named_parts(predictions: Predictions, data: SteadyStates, kinds: Iterable[st
     if not predictions.chosen.orders or unknown.any():
         kinds = [k for k in kinds if not issubclass(EFFECTS[k], _SEEN_BY_HARMONICS)]
     readings = _readings(predictions, data, unknown)
-    if readings.posterior.states.of_one_phase:  # which no gain, phase or mode beside it shows in
-        kinds = [k for k in kinds if not _seen_by_phases(k)]
+    if readings.posterior.states.of_one_phase:
+        kinds = [k for k in kinds if _shows_at_one_phase(k)]
     gain, phase, *_ = readings.posterior.hyper.level_std
     # What all levels have in common is theirs where their own errors are about as large.
     if gain > priors.OF_LEVELS * priors.GAIN:
@@ -80,11 +80,12 @@ def named_parts(predictions: Predictions, data: SteadyStates, kinds: Iterable[st
     return NamedParts(naming_of(problem, cells), problem)
 
 
-def _seen_by_phases(kind: str) -> bool:
-    """Whether states of one phase do not show an effect."""
+def _shows_at_one_phase(kind: str) -> bool:
+    """Whether states of one phase can show an effect."""
     effect = EFFECTS[kind]
     by_instrument = is_instrument(kind) and (effect.like_force_gain or effect.only_phase)
-    return by_instrument or issubclass(effect, (AbstractAddedMode, CloseMode, ResidualMode))
+    added = issubclass(effect, (AbstractAddedMode, CloseMode, ResidualMode))
+    return not (by_instrument or added)
 
 
 def _with_likely_phases(predictions: Predictions, data: SteadyStates) -> Predictions:

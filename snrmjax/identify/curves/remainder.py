@@ -15,7 +15,7 @@ class WithRemainder(AbstractFamily):
     """A curve by a family, and the natural spline in amplitude² that the family leaves.
 
     Its parameters are the family's, then the coefficients of smooth functions (a straight line and
-    bends), which are expected within `std` of zero.
+    curvatures), which are expected within `std` of zero.
     """
 
     kind: ClassVar[str] = "with_remainder"

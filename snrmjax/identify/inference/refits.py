@@ -200,16 +200,20 @@ def _implicit(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     multipliers = -jnp.linalg.solve(square, (slopes @ errors[:, :, None]))[:, :, 0]
 
     def by_errors(direction: Array) -> Array:
-        given = lambda e: problem.stationary(point, e, multipliers)[1]  # noqa: E731
+        def given(errors: Array) -> Array:
+            return problem.stationary(point, errors, multipliers)[1]
+
         return jax.jvp(given, (errors,), (direction,))[1]
 
     inner = jnp.moveaxis(jax.vmap(by_errors)(kinds), 0, 2)
     none = jnp.zeros((len(errors), 2, 2))
     blocks = jnp.block([[inner, slopes.mT], [slopes, none]])
-    hessian, *arms = jax.jacfwd(lambda p: problem.stationary(p, errors, multipliers))(point)
-    arms = jnp.concatenate(arms, axis=1)  # (state, input and part, unknown)
-    solved = jnp.linalg.solve(blocks, arms)
-    whole = hessian - jnp.einsum("sie,sif->ef", arms, solved)
+    hessian, *sensitivities = jax.jacfwd(lambda p: problem.stationary(p, errors, multipliers))(
+        point
+    )
+    by_unknown = jnp.concatenate(sensitivities, axis=1)  # (state, input and part, unknown)
+    solved = jnp.linalg.solve(blocks, by_unknown)
+    whole = hessian - jnp.einsum("sie,sif->ef", by_unknown, solved)
     right = eqx.filter_jvp(
         lambda given: given.stationary(point, errors, multipliers), (problem,), (moved,)
     )[1]
