@@ -68,7 +68,7 @@ def named_parts(predictions: Predictions, data: SteadyStates, kinds: Iterable[st
     if not predictions.chosen.orders or unknown.any():
         kinds = [k for k in kinds if not issubclass(EFFECTS[k], _SEEN_BY_HARMONICS)]
     readings = _readings(predictions, data, unknown)
-    if readings.posterior.states.of_one_phase:
+    if readings.posterior.phase_is_controlled:
         kinds = [k for k in kinds if _shows_at_one_phase(k)]
     gain, phase, *_ = readings.posterior.hyper.level_std
     # What all levels have in common is theirs where their own errors are about as large.
@@ -81,7 +81,7 @@ def named_parts(predictions: Predictions, data: SteadyStates, kinds: Iterable[st
 
 
 def _shows_at_one_phase(kind: str) -> bool:
-    """Whether states of one phase can show an effect."""
+    """Whether states at a controlled phase can show an effect."""
     effect = EFFECTS[kind]
     by_instrument = is_instrument(kind) and (effect.like_force_gain or effect.only_phase)
     added = issubclass(effect, (AbstractAddedMode, CloseMode, ResidualMode))
@@ -144,7 +144,9 @@ def _readings(predictions: Predictions, data: SteadyStates, unknown: np.ndarray)
     recorded = _recorded_harmonics(predictions, rows, none=not_read)
     model = _motion_of_model(predictions, data, rows, recorded.order)
     alike = not unknown.any()  # likely phases are smooth by themselves
-    return readings_of(states, order, model, linear, recorded, tempered=alike)
+    return readings_of(
+        *(states, order, model, linear, recorded), tempered=alike, parts_of_noise=alike
+    )
 
 
 def _recorded_harmonics(

@@ -57,8 +57,9 @@ def corrections(seen: CheckedStates, states: TestStates, base: Judged) -> Iterat
         gains = judged.posterior.level_errors[:, 0]
         yield TestCorrection("volts_as_force", judged, gains=tuple(gains.tolist()))
     yield from _clipped(states, base)
-    yield from _unsettled(seen, states, base)
-    yield from _noisy_force(states, base)
+    if not base.posterior.phase_is_controlled:  # else frequency and force are what follows
+        yield from _unsettled(seen, states, base)
+        yield from _noisy_force(states, base)
 
 
 def _freer(states: TestStates, base: Judged) -> Judged:
@@ -227,7 +228,7 @@ def _unsettled(seen: CheckedStates, states: TestStates, base: Judged) -> Iterato
 
 def _noisy_force(states: TestStates, base: Judged) -> Iterator[TestCorrection]:
     """A force that falls at resonance into its cell's noise, which is of one size in newtons."""
-    if states.of_one_phase or deepest_fall(states) < FORCE_FALLS:
+    if deepest_fall(states) < FORCE_FALLS:
         return
     tried = []
     least = float(states.force.min())

@@ -12,12 +12,19 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from snrmjax.doctor.priors import ANY_MASS, CLEARLY, FITS_WELL, MODAL_MASS, NO_MODE, SCATTER
+from snrmjax.doctor.priors import (
+    ANY_MASS,
+    CLEARLY,
+    FITS_WELL,
+    MODAL_MASS,
+    NO_MODE,
+    SCATTER,
+)
 from snrmjax.identify.checks.residual_autocorrelation import share_told_by
 from snrmjax.identify.pointwise.snrm import participation_of, sensed_mode
 from snrmjax.identify.test_model.posterior import TestPosterior, fit_test
 from snrmjax.identify.test_model.priors import LEAST_SHARE
-from snrmjax.identify.test_model.states import TestStates, at_controlled_phase, state_errors
+from snrmjax.identify.test_model.states import RECORDED, TestStates, state_errors
 from snrmjax.identify.test_model.walk import Rounds
 from snrmjax.measure.states import SteadyStates, relative_errors
 from snrmjax.model.modes import residual_velocity
@@ -302,7 +309,7 @@ def checked_states(
         moving = data.base._replace(motion="absolute").own_velocity(data.sensors, omega, force)
         own = sign * moving[:, sensor], data.base.motion == "relative"
     return CheckedStates(
-        at_controlled_phase(test, mass_stated=False),
+        _with_wandering_frequency(test),
         at,
         sign * beside,
         order,
@@ -311,6 +318,22 @@ def checked_states(
         own,
         to_mode,
     )
+
+
+def _with_wandering_frequency(test: TestStates) -> TestStates:
+    """The states with an error of the natural frequency where their phase was controlled.
+
+    Sweeps pass the half-power points: what scatters there says which column is wrong.
+    """
+    if not test.near_one_phase:
+        return test
+    found = fit_test(
+        test, tempered=True, compare_levels=False, parts_of_noise=True, rounds=Rounds(6, 24)
+    )
+    if not found.phase_is_controlled:
+        return test
+    errors = found.states.errors[:, RECORDED:]
+    return test._replace(errors=np.column_stack([test.errors, errors]))
 
 
 def usable_rows(data: SteadyStates, sensor: int) -> Bool[np.ndarray, " state"]:

@@ -18,7 +18,8 @@ _VOLTS = (ImportCorrection(force_unit="V"),)
 
 def is_other_scale(scale: Scale, as_modelled: Judged) -> bool:
     """Whether states tell a modal mass that is no linear test's, better than the model's own."""
-    if as_modelled.states.of_one_phase or abs(np.log(scale.mass)) < OTHER_SCALE + BAND * scale.std:
+    controlled = as_modelled.posterior.phase_is_controlled
+    if controlled or abs(np.log(scale.mass)) < OTHER_SCALE + BAND * scale.std:
         return False
     jacobian = as_modelled.evidence - as_modelled.posterior.log_evidence
     held = judge(as_modelled.states._replace(mass_std=0.0), jacobian)

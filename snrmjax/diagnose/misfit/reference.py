@@ -22,7 +22,7 @@ from snrmjax.identify.checks.instruments import force_gain_undetermined
 from snrmjax.identify.pointwise.snrm import participation_of, sensed_mode
 from snrmjax.identify.test_model.posterior import TestPosterior, fit_test
 from snrmjax.identify.test_model.priors import INSTRUMENT_PHASE
-from snrmjax.identify.test_model.states import TestStates, at_controlled_phase, state_errors
+from snrmjax.identify.test_model.states import TestStates, state_errors
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.modes import residual_velocity
 from snrmjax.model.structures import Structure
@@ -48,7 +48,7 @@ def reference_of(predictions: Predictions) -> Reference | None:
     if len(rows) < _FEWEST:
         return None
     states = test_states_of(predictions, rows)
-    found = fit_test(states)
+    found = fit_test(states, parts_of_noise=True)
     # What errors move belongs to the motion that was there: the records without any of them.
     levels = found.level_errors[states.level]
     errors = found.corrections[:, 1] - (0.0 if states.force_is_free else levels[:, 0])
@@ -103,7 +103,9 @@ def test_states_of(predictions: Predictions, rows: np.ndarray) -> TestStates:
         # What all levels share is a hypothesis of its own: it must not pass for levels that differ.
         phase_std=INSTRUMENT_PHASE,
     )
-    return at_controlled_phase(test, mass_stated=modes.modal_mass_std is not None)
+    if test.of_one_phase and modes.modal_mass_std is None:
+        return test._replace(mass_std=0.0)  # which such states do not tell
+    return test
 
 
 def with_reference(predictions: Predictions) -> Predictions:

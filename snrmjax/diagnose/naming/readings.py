@@ -143,14 +143,17 @@ def readings_of(
     recorded: RecordedHarmonics | None = None,
     *,
     tempered: bool = True,
+    parts_of_noise: bool = True,
 ) -> Readings:
     """The readings of a test's states, beyond a model.
 
-    `tempered`: neighbouring states that err alike count as fewer.
+    Arguments: with `tempered` neighbouring states that err alike count as fewer; with
+    `parts_of_noise` a natural frequency that wanders is looked for.
     """
     # Curves may go with the forcing frequency too.
     states = states._replace(off_resonance_std=OFF_RESONANCE)
-    found = fit_test(states, compare_levels=False, tempered=tempered)
+    found = fit_test(states, compare_levels=False, tempered=tempered, parts_of_noise=parts_of_noise)
+    states = found.states
     balance = Balance(
         *(states, found.terms, found.places, found.weight),
         np.zeros((len(states.level), 0), complex),

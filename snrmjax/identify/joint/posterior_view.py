@@ -22,14 +22,13 @@ from snrmjax.identify.joint.force_balance import (
     velocity_of_others,
 )
 from snrmjax.identify.joint.notes import NoiseEstimate
-from snrmjax.identify.joint.state_noise import StateNoise, noise_of_states
 from snrmjax.identify.test_model.balance import off_resonance
 from snrmjax.identify.test_model.curve_basis import MOST_KNOTS, CurveBasis
 from snrmjax.identify.test_model.curve_terms import CurveTerms
 from snrmjax.identify.test_model.hyper import MASS, OFFSET, PHASE, WITH_FREQUENCY
 from snrmjax.identify.test_model.posterior import TestPosterior, fit_test, students_factor
 from snrmjax.identify.test_model.priors import OFF_RESONANCE
-from snrmjax.identify.test_model.states import TestStates, at_controlled_phase
+from snrmjax.identify.test_model.states import TestStates
 from snrmjax.identify.test_model.walk import Rounds
 
 _FREE = 3.0  # 1σ of what nobody knows of the instruments, once its size is guessed
@@ -50,7 +49,6 @@ class View(NamedTuple):
     gain: complex  # of the force, and phase of the velocity, as guessed beforehand
     free: tuple[str, ...]
     noise: NoiseEstimate
-    more_noise: StateNoise  # of the states, of kinds that nobody stated
 
 
 def view_of(
@@ -68,8 +66,9 @@ def view_of(
     by first.
 
     Stated noise that the states exceed widens the bands by as much. A modal mass of which
-    nobody stated an error is the model's, unless the states ask for another; a frequency that
-    wanders is an error of every state where the residuals ask for it.
+    nobody stated an error is the model's, unless the states ask for another, which those at a
+    controlled phase cannot; a frequency that wanders is an error of every state where the states
+    ask for it.
 
     Arguments: `free` what of the instruments nobody knows; `stated` whether noise is; `knots` how
     many the curves have at most.
@@ -79,21 +78,20 @@ def view_of(
     guess = gain * np.exp(1j * np.angle(guess)) if "instrument_phase" in free else gain + 0j
     assumed = "force_gain" not in free and problem.modes.modal_mass_std is None
     states = _test_states(problem, free, stated, guess)
-    states = at_controlled_phase(states, mass_stated=not assumed)
     rounds = Rounds(most_knots=MOST_KNOTS if knots is None else knots)
     fit = functools.partial(fit_test, robust=robust, tempered=True)
-    posterior = fit(states, compare_levels=False, rounds=rounds)
+    first = functools.partial(fit, states, compare_levels=False, parts_of_noise=True)
+    posterior = first(rounds=rounds)
     if _noise_of(posterior, stated).exceeded:  # curves may be steeper than their knots let them
-        posterior = fit(states, compare_levels=False, rounds=rounds._replace(crowded=True))
+        posterior = first(rounds=rounds._replace(crowded=True))
+    states = posterior.states
     mass, std = posterior.modal_mass
-    if assumed and abs(mass - 1) <= _ASKED * std:
+    if assumed and (posterior.phase_is_controlled or abs(mass - 1) <= _ASKED * std):
         linear = np.append(np.asarray(problem.prior.linear)[:-1], 0.0)
         known = dataclasses.replace(problem.prior, linear=jax.device_put(linear))
         problem = dataclasses.replace(problem, prior=known)
         states = states._replace(mass_std=0.0)
         posterior = fit(states, compare_levels=False, rounds=rounds._replace(start=posterior))
-    more = noise_of_states(posterior)
-    states = more.of(states)
     named = any(choice.kind not in SMOOTH or choice.argument == "velocity" for choice in choices)
     start = rounds._replace(start=posterior)
     if named:
@@ -139,7 +137,7 @@ def view_of(
         ),
     )
     posterior = posterior._replace(covariance=wider**2 * posterior.covariance)
-    return View(posterior, problem, guess, free, noise, more)
+    return View(posterior, problem, guess, free, noise)
 
 
 def _with_common_gain_in_the_force(posterior: TestPosterior) -> TestPosterior:

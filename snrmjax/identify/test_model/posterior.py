@@ -17,6 +17,8 @@ of the curves' bends and of the discrepancy) all is one Gaussian (`linear_gaussi
 taken where likelihood times prior is largest, and integrated over by Laplace's approximation.
 """
 
+import functools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -50,11 +52,14 @@ from snrmjax.identify.test_model.hyper import (
 from snrmjax.identify.test_model.linear_gaussian import (
     laplace_evidence,
 )
-from snrmjax.identify.test_model.states import TestStates
+from snrmjax.identify.test_model.state_noise import StateNoise, noise_of_states
+from snrmjax.identify.test_model.states import RECORDED, TestStates
 from snrmjax.identify.test_model.walk import Reached, Rounds, likeliest_walk
 from snrmjax.numerics.blocks import on_one_core
 
 _ALL = Rounds()
+_NOISE_ROUNDS = 3  # of finding what noise is made of, at most
+_SAME_NOISE = 0.1  # relative, by which its parts then move
 _REACH = 3.0  # times the dynamic stiffness, that a natural frequency may lie beside a test
 
 
@@ -89,6 +94,25 @@ class TestPosterior(NamedTuple):
     in_order: tuple[bool, ...]  # which errors of levels run with their forces: curves do
     remainders: tuple[bool, bool]  # whether noise does not explain what a family leaves
     level_std: Float[np.ndarray, " error"]  # 1σ of levels' errors as the covariance has them
+
+    @property
+    def wandering(self) -> float:
+        """1σ of the natural frequency from state to state, relative; 0: as far as noise goes."""
+        stiffness = self.states.errors[:, RECORDED:].sum(axis=1)
+        return 0.5 * self.hyper.noise * float(np.max(stiffness, initial=0.0))
+
+    @property
+    def phase_is_controlled(self) -> bool:
+        """Whether phases spread by less than a frequency that wanders would have them.
+
+        Who measures has then kept the phase, and the states do not tell the modal mass: the larger
+        the half-power bandwidth, the smaller the spread would be at given frequencies.
+        """
+        if self.states.of_one_phase:
+            return True
+        bandwidth = np.median(np.abs(self.curves(self.states.amplitude).modal_damping))
+        turned = 2 * self.wandering * float(np.median(self.states.frequency) / bandwidth)
+        return turned > float(np.std(self.states.phase))
 
     @property
     def modal_mass(self) -> tuple[float, float]:
@@ -175,6 +199,7 @@ def fit_test(
     tempered: bool = False,
     over_sizes: bool = False,
     compare_levels: bool = True,
+    parts_of_noise: bool = False,
     rounds: Rounds = _ALL,
 ) -> TestPosterior:
     """The posterior of a test.
@@ -183,11 +208,26 @@ def fit_test(
     and amplitude, zero at phase resonance; with `robust` noise has outliers (Student's t); with
     `tempered` states whose neighbours miss the curves alike count as fewer; with `over_sizes`
     curves are averaged over the sizes that their bends may have; without `compare_levels` nothing
-    is said on which errors levels differ by (`differing`), which takes half the time.
+    is said on which errors levels differ by (`differing`), which takes half the time; with
+    `parts_of_noise` a natural frequency that wanders, and a floor of the noise where none is
+    stated, are looked for (`StateNoise`): the posterior's `states` have them as errors.
     Raises `ValueError` for fewer than two states.
     """
     if len(states.level) < 2:
         raise ValueError(f"a test needs at least two states, not {len(states.level)}.")
+    if parts_of_noise:
+        return _with_parts_of_noise(
+            functools.partial(
+                fit_test,
+                discrepancy=discrepancy,
+                robust=robust,
+                tempered=tempered,
+                over_sizes=over_sizes,
+                compare_levels=compare_levels,
+            ),
+            states,
+            rounds,
+        )
     n, omega = len(states.level), states.frequency
     reference = float(np.mean(omega**2))
     z = 1j * omega * states.constant * states.force / (states.velocity)
@@ -234,7 +274,9 @@ def fit_test(
 
     def gaussian(point: np.ndarray) -> Gaussian:
         noise, variance = np.exp(point[NOISE]), variances(point)
-        mean, covariance = equations.posterior(noise, variance)
+        # Of what levels have in common nothing is the likeliest: small curves bend less.
+        mean, _ = reached.equations.posterior(noise, variance)
+        covariance = equations.posterior(noise, variance)[1]
         known = variance > 0
         informed = np.zeros_like(variance)  # curves take what they can of levels' errors
         informed[known] = 1 - np.diag(covariance)[known] / variance[known]
@@ -276,6 +318,32 @@ def fit_test(
     if states.linear is None:
         return posterior
     return posterior._replace(log_evidence=posterior.log_evidence + _near_linear(posterior))
+
+
+def _with_parts_of_noise(
+    fit: Callable[..., TestPosterior], states: TestStates, rounds: Rounds
+) -> TestPosterior:
+    """The posterior of states whose errors have the parts that they clearly ask for.
+
+    Again and again: a frequency that wanders and is taken for noise of the phase changes the modal
+    mass, and with it what is left. Where the phase may have been controlled the mass is at first
+    the model's: taken for noise of the phase, the scatter would be none of a mode without mass.
+    """
+    first = states._replace(mass_std=0.0) if states.near_one_phase else states
+    found, parts = fit(first, rounds=rounds), StateNoise(0.0, 0.0, 1.0)
+    for _ in range(_NOISE_ROUNDS):
+        balance = Balance(
+            *(states, found.terms, found.places, found.weight),
+            np.zeros((len(states.level), 0), complex),
+        )
+        last = parts
+        parts = noise_of_states(balance, found.mean, found.corrections, found.hyper.noise)
+        same = np.allclose(parts, last, rtol=_SAME_NOISE, atol=0.0)
+        if same or (not any(parts[:2]) and not any(last[:2]) and first is states):
+            break
+        first = states
+        found = fit(parts.of(states), rounds=rounds)
+    return found
 
 
 def _near_linear(posterior: TestPosterior) -> float:

@@ -143,8 +143,9 @@ ONE_PHASE = 0.03
 """rad, from their mean, up to which states count as all of one phase: 1.7°, as phase controllers
 keep it. Steps of that size say less on a modal mass than phases' own errors."""
 
-LEAST_SCATTER = 1e-3
-"""Relative: states that are smoother than that along their amplitude were computed or filtered."""
+NEAR_ONE_PHASE = 0.4
+"""rad, from their mean: half of the way to the half-power points. States that stay within it may
+have had their phase controlled."""
 
 IN_ORDER = 0.01
 """Probability by chance of a line over the levels' forces, below which their errors run with it:

@@ -7,14 +7,13 @@ from jaxtyping import Complex, Float, Int
 
 from snrmjax.identify.test_model.priors import (
     FORCE_TO_VELOCITY,
-    LEAST_SCATTER,
+    NEAR_ONE_PHASE,
     ONE_FORCE,
     ONE_PHASE,
 )
 
-_MEDIAN = 0.6745  # of the absolute value of a standard normal number
-_RECORDED = 3  # kinds of errors of a record; a fourth is of the structure
-_FEWEST = 5  # states, whose scatter says how large its 1σ is
+RECORDED = 3
+"""Kinds of errors of a record; a fourth is of the structure."""
 
 LEVEL_ERRORS = ("gain", "phase", "stiffness", "damping")
 """What all states of a level may have in common, relative or in rad."""
@@ -60,9 +59,20 @@ class TestStates(NamedTuple):
         return int(self.level.max(initial=-1)) + 1
 
     @property
+    def phase(self) -> Float[np.ndarray, " state"]:
+        """Phases (rad) from their mean one on."""
+        direction = self.velocity / np.abs(self.velocity)
+        return np.angle(direction / np.mean(direction))
+
+    @property
     def of_one_phase(self) -> bool:
-        """Whether the phase was controlled (`at_controlled_phase`)."""
-        return self.errors.shape[1] > _RECORDED
+        """Whether all states have the same phase."""
+        return bool(np.max(np.abs(self.phase)) < ONE_PHASE)
+
+    @property
+    def near_one_phase(self) -> bool:
+        """Whether their phase may have been controlled."""
+        return bool(np.max(np.abs(self.phase)) < NEAR_ONE_PHASE)
 
     @property
     def amplitude(self) -> Float[np.ndarray, " state"]:
@@ -78,36 +88,6 @@ class TestStates(NamedTuple):
         along = np.log([np.median(self.force[self.level == k]) for k in level])
         constant, apart = np.ones(len(level)), np.ptp(along) > ONE_FORCE
         return np.linalg.qr(np.stack([constant, along - along[0]][: 1 + apart], axis=1))[0]
-
-
-def at_controlled_phase(states: TestStates, *, mass_stated: bool) -> TestStates:
-    """States whose phase was controlled: what scatters is their frequency.
-
-    The controller, or whoever reads a decay, keeps the phase; the frequency that it takes scatters
-    as a relative stiffness that wanders from state to state. Its 1σ is that of second differences
-    along the amplitude. Taken for an error of the phase, the scatter would be the smaller the
-    larger the damping, and so the smaller the modal mass, which such states do not determine: where
-    nobody stated its 1σ it is the model's. Other states, and those of which only the drive is
-    known, are returned as they are.
-    """
-    phase = np.angle(states.velocity)
-    turned = np.angle(np.exp(1j * phase) / np.mean(np.exp(1j * phase)))
-    if states.force_is_free or len(phase) < _FEWEST or np.max(np.abs(turned)) > ONE_PHASE:
-        return states
-    omega, order = states.frequency, np.argsort(states.amplitude, kind="stable")
-    z = 1j * omega * states.constant * states.force / states.velocity
-
-    def scatter(of: np.ndarray) -> float:
-        second = np.diff(of[order], 2) / np.sqrt(6)
-        return float(np.median(np.abs(second)) / _MEDIAN)
-
-    wander = scatter(np.log(np.maximum(omega**2 + z.real, 1e-300)))
-    lossy = scatter(np.log(np.abs(z.imag) / omega))
-    unit = (
-        1.0 if states.stated else max(lossy, LEAST_SCATTER) / float(np.median(states.errors[:, 1]))
-    )
-    errors = np.column_stack([states.errors[:, :_RECORDED], np.full(len(phase), wander / unit)])
-    return states._replace(errors=errors, mass_std=states.mass_std if mass_stated else 0.0)
 
 
 def state_errors(

@@ -122,7 +122,8 @@ class Walk:
     def from_(self, start: "TestPosterior") -> "Walk":
         """The same, going on from what was found for other states."""
         self.mean, self.point = start.mean, point_of(start.hyper)
-        self.errors[:, : start.corrections.shape[1]] = start.corrections
+        known = min(self.errors.shape[1], start.corrections.shape[1])
+        self.errors[:, :known] = start.corrections[:, :known]
         self.turn = _SETTLED + 1
         return self
 
