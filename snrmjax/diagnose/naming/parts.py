@@ -296,9 +296,9 @@ def _part(
 
 
 def _is_most(explained: Explained, remainder: Remainder) -> bool:
-    """Whether laws explain most of a change, or may explain it where the rest may be noise."""
+    """Whether laws explain most of a change, or half and maybe most where the rest may be noise."""
     if not remainder.significant:
-        return explained.high >= priors.EXPLAINED
+        return explained.value >= priors.AT_LEAST and explained.high >= priors.EXPLAINED
     return explained.value >= priors.EXPLAINED and explained.low >= priors.AT_LEAST
 
 
