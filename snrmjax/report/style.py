@@ -55,18 +55,18 @@ class Unit(NamedTuple):
 
 
 def unit_for(values: Any, base: str) -> Unit:
-    """The unit in which values read well, with a prefix when they are small.
+    """The unit in which the largest of values lies between 0.1 and 1000, where a prefix does that.
 
-    >>> unit_for([0.02, 0.05], "m/s")
-    Unit(size=0.001, name='mm/s')
+    >>> unit_for([0.02, 0.05], "m/s"), unit_for(1.166e-11, "N")
+    (Unit(size=0.001, name='mm/s'), Unit(size=1.0, name='N'))
     """
     largest = np.nanmax(np.abs(np.asarray(values)), initial=0.0)
     if base.startswith("×"):  # a number of what is then named: no unit of its own
         return Unit(1.0, base)
-    for size, prefix in ((1.0, ""), (1e-3, "m")):
-        if largest >= 0.1 * size or largest == 0:
+    for size, prefix in ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n")):
+        if largest >= 0.1 * size:
             return Unit(size, prefix + base)
-    return Unit(1e-6, "µ" + base)
+    return Unit(1.0, base)
 
 
 def with_unit(value: float, base: str, digits: int = 4) -> str:

@@ -441,7 +441,13 @@ def test_plotting_needs_no_display():
 
 @pytest.mark.parametrize(
     ("value", "name", "text"),
-    [(0.2, "m/s", "0.2 m/s"), (0.0999, "m/s", "99.9 mm/s"), (5e-5, "m/s", "50 µm/s")],
+    [
+        (0.2, "m/s", "0.2 m/s"),
+        (0.0999, "m/s", "99.9 mm/s"),
+        (5e-5, "m/s", "50 µm/s"),
+        (3.2e-9, "N", "3.2 nN"),
+        (1.166e-11, "N", "1.166e-11 N"),
+    ],
 )
 def test_units_suit_the_size(value, name, text):
     assert drawing.with_unit(value, name) == text

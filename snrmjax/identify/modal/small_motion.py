@@ -49,6 +49,7 @@ _LEFT = 1.05  # residuals over the noise, that few samples exceed by three of it
 _LEFT_OF_MOTION = 1e-5  # of the motion: no less noise is looked for
 _CYCLES_OF_LINE = 10
 _NOT_KNOWN = (0.01, 0.5)  # 1σ over ω and ζ
+_CLOSE = 0.1  # of a frequency, between modes of which one may stand for a change of the other
 _SAME = 0.02  # of a frequency, between a mode of two parts
 _FURTHEST = (0.02, 0.25)  # relative change of ω and of ζ from the last motion recorded to none
 
@@ -117,7 +118,12 @@ def is_linear(
     """Whether linear modes leave noise alone, and rates that move with the amplitude no less."""
     if not _settled(found, noise):
         return False
-    moved = _with_better_powers(_leading(found, time), values, time)
+    found = _leading(found, time)
+    moved = [
+        one
+        for base in (found, *_without_close(found, values, time))
+        for one in _with_better_powers(base, values, time)
+    ]
     return max(one.information for one in moved) < found.information + _BETTER
 
 
@@ -289,6 +295,21 @@ def _alone(found: DecayFit, part: np.ndarray, time: np.ndarray) -> DecayFit:
     if n == 1:
         return found
     return fit_waves(part, time, found.unknowns[[k, n + k]], WaveForm(1))
+
+
+def _without_close(found: DecayFit, part: np.ndarray, time: np.ndarray) -> list[DecayFit]:
+    """The fit without modes close to the leading one and its harmonics, where there are some.
+
+    Several linear modes beside each other can stand for one whose rates move.
+    """
+    n, k = found.form.n_modes, found.form.leading
+    ratio = found.natural_frequency / found.natural_frequency[k]
+    order = np.clip(np.round(ratio), 1, 3)
+    kept = (np.abs(ratio / order - 1) > _CLOSE) | (np.arange(n) == k)
+    if kept.all():
+        return []
+    form = WaveForm(int(kept.sum()), leading=int(kept[:k].sum()))
+    return [fit_waves(part, time, found.unknowns[: 2 * n][np.tile(kept, 2)], form, found.scale)]
 
 
 def _leading(found: DecayFit, time: np.ndarray) -> DecayFit:

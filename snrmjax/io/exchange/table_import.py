@@ -147,7 +147,8 @@ def _frequency_column(source: _Source) -> str:
     if len(columns) != 1:
         raise ValueError(
             f"which column of {source.file} is the frequency? --frequency names it, of "
-            f"{', '.join(columns) or source.listed}."
+            f"{', '.join(columns) or source.listed}; --frequency-start and --frequency-step state "
+            "frequencies that no column has."
         )
     source.assumed.add("frequency", Fact("column_by_name"))
     return columns[0]
@@ -178,10 +179,10 @@ def _force(source: _Source) -> tuple[Complex[np.ndarray, " row"], Force]:
         force = load_meaning(mapping, "" if mapping.base else "N", "--force-amplitude")
         stated = float(amplitudes[0]) * force.factor
         return np.full(source.table.n_rows, stated, dtype=complex), force
+    raw = source.column(name, option)
     if not mapping.base:
         source.assumed.unit("force_unit", mapping.force_unit, source.unit(name))
     force = load_meaning(mapping, source.unit(name), f"{name} of {file}")
-    raw = source.column(name, option)
     if not np.iscomplexobj(raw) and np.nanmin(raw, initial=1.0) < 0:
         raise ValueError(
             f"{name} of {file} has negative amplitudes: {option} names another column."

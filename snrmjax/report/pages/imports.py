@@ -8,6 +8,7 @@ import numpy as np
 from snrmjax.io.exchange.exports import write_import
 from snrmjax.io.exchange.importing import Imported
 from snrmjax.io.units import HERTZ
+from snrmjax.report.sentences import number_of
 
 
 def write(folder: Path, found: Imported, *, files: Sequence[str] = ()) -> list[str]:
@@ -24,9 +25,9 @@ def headline(found: Imported) -> list[str]:
     if found.states is not None:
         data = found.states
         hertz = np.asarray(data.frequency) / HERTZ
-        levels = len(np.unique(np.asarray(data.level)))
+        levels = number_of(len(np.unique(np.asarray(data.level))), "level")
         lines.append(
-            f"{data.n_states} steady states on {levels} levels, {hertz.min():.5g} to "
+            f"{data.n_states} steady states on {levels}, {hertz.min():.5g} to "
             f"{hertz.max():.5g} Hz, of {', '.join(data.sensors)}"
         )
         if data.base is not None:

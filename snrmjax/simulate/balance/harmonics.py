@@ -7,6 +7,7 @@ sine of every harmonic of τ = Ωt. The force is a cosine, so phasors are relati
 from functools import lru_cache
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
@@ -109,9 +110,7 @@ def displacement_phasors(
     coefficients: Float[Array | np.ndarray, "*batch coefficient mode"],
 ) -> Complex[Array, "*batch harmonic mode"]:
     """Phasors X_h of q = Re Σ X_h e^{ihΩt}, h = 0…H, from the real coefficients."""
-    xp = _namespace(coefficients)
-    mean, pairs = coefficients[..., :1, :] + 0j, coefficients[..., 2::2, :] * 1j
-    return xp.concatenate([mean, coefficients[..., 1::2, :] - pairs], axis=-2)
+    return _complex(*_real_and_imaginary(coefficients))
 
 
 def velocity_phasors(
@@ -124,11 +123,26 @@ def velocity_phasors(
     Of NumPy's arrays on the host: a curve is done there before a program has its arguments, and no
     number of points compiles.
     """
-    displacement = displacement_phasors(coefficients)
-    rate = (
-        1j * np.arange(displacement.shape[-2]) * _namespace(frequency).asarray(frequency)[..., None]
-    )
-    return rate[..., None] * (displacement @ mode_shape.T)
+    real, imaginary = (part @ mode_shape.T for part in _real_and_imaginary(coefficients))
+    orders = np.arange(real.shape[-2])
+    rate = (orders * _namespace(frequency).asarray(frequency)[..., None])[..., None]
+    return _complex(-rate * imaginary, rate * real)
+
+
+def _real_and_imaginary(coefficients: Array | np.ndarray) -> tuple[Any, Any]:
+    """Parts of the phasors of the displacement."""
+    xp = _namespace(coefficients)
+    mean, cosines = coefficients[..., :1, :], coefficients[..., 1::2, :]
+    sines = coefficients[..., 2::2, :]
+    real = xp.concatenate([mean, cosines], axis=-2)
+    return real, xp.concatenate([xp.zeros_like(mean), -sines], axis=-2)
+
+
+def _complex(real: Any, imaginary: Any) -> Any:
+    """From real parts: jax 0.8 warns in derivatives of real numbers that become complex."""
+    if isinstance(real, np.ndarray) and isinstance(imaginary, np.ndarray):
+        return real + 1j * imaginary
+    return jax.lax.complex(real, imaginary)
 
 
 def with_sines(

@@ -1,6 +1,7 @@
 """Periodic motions with the harmonics that their balance has left out."""
 
 import dataclasses
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -38,10 +39,13 @@ def completed_motions(
     """Coefficients (kg^1/2 m) and frequencies (rad/s) of scaled points with twice the harmonics.
 
     Where a contact closes and a slider slips depends on harmonics beyond those of the balance, and
-    with it the stability. A motion that is not found with them is returned as it is, with zeros.
+    with it the stability. A motion that is not found with them is NaN: its stability is not known.
     Arguments: `balances` stacked; `owner` says of which of them a point is.
     """
     wide = by_member(_completed, balances, owner, points)
+    missed = np.isnan(wide[:, -1]) & np.isfinite(points[:, -1])
+    if missed.any():
+        wide[missed] = by_member(_completed_by_newton, balances, owner[missed], points[missed])
     return _widened(balances).motions(wide, owner)
 
 
@@ -52,8 +56,17 @@ def _completed(
     return mapped(lambda balance, rows: jax.vmap(partial(_of, balance))(rows), balances, points)
 
 
+@partial(compiled, long_loops=True)
+def _completed_by_newton(
+    balances: HarmonicBalance, points: Float[Array, "row point unknown"]
+) -> Float[Array, "row point wide"]:
+    return mapped(
+        lambda balance, rows: jax.lax.map(partial(_by_newton, balance), rows), balances, points
+    )
+
+
 def _of(balance: HarmonicBalance, point: Point) -> Point:
-    """The point with twice the harmonics.
+    """The point with twice the harmonics, NaN where they do not settle.
 
     Newton's method with two parts of the Jacobian: that of the balance at the point, across its
     null vector, so that it passes folds; and for every harmonic beyond the dynamic stiffness of
@@ -71,22 +84,46 @@ def _of(balance: HarmonicBalance, point: Point) -> Point:
     dynamic = stiffness - terms.mass * speed**2
     dynamic = dynamic - 1j * terms.damping * speed / balance.frequency_scale
 
-    def corrected(last: _Correcting) -> _Correcting:
-        residual = wide.residual(last.point)
+    def change(at: Point) -> Point:
+        residual = wide.residual(at)
         beyond = residual[size:].reshape(len(orders), 2, n)
         phasor = (beyond[:, 0] + 1j * beyond[:, 1]) / dynamic
         near, far = shortest @ residual[:size], jnp.stack([phasor.real, phasor.imag], axis=1)
-        change = jnp.concatenate([near[:-1], far.reshape(-1), near[-1:]])
-        return _Correcting(last.point - change, jnp.linalg.norm(change), last.rounds + 1)
+        return jnp.concatenate([near[:-1], far.reshape(-1), near[-1:]])
+
+    return _settled(change, _padded(wide, point))
+
+
+def _by_newton(balance: HarmonicBalance, point: Point) -> Point:
+    """The same with the whole Jacobian in each round, where the parts' coupling is not small."""
+    wide = _widened(balance)
+
+    def change(at: Point) -> Point:
+        residual, jacobian = wide.linearised(at)
+        gram = jacobian @ jacobian.T
+        return solved_behind(jnp.concatenate([gram, residual[None]]))[0] @ jacobian
+
+    return _settled(change, _padded(wide, point))
+
+
+def _settled(change: Callable[[Point], Point], start: Point) -> Point:
+    """Where corrections end, NaN where they do not."""
+
+    def corrected(last: _Correcting) -> _Correcting:
+        step = change(last.point)
+        return _Correcting(last.point - step, jnp.linalg.norm(step), last.rounds + 1)
 
     def goes_on(last: _Correcting) -> Array:
         return (last.moved > _TOLERANCE) & (last.rounds < _ROUNDS)
 
-    zeros = jnp.zeros(wide.size - size)
-    start = jnp.concatenate([point[:-1], zeros, point[-1:]])
     begun = _Correcting(start, jnp.array(jnp.inf), jnp.array(0))
     end = jax.lax.while_loop(goes_on, corrected, begun)
-    return jnp.where(end.moved <= _TOLERANCE, end.point, start)
+    return jnp.where(end.moved <= _TOLERANCE, end.point, jnp.nan)
+
+
+def _padded(wide: HarmonicBalance, point: Point) -> Point:
+    zeros = jnp.zeros(wide.size + 1 - len(point))
+    return jnp.concatenate([point[:-1], zeros, point[-1:]])
 
 
 def _widened(balance: HarmonicBalance) -> HarmonicBalance:
