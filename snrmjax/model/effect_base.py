@@ -154,6 +154,11 @@ class AbstractForce(AbstractEffect):
         """
         return (self.at,)
 
+    def idle(self, natural_frequency: float, damping_ratio: float) -> Self:
+        """At the same place; see `AbstractEffect`."""
+        idle = super().idle(natural_frequency, damping_ratio)
+        return dataclasses.replace(idle, at=self.at)
+
     @abstractmethod
     def cycle_force(self, displacement: Samples, velocity: Samples) -> Samples:
         """The force at equally spaced samples of one period of a steady motion.

@@ -55,16 +55,18 @@ class DiagnosedTest(NamedTuple):
 
     @property
     def is_placed(self) -> bool:
-        """Whether a law at one place explains what no effect on the mode alone does."""
-        unknown = self.diagnosis.verdict is Verdict.UNKNOWN
-        return unknown and self.where is not None and self.where.explains
+        """Whether a law at one place explains all sensors to the noise, and is not named anyway."""
+        if self.where is None or not self.where.explains:
+            return False
+        law, named = self.where.places[0].law, self.diagnosis.verdict is Verdict.NAMED
+        return not (named and law is not None and self.diagnosis.effects == (law.kind,))
 
     @property
     def verdict(self) -> Verdict:
         """The verdict on the whole test, as `diagnosis.json` has it.
 
-        `diagnosis.verdict` is that on effects of the mode alone; where these explain nothing and a
-        law at one place does, its verdict takes the place of theirs.
+        `diagnosis.verdict` is that on effects of the mode alone, by the reference sensor; where a
+        law at one place explains all sensors, its verdict takes the place of theirs.
         """
         if self.where is not None and self.is_placed:
             return Verdict(placed_answer(self.where)["verdict"])
@@ -96,6 +98,8 @@ def diagnose_test(
     found = diagnose_model(model, data, former=former)
     _log.info("looks for the point where the missing force acts")
     place = _whereabouts(found, data, model, where)
+    if DiagnosedTest(found, model, where=place).is_placed and place is not None:
+        found = _completed_at(found, place)
     if not (simulate and found.effects and found.completed is not None):
         return DiagnosedTest(found, model, where=place)
     _log.info("simulates the responses of all levels")
@@ -113,6 +117,14 @@ def diagnose_test(
         note = Fact("resonances_missed", levels=missed)
         found = dataclasses.replace(found, notes=(*found.notes, note))
     return DiagnosedTest(found, model, simulated, place)
+
+
+def _completed_at(found: Diagnosis, place: Whereabouts) -> Diagnosis:
+    """The diagnosis with the model that a law at one place completes."""
+    answer = found.answer._replace(completed=place.model)
+    checks = found.checks._replace(completed_without={})  # of effects on the mode alone
+    notes = [note for note in found.notes if getattr(note, "kind", "") != "other_sensors_missed"]
+    return dataclasses.replace(found, answer=answer, checks=checks, notes=tuple(notes))
 
 
 def _is_missed(level: LevelResponse) -> bool:

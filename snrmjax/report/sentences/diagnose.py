@@ -220,8 +220,8 @@ def _not_placed(
 SENTENCES: dict[str, Wording] = {
     "force_placed": _placed,
     "placed_law_explains": lambda kind: (
-        f"effects on the mode alone do not explain the states, {effect_name(kind)} at one "
-        "place does, to the noise."
+        f"{effect_name(kind)} at one place explains all sensors to the noise, which effects on the "
+        "mode alone do not."
     ),
     "force_not_placed": _not_placed,
     "no_place_fits": _no_place_fits,
