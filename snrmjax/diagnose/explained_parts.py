@@ -143,10 +143,7 @@ def _readings(predictions: Predictions, data: SteadyStates, unknown: np.ndarray)
     not_read = bool(unknown.any()) or not is_single(modes)
     recorded = _recorded_harmonics(predictions, rows, none=not_read)
     model = _motion_of_model(predictions, data, rows, recorded.order)
-    alike = not unknown.any()  # likely phases are smooth by themselves
-    return readings_of(
-        *(states, order, model, linear, recorded), tempered=alike, parts_of_noise=alike
-    )
+    return readings_of(states, order, model, linear, recorded, phases_known=not unknown.any())
 
 
 def _recorded_harmonics(

@@ -57,7 +57,7 @@ def corrections(seen: CheckedStates, states: TestStates, base: Judged) -> Iterat
         gains = judged.posterior.level_errors[:, 0]
         yield TestCorrection("volts_as_force", judged, gains=tuple(gains.tolist()))
     yield from _clipped(states, base)
-    if not base.posterior.phase_is_controlled:  # else frequency and force are what follows
+    if not base.posterior.phase_is_controlled:  # a controller waits, and sets the force
         yield from _unsettled(seen, states, base)
         yield from _noisy_force(states, base)
 

@@ -12,14 +12,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from snrmjax.doctor.priors import (
-    ANY_MASS,
-    CLEARLY,
-    FITS_WELL,
-    MODAL_MASS,
-    NO_MODE,
-    SCATTER,
-)
+from snrmjax.doctor.priors import ANY_MASS, CLEARLY, FITS_WELL, MODAL_MASS, NO_MODE, SCATTER
 from snrmjax.identify.checks.residual_autocorrelation import share_told_by
 from snrmjax.identify.pointwise.snrm import participation_of, sensed_mode
 from snrmjax.identify.test_model.posterior import TestPosterior, fit_test
@@ -309,7 +302,7 @@ def checked_states(
         moving = data.base._replace(motion="absolute").own_velocity(data.sensors, omega, force)
         own = sign * moving[:, sensor], data.base.motion == "relative"
     return CheckedStates(
-        _with_wandering_frequency(test),
+        _with_scattering_frequency(test),
         at,
         sign * beside,
         order,
@@ -320,10 +313,11 @@ def checked_states(
     )
 
 
-def _with_wandering_frequency(test: TestStates) -> TestStates:
-    """The states with an error of the natural frequency where their phase was controlled.
+def _with_scattering_frequency(test: TestStates) -> TestStates:
+    """The states with a scatter of the natural frequency, where their phase was controlled.
 
-    Sweeps pass the half-power points: what scatters there says which column is wrong.
+    Of sweeps through the half-power points it stays out: there, such scatter is how a wrong column
+    shows.
     """
     if not test.near_one_phase:
         return test

@@ -155,7 +155,7 @@ class AbstractForce(AbstractEffect):
         return (self.at,)
 
     def idle(self, natural_frequency: float, damping_ratio: float) -> Self:
-        """At the same place; see `AbstractEffect`."""
+        """See `AbstractEffect`; it acts at the same place."""
         idle = super().idle(natural_frequency, damping_ratio)
         return dataclasses.replace(idle, at=self.at)
 

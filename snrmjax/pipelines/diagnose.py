@@ -55,11 +55,15 @@ class DiagnosedTest(NamedTuple):
 
     @property
     def is_placed(self) -> bool:
-        """Whether a law at one place explains all sensors to the noise, and is not named anyway."""
+        """Whether the answer is a law at one place, which explains all sensors to the noise.
+
+        The law alone that is named for the mode as a whole stays with the mode.
+        """
         if self.where is None or not self.where.explains:
             return False
-        law, named = self.where.places[0].law, self.diagnosis.verdict is Verdict.NAMED
-        return not (named and law is not None and self.diagnosis.effects == (law.kind,))
+        law, diagnosis = self.where.places[0].law, self.diagnosis
+        of_mode = diagnosis.effects if diagnosis.verdict is Verdict.NAMED else ()
+        return law is not None and of_mode != (law.kind,)
 
     @property
     def verdict(self) -> Verdict:
@@ -98,7 +102,7 @@ def diagnose_test(
     found = diagnose_model(model, data, former=former)
     _log.info("looks for the point where the missing force acts")
     place = _whereabouts(found, data, model, where)
-    if DiagnosedTest(found, model, where=place).is_placed and place is not None:
+    if place is not None and DiagnosedTest(found, model, where=place).is_placed:
         found = _completed_at(found, place)
     if not (simulate and found.effects and found.completed is not None):
         return DiagnosedTest(found, model, where=place)
@@ -120,9 +124,9 @@ def diagnose_test(
 
 
 def _completed_at(found: Diagnosis, place: Whereabouts) -> Diagnosis:
-    """The diagnosis with the model that a law at one place completes."""
+    """The diagnosis whose completed model has the law at its place."""
     answer = found.answer._replace(completed=place.model)
-    checks = found.checks._replace(completed_without={})  # of effects on the mode alone
+    checks = found.checks._replace(completed_without={})  # these have effects on the mode
     notes = [note for note in found.notes if getattr(note, "kind", "") != "other_sensors_missed"]
     return dataclasses.replace(found, answer=answer, checks=checks, notes=tuple(notes))
 

@@ -104,7 +104,7 @@ def test_states_of(predictions: Predictions, rows: np.ndarray) -> TestStates:
         phase_std=INSTRUMENT_PHASE,
     )
     if test.of_one_phase and modes.modal_mass_std is None:
-        return test._replace(mass_std=0.0)  # which such states do not tell
+        return test._replace(mass_std=0.0)  # these states do not determine it
     return test
 
 

@@ -28,6 +28,12 @@ class Explained(NamedTuple):
     low: float
     high: float
 
+    def is_most(self, *, rest_is_noise: bool) -> bool:
+        """Whether it is most of the change; if the rest may be noise, half and perhaps most."""
+        if rest_is_noise:
+            return self.value >= priors.AT_LEAST and self.high >= priors.EXPLAINED
+        return self.value >= priors.EXPLAINED and self.low >= priors.AT_LEAST
+
 
 class Remainder(NamedTuple):
     """What is left of a part: a curve of amplitude."""
@@ -287,19 +293,16 @@ def _part(
         verdict, effects, candidates, probability, explained = "none", (), (), silent, None
     elif not effects:
         verdict, probability = "drawn", none
-    elif probability >= priors.NAMED and explained is not None and _is_most(explained, remainder):
+    elif (
+        probability >= priors.NAMED
+        and explained is not None
+        and explained.is_most(rest_is_noise=not remainder.significant)
+    ):
         single = all(len(group) == 1 for group in candidates)
         verdict = "named" if single else "ambiguous"
     else:
         verdict = "drawn"
     return PartAnswer(part, verdict, effects, candidates, probability, explained, remainder)
-
-
-def _is_most(explained: Explained, remainder: Remainder) -> bool:
-    """Whether laws explain most of a change, or half and maybe most where the rest may be noise."""
-    if not remainder.significant:
-        return explained.value >= priors.AT_LEAST and explained.high >= priors.EXPLAINED
-    return explained.value >= priors.EXPLAINED and explained.low >= priors.AT_LEAST
 
 
 def _classes(reads: list[_Read], part: str) -> tuple[Laws, tuple[Laws, ...], float]:

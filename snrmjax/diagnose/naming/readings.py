@@ -142,17 +142,18 @@ def readings_of(
     linear: LinearTest,
     recorded: RecordedHarmonics | None = None,
     *,
-    tempered: bool = True,
-    parts_of_noise: bool = True,
+    phases_known: bool = True,
 ) -> Readings:
     """The readings of a test's states, beyond a model.
 
-    Arguments: with `tempered` neighbouring states that err alike count as fewer; with
-    `parts_of_noise` a natural frequency that wanders is looked for.
+    Where phases are not known (`phases_known`) they come from smooth curves: residuals of
+    neighbouring states are then alike by themselves, and say nothing of a scatter of the frequency.
     """
     # Curves may go with the forcing frequency too.
     states = states._replace(off_resonance_std=OFF_RESONANCE)
-    found = fit_test(states, compare_levels=False, tempered=tempered, parts_of_noise=parts_of_noise)
+    found = fit_test(
+        states, compare_levels=False, tempered=phases_known, parts_of_noise=phases_known
+    )
     states = found.states
     balance = Balance(
         *(states, found.terms, found.places, found.weight),

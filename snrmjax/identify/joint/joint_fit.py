@@ -349,7 +349,7 @@ def fit_jointly(
         np.asarray(curve(fit.motion().amplitude(curve))),
     )
     named = any(choice.kind != SmoothingSpline.kind for choice in choices)
-    notes += _notes(fit, posterior.wandering, level_std, named)
+    notes += _notes(fit, posterior.frequency_scatter, level_std, named)
     return dataclasses.replace(fit, notes=tuple(notes))
 
 

@@ -211,12 +211,10 @@ class Balance(NamedTuple):
         # Of the rows to what was recorded: |∂Z/∂X| a state.
         jacobian = float(np.sum(np.log(np.abs(now.z) * np.abs(now.z + slope))))
         matrix, vector = white.reshape(-1, len(unknowns)), goal.reshape(-1)
-        of_stiffness = np.stack([now.stiffness, np.zeros_like(now.stiffness)], axis=1)
         return Straight(
             LinearRows.of(matrix, vector, jacobian - 0.5 * log_det, self.flat),
             matrix,
             vector,
-            np.einsum("nij,nj->ni", root, of_stiffness),
         )
 
 
@@ -255,7 +253,6 @@ class Straight(NamedTuple):
     equations: LinearRows
     design: Float[np.ndarray, "row unknown"]
     rows: Float[np.ndarray, " row"]
-    arms_of_stiffness: Float[np.ndarray, "state part"]
 
 
 def whitening(

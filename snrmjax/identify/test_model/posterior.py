@@ -84,7 +84,6 @@ class TestPosterior(NamedTuple):
     log_likelihood: float  # of the states alone, at the most likely unknowns
     corrections: Float[np.ndarray, "state input"]  # most likely errors, subtracted from the record
     residuals: Float[np.ndarray, "state part"]  # whitened: of unit variance where all is right
-    arms_of_stiffness: Float[np.ndarray, "state part"]  # how a relative change of ω̃² moves them
     effective_unknowns: float  # that the states, and not their priors, tell
     places: Places
     differing: tuple[bool, bool, bool, bool]  # whether levels differ by more than is stated
@@ -96,22 +95,25 @@ class TestPosterior(NamedTuple):
     level_std: Float[np.ndarray, " error"]  # 1σ of levels' errors as the covariance has them
 
     @property
-    def wandering(self) -> float:
-        """1σ of the natural frequency from state to state, relative; 0: as far as noise goes."""
+    def frequency_scatter(self) -> float:
+        """1σ by which the natural frequency scatters from state to state, relative.
+
+        Zero where the noise of force and velocity explains the scatter.
+        """
         stiffness = self.states.errors[:, RECORDED:].sum(axis=1)
         return 0.5 * self.hyper.noise * float(np.max(stiffness, initial=0.0))
 
     @property
     def phase_is_controlled(self) -> bool:
-        """Whether phases spread by less than a frequency that wanders would have them.
+        """Whether phases spread less than the scatter of the natural frequency would make them.
 
-        Who measures has then kept the phase, and the states do not tell the modal mass: the larger
-        the half-power bandwidth, the smaller the spread would be at given frequencies.
+        The phase was then controlled, and the states do not determine the modal mass: a small mass
+        with a wide resonance would explain the small spread.
         """
         if self.states.of_one_phase:
             return True
         bandwidth = np.median(np.abs(self.curves(self.states.amplitude).modal_damping))
-        turned = 2 * self.wandering * float(np.median(self.states.frequency) / bandwidth)
+        turned = 2 * self.frequency_scatter * float(np.median(self.states.frequency) / bandwidth)
         return turned > float(np.std(self.states.phase))
 
     @property
@@ -209,8 +211,8 @@ def fit_test(
     `tempered` states whose neighbours miss the curves alike count as fewer; with `over_sizes`
     curves are averaged over the sizes that their bends may have; without `compare_levels` nothing
     is said on which errors levels differ by (`differing`), which takes half the time; with
-    `parts_of_noise` a natural frequency that wanders, and a floor of the noise where none is
-    stated, are looked for (`StateNoise`): the posterior's `states` have them as errors.
+    `parts_of_noise` scatter of the natural frequency from state to state is estimated, and a noise
+    floor where no noise is stated (`StateNoise`): the posterior's `states` have them as errors.
     Raises `ValueError` for fewer than two states.
     """
     if len(states.level) < 2:
@@ -274,8 +276,9 @@ def fit_test(
 
     def gaussian(point: np.ndarray) -> Gaussian:
         noise, variance = np.exp(point[NOISE]), variances(point)
-        # Of what levels have in common nothing is the likeliest: small curves bend less.
-        mean, _ = reached.equations.posterior(noise, variance)
+        # In the mean levels have no error in common: the prior of the curves' roughness would
+        # make the curves smaller, and put the rest down to the levels.
+        mean = reached.equations.posterior(noise, variance)[0]
         covariance = equations.posterior(noise, variance)[1]
         known = variance > 0
         informed = np.zeros_like(variance)  # curves take what they can of levels' errors
@@ -304,7 +307,6 @@ def fit_test(
         _log_likelihood(reached),
         reached.errors,
         reached.residuals * np.exp(reached.point[NOISE] - point[NOISE]),
-        last.arms_of_stiffness,
         summary.told,
         places,
         differing_levels(flat, reached.point, bounds, states) if compare_levels else (False,) * 4,
@@ -323,11 +325,11 @@ def fit_test(
 def _with_parts_of_noise(
     fit: Callable[..., TestPosterior], states: TestStates, rounds: Rounds
 ) -> TestPosterior:
-    """The posterior of states whose errors have the parts that they clearly ask for.
+    """The posterior with all parts of the states' noise that the data clearly show.
 
-    Again and again: a frequency that wanders and is taken for noise of the phase changes the modal
-    mass, and with it what is left. Where the phase may have been controlled the mass is at first
-    the model's: taken for noise of the phase, the scatter would be none of a mode without mass.
+    In several rounds: scatter of the frequency that is taken for noise of the phase changes the
+    modal mass, and with it the residuals. Where the phase may have been controlled the first round
+    keeps the model's mass: a mass near zero would explain the scatter without any noise.
     """
     first = states._replace(mass_std=0.0) if states.near_one_phase else states
     found, parts = fit(first, rounds=rounds), StateNoise(0.0, 0.0, 1.0)

@@ -2,10 +2,10 @@
 
 Noise of velocities that nobody stated is relative in part (gains, frequency steps) and absolute in
 part (the floor of an amplifier): over a wide range of amplitudes one size of either is wrong at
-both ends. A natural frequency that wanders from state to state, or a frequency at which a phase
-controller holds the structure, moves the balance most where the mode is driven hardest. Taken for
-an error of the phase, that scatter would be the smaller the larger the damping, and so the smaller
-the modal mass. What a fit leaves of the states says how large each part is.
+both ends. The natural frequency itself may scatter from state to state, and so does the frequency
+that a phase controller sets; this matters most where the mode is driven hardest. Taken for noise of
+the phase it would give a modal mass that is too small. The residuals of a fit say how large each
+part is.
 """
 
 import itertools
@@ -43,10 +43,9 @@ class StateNoise(NamedTuple):
 def noise_of_states(
     balance: Balance, unknowns: np.ndarray, errors: np.ndarray, noise: float
 ) -> StateNoise:
-    """The parts that the states clearly ask for, by the largest likelihood of what a fit leaves.
+    """The parts that the residuals clearly show, by maximum likelihood.
 
-    A stated noise has its floor where it was stated. Where the phase was controlled, what scatters
-    is the frequency.
+    A stated noise includes its floor. Where all states have one phase, the frequency scatters.
     Arguments: `balance` of states with errors of one size; `unknowns` and `errors` of the fit, and
     its `noise` over these.
     """

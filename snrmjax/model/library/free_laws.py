@@ -6,6 +6,7 @@ that the force is exactly zero at rest; beyond the last one f continues straight
 power of x, dry friction and a contact are all smooth.
 """
 
+import dataclasses
 from typing import Any, ClassVar, Self
 
 import jax
@@ -68,11 +69,12 @@ class AbstractLaw(AbstractEffect):
 
     def idle(self, natural_frequency: float, damping_ratio: float) -> Self:
         """The same knots without any force."""
-        knots = {
-            name: getattr(self, name) * (0.0 if parameter.entries is Entries.VALUES else 1.0)
+        values = {
+            name: 0.0 * getattr(self, name)
             for name, parameter in self.parameters().items()
+            if parameter.entries is Entries.VALUES
         }
-        return type(self)(**knots)
+        return dataclasses.replace(self, **values)
 
 
 def _displacements() -> Any:

@@ -58,7 +58,17 @@ def test_one_sensor_tells_it_by_the_law():
     assert answer["effects"] == ["cubic_stiffness"]
     assert sum(answer["probabilities"].values()) == pytest.approx(1.0)
     # The verdict of the test in Python is that of the file.
-    by_mode = SimpleNamespace(verdict=Verdict.UNKNOWN)
+    for verdict, effects in (
+        (Verdict.DRAWN, ("stiffness_law",)),
+        (Verdict.NAMED, ("quintic_stiffness",)),
+        (Verdict.AMBIGUOUS, ("cubic_stiffness",)),
+    ):
+        assert DiagnosedTest(
+            SimpleNamespace(verdict=verdict, effects=effects), model, None, found
+        ).is_placed
+    same = SimpleNamespace(verdict=Verdict.NAMED, effects=("cubic_stiffness",))
+    assert not DiagnosedTest(same, model, where=found).is_placed
+    by_mode = SimpleNamespace(verdict=Verdict.UNKNOWN, effects=())
     test = DiagnosedTest(by_mode, model, where=found)
     assert test.verdict == answer["verdict"] == Verdict.NAMED
     assert answer_in_words(test) == "named (cubic_stiffness at x3-x2)"

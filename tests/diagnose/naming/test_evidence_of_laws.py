@@ -158,6 +158,23 @@ def test_the_fraction_of_a_law_is_right_beside_another_power_of_the_amplitude(po
     assert part.explained.high - part.explained.low < 0.5
 
 
+@pytest.mark.parametrize(
+    ("fraction", "with_a_rest", "with_noise"),
+    [
+        ((0.43, 0.0, 0.81), False, False),  # a wire's quintic spring, measured
+        ((0.6, 0.2, 0.9), False, True),
+        ((0.6, 0.5, 0.7), False, False),
+        ((0.9, 0.4, 1.0), False, True),
+        ((0.9, 0.7, 1.0), True, True),
+    ],
+)
+def test_a_law_is_named_where_it_explains_most(fraction, with_a_rest, with_noise):
+    """80 % and at least half; beside noise at least half and perhaps 80 %."""
+    explained = parts.Explained(*fraction)
+    assert explained.is_most(rest_is_noise=False) is with_a_rest
+    assert explained.is_most(rest_is_noise=True) is with_noise
+
+
 def test_odds_of_a_remainder_are_those_of_the_dense_gaussian():
     read = readings(lambda x: 0.02 * x**2 + 0.004 * np.sin(4 * x), nothing)
     problem = problem_of(read, hypothesis_columns(read, LAWS), 1.0)
