@@ -314,7 +314,7 @@ def checked_states(
 
 
 def _with_scattering_frequency(test: TestStates) -> TestStates:
-    """The states with a scatter of the natural frequency, where their phase was controlled.
+    """The states with a scatter of the natural frequency, where their phase may be controlled.
 
     Of sweeps through the half-power points it stays out: there, such scatter is how a wrong column
     shows.
@@ -324,8 +324,6 @@ def _with_scattering_frequency(test: TestStates) -> TestStates:
     found = fit_test(
         test, tempered=True, compare_levels=False, parts_of_noise=True, rounds=Rounds(6, 24)
     )
-    if not found.phase_is_controlled:
-        return test
     errors = found.states.errors[:, RECORDED:]
     return test._replace(errors=np.column_stack([test.errors, errors]))
 

@@ -60,6 +60,7 @@ from snrmjax.numerics.blocks import on_one_core
 _ALL = Rounds()
 _NOISE_ROUNDS = 3  # of finding what noise is made of, at most
 _SAME_NOISE = 0.1  # relative, by which its parts then move
+_LITTLE_MORE = 2.0  # times: phases that were not controlled spread far more than by scatter
 _REACH = 3.0  # times the dynamic stiffness, that a natural frequency may lie beside a test
 
 
@@ -105,7 +106,7 @@ class TestPosterior(NamedTuple):
 
     @property
     def phase_is_controlled(self) -> bool:
-        """Whether phases spread less than the scatter of the natural frequency would make them.
+        """Whether phases spread little more than scatter of the natural frequency would make them.
 
         The phase was then controlled, and the states do not determine the modal mass: a small mass
         with a wide resonance would explain the small spread.
@@ -114,7 +115,7 @@ class TestPosterior(NamedTuple):
             return True
         bandwidth = np.median(np.abs(self.curves(self.states.amplitude).modal_damping))
         turned = 2 * self.frequency_scatter * float(np.median(self.states.frequency) / bandwidth)
-        return turned > float(np.std(self.states.phase))
+        return _LITTLE_MORE * turned > float(np.std(self.states.phase))
 
     @property
     def modal_mass(self) -> tuple[float, float]:

@@ -73,10 +73,16 @@ def test_scatter_of_the_frequency_changes_neither_mass_nor_damping(scatter):
     )
 
 
-@pytest.mark.parametrize(("scatter", "spread"), [(1e-4, 3), (1e-3, 5), (1e-3, 20), (0.0, 20)])
-def test_phases_that_are_kept_loosely_change_neither_mass_nor_damping(scatter, spread):
-    """As a scatter of the phase it made ζ 9 to 700 % too large, and units were blamed."""
-    model, data = about_resonance(scatter, np.radians(spread), seed=1)
+@pytest.mark.parametrize(
+    ("scatter", "spread", "seed"),
+    [(1e-4, 3, 0), (1e-4, 3, 2), (1e-3, 5, 2), (1e-3, 5, 4), (1e-3, 20, 1), (0.0, 20, 1)],
+)
+def test_phases_that_are_kept_loosely_change_neither_mass_nor_damping(scatter, spread, seed):
+    """Scatter that was taken for noise of the phase made ζ 9 to 700 % too large.
+
+    The check then named rms amplitudes, other units or volts.
+    """
+    model, data = about_resonance(scatter, np.radians(spread), seed)
     fit = sj.fit_jointly(data, model)
     assert fit.modes_found.participation == pytest.approx(model.modes.participation)
     x = np.geomspace(0.12, 0.95, 20)
