@@ -48,7 +48,9 @@ def reference_of(predictions: Predictions) -> Reference | None:
     if len(rows) < _FEWEST:
         return None
     states = test_states_of(predictions, rows)
-    found = fit_test(states, parts_of_noise=True)
+    # The misfit weighs states by one relative noise: only where phases may have been controlled,
+    # whose scatter is the frequency's, is it taken apart.
+    found = fit_test(states, parts_of_noise=states.near_one_phase)
     # What errors move belongs to the motion that was there: the records without any of them.
     levels = found.level_errors[states.level]
     errors = found.corrections[:, 1] - (0.0 if states.force_is_free else levels[:, 0])

@@ -80,18 +80,18 @@ def view_of(
     states = _test_states(problem, free, stated, guess)
     rounds = Rounds(most_knots=MOST_KNOTS if knots is None else knots)
     fit = functools.partial(fit_test, robust=robust, tempered=True)
-    first = functools.partial(fit, states, compare_levels=False, parts_of_noise=True)
-    posterior = first(rounds=rounds)
+    first = functools.partial(fit, compare_levels=False, parts_of_noise=True)
+    posterior = first(states, rounds=rounds)
     if _noise_of(posterior, stated).exceeded:  # curves may be steeper than their knots let them
-        posterior = first(rounds=rounds._replace(crowded=True))
-    states = posterior.states
+        posterior = first(states, rounds=rounds._replace(crowded=True))
     mass, std = posterior.modal_mass
     if assumed and (posterior.phase_is_controlled or abs(mass - 1) <= _ASKED * std):
         linear = np.append(np.asarray(problem.prior.linear)[:-1], 0.0)
         known = dataclasses.replace(problem.prior, linear=jax.device_put(linear))
         problem = dataclasses.replace(problem, prior=known)
         states = states._replace(mass_std=0.0)
-        posterior = fit(states, compare_levels=False, rounds=rounds._replace(start=posterior))
+        posterior = first(states, rounds=rounds._replace(start=posterior))
+    states = posterior.states
     named = any(choice.kind not in SMOOTH or choice.argument == "velocity" for choice in choices)
     start = rounds._replace(start=posterior)
     if named:

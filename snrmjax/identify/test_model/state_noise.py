@@ -19,6 +19,7 @@ from snrmjax.identify.test_model.states import RECORDED, TestStates
 
 _CLEARLY = 20.0  # of −2 ln p, to believe in noise of a kind that nobody stated
 _LEAST = 0.01  # of the noise, that is never of another kind: others are in units of it
+_OF_FLOOR = 0.05  # of the floor at a typical state, that the relative noise is at least
 _START = 0.5  # of the noise, from which a part is looked for
 
 
@@ -56,10 +57,12 @@ def noise_of_states(
     base = noise * states.errors[:, :RECORDED]
     floor = 1 / np.abs(states.velocity)  # of 1 m/s
 
+    typical = noise * np.median(np.abs(states.velocity))
+
     def parts(point: np.ndarray, kinds: tuple[bool, bool]) -> np.ndarray:
         found = np.zeros(3)
         found[[True, *kinds]] = np.exp(point)
-        found[0] = max(found[0], _LEAST)
+        found[0] = max(found[0], _LEAST, _OF_FLOOR * found[2] / typical)
         return found
 
     def criterion(point: np.ndarray, kinds: tuple[bool, bool]) -> float:
@@ -72,7 +75,7 @@ def noise_of_states(
 
     # Each part as large as the first at a typical state.
     size = np.median(np.abs(noise * now.z) / np.abs(now.stiffness))
-    start = np.log(_START * np.array([1.0, size, noise * np.median(np.abs(states.velocity))]))
+    start = np.log(_START * np.array([1.0, size, typical]))
     best = (np.inf, np.zeros(3))
     wander = (True,) if states.of_one_phase else (False, True)
     for kinds in itertools.product(wander, (False, True)[: 2 - states.stated]):
