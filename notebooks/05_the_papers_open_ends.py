@@ -77,15 +77,15 @@ PRINTED = {  # drive in V and force in N of section 4.1, forces of the validatio
         [1.066e-3, 2.287e-3, 4.169e-3],
     ),
 }
-lines, intercepts, shares = {}, {}, {}
+covariances, intercepts, shares = {}, {}, {}
 figure, grid = drawing.panels(drawing.PAGE, 3.4, 1, 2)
 for axes, (name, (volts, tenths, used)) in zip(grid[0], PRINTED.items(), strict=True):
     newtons = 1e-4 * np.array(tenths)
-    line = sj.measure.calibrate_force(volts, newtons)
-    missing = -float(line.offset)
+    (gain, offset), covariance = np.polyfit(volts, newtons, 1, cov=True)
+    missing = -float(offset)
     twice = student.ppf(0.975, len(volts) - 2)  # few points: not 2
-    half_width = twice * float(jnp.sqrt(line.covariance[1, 1]))
-    lines[name], intercepts[name] = line, (missing, half_width)
+    half_width = twice * float(np.sqrt(covariance[1, 1]))
+    covariances[name], intercepts[name] = covariance, (missing, half_width)
     shares[name] = missing / used[0]
     print(
         f"{name}: intercept −{1e6 * missing:.1f} ± {1e6 * half_width:.1f} µN (95 %), "
@@ -93,8 +93,8 @@ for axes, (name, (volts, tenths, used)) in zip(grid[0], PRINTED.items(), strict=
         f"calibrated from {1e6 * newtons[0]:.0f} to {1e6 * newtons[-1]:.0f} µN"
     )
     force = np.geomspace(newtons[0], used[-1], 200)
-    drive = (force - line.offset) / line.gain
-    band = twice * np.asarray(line.force_std(drive)) / force
+    row = np.stack([(force - offset) / gain, np.ones_like(force)])
+    band = twice * np.sqrt(np.sum(row * (covariance @ row), axis=0)) / force
     axes.axvspan(
         1e3 * newtons[0], 1e3 * newtons[-1], color="0.93", zorder=0, label="calibrated range"
     )
@@ -315,7 +315,8 @@ for drop in (0.02, 0.05, 0.10, missing / (lowest + missing)):
         f"a drop of {100 * drop:4.1f} % at {1e3 * lowest:.3f} mN: f₀ = {1e6 * needed:5.1f} µN, "
         f"{needed / missing:.2f} of the printed intercept"
     )
-own = student.ppf(0.975, 3) * float(lines["flat"].force_std(0.0598)) / lowest
+at = np.array([0.0598, 1.0])  # V
+own = student.ppf(0.975, 3) * np.sqrt(at @ covariances["flat"] @ at) / lowest
 precision = max(std for _, std in offsets.values()) / forces[0]
 print(f"the line's own error at that force: ± {100 * own:.1f} % (95 %)")
 print(f"30 to 36 states as above find the offset to ± {100 * precision:.1f} % of the lowest force")

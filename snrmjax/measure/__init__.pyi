@@ -1,7 +1,5 @@
 from .base_excitation import base_excited_states
 from .decays.isolated_decay import IsolatedDecay, isolate_decay
-from .force_calibration import ForceCalibration, apply_calibration, calibrate_force
-from .force_on_mode import EquivalentForce, equivalent_force
 from .indicators import appropriation_of, nnm_appropriation
 from .recordings.channels import Channel
 from .recordings.frequency_responses import FrequencyResponses, frequency_responses
@@ -16,8 +14,6 @@ from .sweeps.sweep_bias import sweep_bias
 
 __all__ = [
     "Channel",
-    "EquivalentForce",
-    "ForceCalibration",
     "FrequencyResponses",
     "IsolatedDecay",
     "MultisineResponses",
@@ -25,11 +21,8 @@ __all__ = [
     "SteppedSineStates",
     "SweptStates",
     "TimeRecording",
-    "apply_calibration",
     "appropriation_of",
     "base_excited_states",
-    "calibrate_force",
-    "equivalent_force",
     "find_ring_downs",
     "force_velocity_loop",
     "frequency_responses",

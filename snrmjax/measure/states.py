@@ -279,9 +279,7 @@ def check_force(data: SteadyStates, purpose: str) -> None:
     raise ValueError(
         f"{purpose} needs the force in newtons, but only a drive voltage (`drive_v`) is given. Let "
         "a joint fit find the force per volt together with the curves: `--fit auto --free "
-        'force_gain`, in Python `fit_jointly(data, modes, free=["force_gain"])`. Or calibrate the '
-        "force with low-level responses first: `sj.measure.equivalent_force`, `calibrate_force` "
-        "and `apply_calibration`."
+        'force_gain`, in Python `fit_jointly(data, modes, free=["force_gain"])`.'
     )
 
 

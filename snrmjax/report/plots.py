@@ -17,11 +17,9 @@ from snrmjax.report.figures.reduction import scale_figure, static_figure
 from snrmjax.report.figures.simulation import (
     amplitudes_figure,
     motions_figure,
-    points_figure,
     simulated_response_figure,
 )
-from snrmjax.report.sampling import BAND, sensor_index, span_of
-from snrmjax.report.style import unit_for
+from snrmjax.report.sampling import sensor_index, span_of
 
 
 def plot_result(result: object, **settings: Any) -> Figure:
@@ -76,24 +74,13 @@ def _curves(values: Any, *, sensor: str = "the sensor") -> Figure:
     )
 
 
-def _force_over_drive(drive: Any, force: Any, std: Any, *, joined: bool = False) -> Figure:
-    force, error = np.asarray(force), BAND * np.nan_to_num(np.asarray(std))
-    unit = unit_for(force[np.isfinite(force)], "N")
-    words = "force, 95 %", "Drive (V)", f"Force ({unit.name})"
-    return points_figure(
-        np.asarray(drive), force / unit.size, *words, error=error / unit.size, joined=joined
-    )
-
-
-def _calibration(found: Any) -> Figure:
-    drive = np.linspace(0.0, 1.0, 50)
-    return _force_over_drive(drive, found.force(drive), found.force_std(drive), joined=True)
-
-
 def _residuals(found: Any) -> Figure:
     """Whitened residuals: within ±2 for 95 % where model and noise are right."""
-    rows, words = np.arange(len(found.residuals)), ("residuals", "Steady state", "Residual (1σ)")
-    return points_figure(rows, found.residuals, *words, limits=(-2.0, 2.0))
+    return simulation_figures.points_figure(
+        *(np.arange(len(found.residuals)), found.residuals),
+        *("residuals", "Steady state", "Residual (1σ)"),
+        limits=(-2.0, 2.0),
+    )
 
 
 # By the names of classes: none of them is imported before there is a result of it.
@@ -110,12 +97,10 @@ _FIGURES: dict[str, Callable[..., Figure]] = {
     "DampedModeBranch": simulation_figures.damped_mode_figure,
     "DecayModes": decay_figure,
     "Diagnosis": diagnosis_figures.misfit_figure,
-    "EquivalentForce": lambda one: _force_over_drive(one.drive, one.force, one.force_std),
     "EventCurve": lambda one, **settings: simulation_figures.event_curve_figure([one], **settings),
     "FittedResponse": lambda one: joint_figures.next_measurements_figure(
         [one], [], sensor=one.sensor
     ),
-    "ForceCalibration": _calibration,
     "Identification": lambda one, **settings: figures.backbone_figure(
         one.points, one.backbone, **settings
     ),

@@ -63,30 +63,3 @@ def test_indicators(broken):
     )
     # State 1 fails, but for its harmonics, which count.
     check_derivatives(of_indicators, 7, data, failed=[] if broken is None else [1, 4])
-
-
-def of_calibrations(relative, drive, data):
-    line = sj.measure.calibrate_force(
-        drive * (1 + relative[:4]), np.array([1.0, 2.1, 2.9, 4.2]) * (1 + relative[4:8])
-    )
-    newtons = np.array([1.0, 2.1, 2.9, 4.2])
-    stated = sj.measure.calibrate_force(drive, newtons * (1 + relative[4:8]), 0.1 * newtons)
-    moved = dataclasses.replace(data, drive=data.drive * (1 + relative[8:]))
-    forces = sj.measure.apply_calibration(moved, line)
-    return numbers(
-        *(line.gain, line.offset, line.covariance, line.residual_std, stated.gain, stated.misfit),
-        *(line.force_std(drive), forces.force, forces.force_std),
-    )
-
-
-def test_calibrations_with_a_drive_that_is_too_small():
-    drive = np.array([0.01, 0.02, 0.03, 0.04])
-    # The second drive is below zero of the line: no force; the third has none, but a force.
-    data = sj.measure.steady_states(
-        [1, 1, 1],
-        np.full(3, OMEGA),
-        [np.nan, np.nan, 2.0],
-        np.ones(3),
-        drive=[0.02, -0.5, np.nan],
-    )
-    check_derivatives(of_calibrations, 11, drive, data, failed=[9, 10])

@@ -55,14 +55,13 @@ def results():
     data = sj.measure.steady_states(level, frequency, force, velocity, sensors=[SENSOR])
     found = sj.identify_backbone(data, modes)
     fit = sj.fit_jointly(data, modes, backbone="polynomial:2", damping="constant")
-    line = sj.measure.calibrate_force([0.01, 0.02, 0.03], [1.0, 2.1, 2.9])
-    made = (modes, sj.model.structure(modes), data, found, found.points, found.backbone, fit, line)
+    made = (modes, sj.model.structure(modes), data, found, found.points, found.backbone, fit)
     return {type(one).__name__: one for one in made}
 
 
 NAMES = (
     *("LinearModes", "Structure", "SteadyStates", "Identification", "BackbonePoints"),
-    *("Backbone", "JointFit", "ForceCalibration"),
+    *("Backbone", "JointFit"),
 )
 
 

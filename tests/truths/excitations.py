@@ -1,10 +1,9 @@
-"""A Duffing oscillator excited in four ways, integrated in time by SciPy's DOP853.
+"""A Duffing oscillator excited in three ways, integrated in time by SciPy's DOP853.
 
 A mass of 0.4 kg on a spring with a cubic part and a dashpot (50 Hz, 2 %), until it is periodic;
 then the fundamental of what sensors see: a `point` force; a shaker table (`base`); a free rigid
-`fixture` of 1.5 kg that a stinger forces (the paper's section 4); a `drive` voltage that low levels
-calibrate. The truth is the closed form of the relative motion, ω̃² = ω²(1 + ¾e + 3e²/128),
-e = γa²/k.
+`fixture` of 1.5 kg that a stinger forces (the paper's section 4). The truth is the closed form of
+the relative motion, ω̃² = ω²(1 + ¾e + 3e²/128), e = γa²/k.
 """
 
 import numpy as np
@@ -18,7 +17,6 @@ STIFFNESS = MASS * (50 * HERTZ) ** 2  # N/m
 DAMPING = 2 * 0.02 * MASS * 50 * HERTZ  # N s/m
 CUBIC = 6e10  # N/m³
 CYCLES, SAMPLES = 140, 64
-GAIN = 0.37  # N/V of the fourth way
 
 
 def internal(stretch, rate):
@@ -43,14 +41,13 @@ def settled(equations, omega, start):
 
 
 def level_of(way, size, omegas):
-    """Rows (frequency, load phasor, velocity phasor) of one level, `size` in N, m/s² or V."""
+    """Rows (frequency, load phasor, velocity phasor) of one level, `size` in N or m/s²."""
     rows = []
     for omega in omegas:
-        if way in ("point", "drive"):
-            load = size * (GAIN if way == "drive" else 1.0)
+        if way == "point":
 
-            def equations(t, y, load=load, omega=omega):
-                return y[1], (load * np.cos(omega * t) - internal(y[0], y[1])) / MASS
+            def equations(t, y, omega=omega):
+                return y[1], (size * np.cos(omega * t) - internal(y[0], y[1])) / MASS
 
             time, y = settled(equations, omega, (0.0, 0.0))
             rows.append((omega, size, fundamental(time, y[1], omega)))
@@ -99,7 +96,6 @@ def ways():
         "point": (point, (1.0, 3.0, 6.0), MASS, own),
         "base": (base, (2.5, 7.5, 15.0), MASS, own),
         "fixture": (fixture, (4.0, 11.0, 22.0), reduced, free),
-        "drive": (point, (0.1, 0.2, 0.3, 2.7, 8.1, 16.2), MASS, own),
     }
 
 
@@ -116,7 +112,6 @@ def measured_test(way, n_states):
         )
         force = (
             size
-            * (GAIN if way == "drive" else 1.0)
             * per_load
             * (
                 float(modes.mode_shape[0, 0]) ** 2
@@ -130,14 +125,7 @@ def measured_test(way, n_states):
     level = level.astype(int)
     if way == "base":
         return modes, sj.measure.base_excited_states(level, omega, load + 0j, velocity[:, None])
-    if way != "drive":
-        return modes, sj.measure.steady_states(level, omega, load, velocity)
-    none = np.full(len(level), np.nan)
-    volts = sj.measure.steady_states(level, omega, none, velocity, drive=load)
-    low = level <= 3
-    seen = sj.measure.equivalent_force(volts.select(low), modes)
-    gain = sj.measure.calibrate_force(seen.drive, seen.force)
-    return modes, sj.measure.apply_calibration(volts.select(~low), gain)
+    return modes, sj.measure.steady_states(level, omega, load, velocity)
 
 
 def frequency_at(phase, force, reduced):

@@ -403,11 +403,9 @@ def points_figure(
     below: str,
     beside: str,
     *,
-    error: np.ndarray | None = None,
-    joined: bool = False,
     limits: Sequence[float] = (),
 ) -> Figure:
-    """Points with error bars, or `joined` a curve in the band of its errors; dashed `limits`.
+    """Points, with dashed `limits`.
 
     Arguments: `title` and what the axes `below` and `beside` are. Returns the figure. Raises
     `ValueError` without a finite value.
@@ -415,12 +413,7 @@ def points_figure(
     if not np.isfinite(y).any():
         raise ValueError(f"there is nothing to show: {title} has no finite value.")
     figure, ((axes,),) = panels(COLUMN, 3.4, 1, 1)
-    if joined:
-        banded(axes, x, y, error, SIMULATED)
-    elif error is None:
-        axes.plot(x, y, **DOT)
-    else:
-        axes.errorbar(x, y, yerr=error, **DOT)
+    axes.plot(x, y, **DOT)
     for limit in limits:
         axes.axhline(limit, color=BACKGROUND, linestyle="--")
     name_axes(axes, title, below, beside)
