@@ -130,8 +130,8 @@ headline["both beyond 95 % of their own error"] = all(c > half for c, half in in
 # ### Virtual tests of a beam with the intercept left out of the force
 #
 # The flat beam's first mode with its own cubic stiffness, 79.02 Hz and 5 % of linear damping; six
-# levels over the paper's range of forces, frequency stepped up and down, **integrated in time**
-# until settled. The same with friction in place of the error: Coulomb's force takes off as much as
+# levels over the paper's range of forces, frequency stepped up and down, by harmonic balance. The
+# same with friction in place of the error: Coulomb's force takes off as much as
 # a tenth of the lowest force does at resonance. Records of these motions differ in their
 # phases and in the error of the force; noise is 1 % in amplitude, 0.7° in phase and 0.3 % in force.
 
@@ -162,11 +162,10 @@ motions = {
         102 * HERTZ,
         appropriation=(0.2, 1.0),
         points_per_level=100,
-        simulation=sj.simulate.SweepSimulation(by="time_integration", steps_per_sweep=110),
     ).steady_states
     for name, one in (("beam", truth), ("beam with friction", rubbing))
 }
-print({name: f"{states.n_states} settled states" for name, states in motions.items()})
+print({name: f"{states.n_states} states" for name, states in motions.items()})
 
 
 # %%

@@ -15,17 +15,12 @@ from .solutions.mode_at_velocities import normal_mode_at_velocities
 from .solutions.normal_modes import nonlinear_normal_mode
 from .solutions.periodic_motion import periodic_motion
 from .solutions.quasi_periodic import quasi_periodic_branch
-from .solutions.time_integration import (
-    IntegrationAccuracy,
-    MotionStatus,
-    settled_motion,
-    stepped_motions,
-)
+from .solutions.time_integration import IntegrationAccuracy, MotionStatus, settled_motion
 from .solutions.tracked_motion import TrackedMotion
 from .virtual_test.equipment import Instruments, Shaker
 from .virtual_test.laboratory import AbstractController, Laboratory, run_test
 from .virtual_test.phase_loop import LoopGains, phase_sweep
-from .virtual_test.phase_resonance_test import SweepSimulation, phase_resonance_test
+from .virtual_test.phase_resonance_test import phase_resonance_test
 from .virtual_test.programmes import (
     AmplitudeGains,
     Playback,
@@ -57,7 +52,6 @@ __all__ = [
     "Shaker",
     "Stability",
     "StepControl",
-    "SweepSimulation",
     "TrackedMotion",
     "damped_normal_mode",
     "decay_test",
@@ -81,7 +75,6 @@ __all__ = [
     "solve_at_frequency",
     "starts_beside_folds",
     "steady_states_of",
-    "stepped_motions",
     "stepped_sine_test",
     "velocity_phasors",
 ]

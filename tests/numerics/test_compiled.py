@@ -73,7 +73,7 @@ def test_a_backbone_at_other_amplitudes_compiles_nothing(compilations):
     test = sj.phase_resonance_test(
         *(beam, np.linspace(1e-3, 6e-3, 4), 60 * hertz, 110 * hertz),
         points_per_level=4,
-        simulation=sj.simulate.SweepSimulation(harmonic_order=3),
+        harmonic_order=3,
     )
     backbone = sj.identify_backbone(test.steady_states, beam.modes).backbone
     methods = (backbone.natural_frequency, backbone.damping_ratio, backbone.velocity)

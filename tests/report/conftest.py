@@ -22,7 +22,7 @@ def virtual(model):
         85 * HERTZ,
         appropriation=(0.5, 0.98),
         recording=sj.simulate.Recording(errors, keep_harmonics=(2, 3)),
-        simulation=sj.simulate.SweepSimulation(harmonic_order=3),
+        harmonic_order=3,
     )
 
 

@@ -72,19 +72,13 @@ RESULTS = {
     "virtual test": (
         lambda: sj.phase_resonance_test(
             *(oscillator(), np.array([0.05, FORCE]), *ENDS),
-            simulation=sj.simulate.SweepSimulation(harmonic_order=3),
+            harmonic_order=3,
         ),
         ("VirtualTest: 10 states", "force_n", "N"),
     ),
     "settled motion": (
         lambda: sj.simulate.settled_motion(oscillator(), FORCE, 1.5, harmonic_order=3),
         ("IntegratedMotion: 4 harmonics", "velocity_re_m_s", "m/s"),
-    ),
-    "stepped sine": (
-        lambda: sj.simulate.stepped_motions(
-            oscillator(), FORCE, (1.4, 1.5), cycles_per_step=20, harmonic_order=3
-        ),
-        ("IntegratedMotion: 2 motions", "frequency_hz", "Hz"),
     ),
 }
 
@@ -131,19 +125,6 @@ def test_tables_have_one_row_a_member():
     np.testing.assert_allclose(table["peak_frequency_hz"] * HERTZ, batch.peak_frequency)
     assert set(table["status"]) == {"upper_end"}
     assert set(table["n_not_located"]) == {0}
-
-
-def test_steps_that_had_not_settled_are_counted():
-    # Eight cycles are too few for a motion that decays by a tenth in each.
-    simulation = sj.simulate.SweepSimulation("time_integration", 3, 25, cycles_per_step=8)
-    with pytest.raises(ValueError, match="no stable state"):
-        sj.phase_resonance_test(oscillator(), FORCE, *ENDS, simulation=simulation)
-    modes = sj.model.linear_modes([2.0], [0.2], [[1.0]], [1.5])
-    damped = sj.model.structure(modes)
-    simulation = sj.simulate.SweepSimulation("time_integration", 1, 25, cycles_per_step=10)
-    test = sj.phase_resonance_test(damped, 0.01, 1.5, 2.5, simulation=simulation)
-    assert 0 < test.n_unsettled < 50  # of 25 steps up and as many down
-    assert test.to_xarray().attrs["n_unsettled"] == test.n_unsettled
 
 
 def test_a_response_is_labelled_as_its_file_is(curve):

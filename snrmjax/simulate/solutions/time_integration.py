@@ -1,11 +1,10 @@
-"""Settled motions and stepped sines by time integration: what a test sees, transients included.
+"""Settled motions by time integration.
 
 Needs diffrax: pip install 'snrmjax[integrate]'.
 """
 
 from typing import Any, ClassVar, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -86,7 +85,6 @@ class IntegrationAccuracy(NamedTuple):
 
 
 SETTLED_ACCURACY = IntegrationAccuracy()
-STEPPED_ACCURACY = IntegrationAccuracy(settled=1e-4)
 
 
 def settled_motion(
@@ -127,66 +125,19 @@ def settled_motion(
     >>> bool(motion.converged), bool(abs(motion.velocity[1] / exact - 1).max() < 1e-4)
     (True, True)
     """
-    positive("frequency", frequency)
-    motions = stepped_motions(
-        *(model, force, jnp.asarray(frequency, dtype=jnp.float64)[None]),
-        cycles_per_step=max_cycles,
-        start=start,
-        harmonic_order=harmonic_order,
-        accuracy=accuracy,
-    )
-    return jax.tree.map(lambda part: part[0], motions)
-
-
-def stepped_motions(
-    model: Structure,
-    force: Float[Array, ""] | float,
-    frequencies: Float[Array, " step"] | np.ndarray,
-    *,
-    cycles_per_step: int = 200,
-    start: Float[Array, "..."] | np.ndarray | None = None,
-    test_orders: Float[Array, " step"] | np.ndarray | None = None,
-    harmonic_order: int = 9,
-    accuracy: IntegrationAccuracy = STEPPED_ACCURACY,
-) -> IntegratedMotion:
-    """Step the frequency of a cosine force, up or down, without ever stopping the motion.
-
-    At each step the state and the phase of the force go on from where the last one left them,
-    so that the motion jumps where it does in a test: early, when the transient of a step throws
-    it over the edge of a narrowing basin. A step lasts until the motion has settled, at most
-    `cycles_per_step` cycles; what it shows is its last cycle, settled or not.
-
-    Arguments: `force` in N; `frequencies` in rad/s, in the order of the test; `test_orders` from
-    0 to 1, the time of each step for a model that drifts; the others as in `settled_motion`.
-    Returns an `IntegratedMotion` whose arrays lead with the step. Another number of steps
-    compiles anew. Raises as `settled_motion` does, and is not differentiable by `jax.grad` either.
-    """
     positive("force", force)
-    positive("frequencies", frequencies)
-    if cycles_per_step < LEAST_CYCLES:
+    positive("frequency", frequency)
+    if max_cycles < LEAST_CYCLES:
         raise ValueError(
-            f"a motion needs {LEAST_CYCLES} cycles or more to settle, but gets {cycles_per_step}."
+            f"a motion needs {LEAST_CYCLES} cycles or more to settle, but gets {max_cycles}."
         )
-    frequencies = jnp.asarray(frequencies, dtype=jnp.float64)
-    if frequencies.ndim != 1:
-        raise ValueError(
-            f"`frequencies` must be a vector of steps, but has shape {frequencies.shape}."
-        )
-    if test_orders is None:
-        test_orders = jnp.broadcast_to(model.test_order, frequencies.shape)
-    test_orders = jnp.asarray(test_orders, dtype=jnp.float64)
-    if test_orders.shape != frequencies.shape:
-        raise ValueError(
-            f"`test_orders` must have shape {frequencies.shape}, but has {test_orders.shape}."
-        )
-    return _stepped(
+    return _settled(
         simulated_structure(model),
         jnp.asarray(force, dtype=jnp.float64),
-        frequencies,
-        test_orders,
+        jnp.asarray(frequency, dtype=jnp.float64),
         _start_state(model, start),
         harmonic_order,
-        _Settings(jnp.asarray(cycles_per_step), *(jnp.asarray(part) for part in accuracy)),
+        _Settings(jnp.asarray(max_cycles), *(jnp.asarray(part) for part in accuracy)),
     )
 
 
@@ -223,40 +174,32 @@ class _Settling(NamedTuple):
 
 
 @jitted
-def _stepped(
+def _settled(
     model: Structure,
     force: Float[Array, ""],
-    frequencies: Float[Array, " step"],
-    test_orders: Float[Array, " step"],
+    frequency: Float[Array, ""],
     start: Float[Array, "2 mode"],
     harmonic_order: int,
     settings: _Settings,
 ) -> IntegratedMotion:
-    """The motions at all steps, of the structure as simulated."""
+    """The motion of the structure as simulated."""
     q, v = start
     unscaled = jnp.ones(len(model.hysteretic))
     memory = memory_at_rest(model, scaled_friction(model, unscaled, unscaled), q)
     begin = CyclePoint(q, v, memory, jnp.asarray(0.01), jnp.zeros(()), 0 * unscaled, 0 * unscaled)
-
-    def dwell(point: CyclePoint, step: tuple[Array, Array]) -> tuple[CyclePoint, IntegratedMotion]:
-        frequency, order = step
-        now = eqx.tree_at(lambda m: m.test_order, model, order)
-        acting = newtons(model.modes.unbalance, frequency, force)
-        settled = _settle(now, acting, frequency, point, harmonic_order, settings)
-        end = settled.point
-        motion = IntegratedMotion(
-            force=force,
-            frequency=frequency,
-            coefficients=settled.coefficients,
-            velocity=velocity_phasors(settled.coefficients, frequency, model.modes.mode_shape),
-            state=jnp.stack([end.q, end.v]),
-            status=_status(now, frequency, settled, settings),
-            distance=settled.distance,
-            n_cycles=settled.n_cycles,
-        )
-        return end, motion
-
-    return jax.lax.scan(dwell, begin, (frequencies, test_orders))[1]
+    acting = newtons(model.modes.unbalance, frequency, force)
+    settled = _settle(model, acting, frequency, begin, harmonic_order, settings)
+    end = settled.point
+    return IntegratedMotion(
+        force=force,
+        frequency=frequency,
+        coefficients=settled.coefficients,
+        velocity=velocity_phasors(settled.coefficients, frequency, model.modes.mode_shape),
+        state=jnp.stack([end.q, end.v]),
+        status=_status(model, frequency, settled, settings),
+        distance=settled.distance,
+        n_cycles=settled.n_cycles,
+    )
 
 
 def _settle(

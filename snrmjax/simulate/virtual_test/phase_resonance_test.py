@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import ClassVar, Literal, NamedTuple, get_args
+from typing import ClassVar, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -23,7 +23,6 @@ from snrmjax.simulate.virtual_test.appropriation import (
     spread_in_phase,
     states_near,
 )
-from snrmjax.simulate.virtual_test.integrated_test import stepped_states
 from snrmjax.simulate.virtual_test.recording import (
     EXACT,
     Recording,
@@ -31,20 +30,6 @@ from snrmjax.simulate.virtual_test.recording import (
     check_recording,
     recorded_states,
 )
-
-Means = Literal["harmonic_balance", "time_integration"]
-
-
-class SweepSimulation(NamedTuple):
-    """How the motions of a phase-resonance test are computed."""
-
-    by: Means = "harmonic_balance"  # as if the frequency were stepped infinitely slowly
-    harmonic_order: int = 9  # highest of the motion
-    steps_per_sweep: int = 100  # of a time integration: equal steps of frequency
-    cycles_per_step: int = 200  # of a time integration, at most
-
-
-BY_HARMONIC_BALANCE = SweepSimulation()
 
 
 class VirtualTest(AbstractResult):
@@ -57,8 +42,6 @@ class VirtualTest(AbstractResult):
     curves: tuple[ResponseCurve, ...]  # the exact responses behind the test
     # States aimed at that the test did not reach, or that were not found.
     n_missing: int = setting(default=0)
-    # Steps of a time integration that had not settled: none is recorded.
-    n_unsettled: int = setting(default=0)
 
     def variables(self) -> Mapping[str, Variable]:
         """The steady states, by the names of their file's columns."""
@@ -75,7 +58,7 @@ def phase_resonance_test(
     appropriation: tuple[float, float] = (0.5, 0.7),
     points_per_level: int = 5,
     recording: Recording = EXACT,
-    simulation: SweepSimulation = BY_HARMONIC_BALANCE,
+    harmonic_order: int = 9,
 ) -> VirtualTest:
     """Step the frequency towards resonance at rising force levels and record near, not at, it.
 
@@ -87,18 +70,13 @@ def phase_resonance_test(
     reached.
 
     By harmonic balance it steps infinitely slowly and records exact states, at `order` from 0
-    to 1 in the order of the rows. By time integration it is `stepped_motions`: each level starts
-    from rest, goes up in `steps_per_sweep` equal steps of at most `cycles_per_step` cycles and
-    down again, jumps where a step's transient throws it off, and records of its own steps the
-    settled ones, at their time in the test; fewer than `points_per_level` where a coarse
-    sweep has no more, and no curves. Both record through the measurement effects of the model,
-    and drift makes its way through the test.
+    to 1 in the order of the rows, through the measurement effects of the model; drift makes its
+    way through the test. For transients see `stepped_sine_test` in a `Laboratory`.
 
     Arguments: `forces` in N, frequencies in rad/s; `recording` has the random errors and the
-    harmonics recorded beside the fundamental; `simulation` how the motions are computed.
+    harmonics recorded beside the fundamental; `harmonic_order` the highest of the motion.
     Returns a `VirtualTest`; its steady states carry the stated standard deviations, and
-    `n_missing` counts states aimed at that could not be computed, `n_unsettled` steps of a time
-    integration that had not settled.
+    `n_missing` counts states aimed at that could not be computed.
     Raises `ValueError` for an empty range of the indicator, for one that no stable state falls
     into, and for harmonics, errors or steps that make no sense.
     Not differentiable: differentiate the steady states of a model by
@@ -108,32 +86,17 @@ def phase_resonance_test(
     limits = phase_limits(appropriation)
     if points_per_level < 1:
         raise ValueError(f"`points_per_level` must be 1 or more, but is {points_per_level}.")
-    by, harmonic_order, steps_per_sweep, cycles_per_step = simulation
     check_recording(recording, harmonic_order)
-    if by not in get_args(Means):
-        raise ValueError(f"`by` must be one of {get_args(Means)}, but is {by!r}.")
-    if steps_per_sweep < 2:
-        raise ValueError(f"`steps_per_sweep` must be 2 or more, but is {steps_per_sweep}.")
     loads = positive("forces", forces).tolist()
     low, high = frequency_range(from_frequency, to_frequency).tolist()
-    if by == "harmonic_balance":
-        found = _along_curves(model, loads, (low, high), limits, points_per_level, harmonic_order)
-    else:
-        up = np.linspace(low, high, steps_per_sweep)
-        states, jumps, n_unsettled = stepped_states(
-            *(model, loads, up, limits, points_per_level),
-            cycles_per_step=cycles_per_step,
-            harmonic_order=harmonic_order,
-        )
-        found = _Visited(states, jumps, (), 0, n_unsettled)
+    found = _along_curves(model, loads, (low, high), limits, points_per_level, harmonic_order)
     if not len(found.states.level):
         raise ValueError(
             "no stable state has an appropriation indicator in the range asked for; widen "
-            "`appropriation` or the frequency range, or take more steps."
+            "`appropriation` or the frequency range."
         )
     recorded = recorded_states(model, found.states, recording)
-    counts = (found.n_missing, found.n_unsettled)
-    return VirtualTest(recorded, tuple(found.jumps), found.curves, *counts)
+    return VirtualTest(recorded, tuple(found.jumps), found.curves, found.n_missing)
 
 
 class _Visited(NamedTuple):
@@ -143,7 +106,6 @@ class _Visited(NamedTuple):
     jumps: list[tuple[int, float]]
     curves: tuple[ResponseCurve, ...]
     n_missing: int
-    n_unsettled: int = 0
 
 
 def _along_curves(

@@ -22,7 +22,6 @@ from snrmjax.model.parameters import (
 
 HERTZ = 2 * np.pi
 ORDER = 5  # of the tests and of the fits alike: what is left out is left out of both
-BY_BALANCE = sj.simulate.SweepSimulation(harmonic_order=ORDER)
 DRAG = "quadratic_damping.coefficient"
 
 
@@ -36,7 +35,7 @@ def curved_test(model, **settings):
     """Three levels, the response folds at the highest."""
     return sj.phase_resonance_test(
         model, (5e-5, 1.334e-4, 6.672e-4), 20 * HERTZ, 140 * HERTZ,
-        appropriation=(0.5, 1.0), points_per_level=6, simulation=BY_BALANCE, **settings,
+        appropriation=(0.5, 1.0), points_per_level=6, harmonic_order=ORDER, **settings,
     ).steady_states  # fmt: skip
 
 
@@ -161,7 +160,7 @@ def test_exact_data_of_the_flat_beam_give_its_dominant_coefficients():
     beam, forces = sj.model.flat_beam(), (4.448e-3, 1.334e-2)
     data = sj.phase_resonance_test(
         beam, forces, 60 * HERTZ, 120 * HERTZ, appropriation=(0.5, 1.0), points_per_level=6,
-        simulation=BY_BALANCE,
+        harmonic_order=ORDER,
     ).steady_states  # fmt: skip
     names = ("potential.1111", "potential.1112", "mode_1.natural_frequency", "mode_1.damping_ratio")
     start, truth = scaled(beam, names, np.array([1.3, 0.7, 1.02, 0.8]))
@@ -272,7 +271,7 @@ def test_other_sensors_and_harmonics_are_weighed_by_their_errors():
     chi, distance, freedom = 0.0, 0.0, 0
     for seed in range(4):
         data = sj.phase_resonance_test(
-            model, (0.02, 0.1), 250.0, 700.0, simulation=BY_BALANCE, points_per_level=6,
+            model, (0.02, 0.1), 250.0, 700.0, harmonic_order=ORDER, points_per_level=6,
             appropriation=(0.5, 1.0), recording=sj.simulate.Recording(errors, seed, (2, 3)),
         ).steady_states  # fmt: skip
         start, truth = scaled(model, names, np.array([1.2, 0.8]))

@@ -17,7 +17,6 @@ from snrmjax.simulate.solutions.time_integration import (
     IntegrationAccuracy,
     MotionStatus,
     settled_motion,
-    stepped_motions,
 )
 
 HZ = 2 * np.pi
@@ -159,68 +158,6 @@ def test_a_start_of_the_model_is_one_of_the_simulated_structure():
 # ----------------------------------------------------------------------------------- stepping
 
 
-def stepped_by_scipy(truth_of, frequencies, cycles):
-    """The same programme by Dormand & Prince, state and phase going on from step to step."""
-    state, found = [[1e-15, 0.0]], []
-    for omega in frequencies:
-        truth, period = truth_of(omega), 2 * np.pi / omega
-        times = np.concatenate([np.arange(128) / 128 + cycles - 1, [cycles]]) * period
-        rows = truth.integrate(state, times[-1], rtol=1e-9, t_eval=times)
-        state = rows[-1]
-        found.append(1j * omega * SHAPE * np.fft.rfft(rows[:-1, 0, 0])[1] / 64)
-    return np.array(found)
-
-
-@pytest.mark.long
-def test_a_coarse_sweep_jumps_early_as_scipy_says(stiffening, time_domain):
-    model, curve = stiffening
-    fold = curve.frequency[curve.at_events("fold")].max()
-    height, steps = {}, {}
-    for n_steps in (16, 31):
-        grid = np.linspace(0.95, 1.35, n_steps)
-        steps[n_steps] = grid[grid < 1.17] * OMEGA
-        options = {"cycles_per_step": 40, "accuracy": IntegrationAccuracy(0.0, 1e-10)}
-        sweep = stepped_motions(model, 1.0, steps[n_steps], **options)
-        assert np.all(sweep.n_cycles == 40)
-        height[n_steps] = np.abs(fundamental(sweep))
-        if n_steps == 16:
-            wanted = stepped_by_scipy(
-                lambda omega: time_domain(model, 1.0, omega), steps[n_steps], 40
-            )
-            # They err by 1e-9 and 1e-10 in a step; beside the jump the motion magnifies that a lot.
-            np.testing.assert_allclose(fundamental(sweep), wanted, rtol=1e-4)
-    last = steps[31][steps[31] < fold].max()
-    assert last in steps[16]
-    before = {n: float(height[n][steps[n] == last][0]) for n in height}
-    after = {n: float(height[n][np.argmax(steps[n] > fold)]) for n in height}
-    # At one and the same frequency, below the fold, the finer sweep is still on the upper branch.
-    assert before[16] < 0.6 * before[31]  # and falling
-    assert after[16] < 0.3 * before[31]
-    assert after[31] < 0.3 * before[31]
-
-
-def test_a_sweep_down_jumps_up_at_the_other_fold(stiffening):
-    model, curve = stiffening
-    lower = curve.frequency[curve.at_events("fold")].min()
-    steps = np.linspace(1.2, 0.95, 51) * OMEGA
-    sweep = stepped_motions(model, 1.0, steps, cycles_per_step=400)
-    jump = int(np.argmax(np.diff(np.abs(fundamental(sweep)))))
-    assert steps[jump + 1] < 1.0005 * lower
-    assert steps[jump] > lower - 0.005 * OMEGA
-    assert np.all(sweep.converged)
-    # A step ends as soon as the motion has settled.
-    assert sweep.n_cycles.max() < 400
-
-
-def test_drift_moves_the_resonance_from_step_to_step():
-    drift = make_effect("frequency_drift", {"relative_drift": 0.02})
-    steps, orders = np.linspace(490.0, 510.0, 4), np.array([0.0, 0.25, 0.75, 1.0])
-    sweep = stepped_motions(oscillator(effects=[drift]), 1.0, steps, test_orders=orders)
-    moved = OMEGA * (1 + 0.02 * orders)
-    phasor = PARTICIPATION / (moved**2 - steps**2 + 2j * RATIO * moved * steps)
-    np.testing.assert_allclose(fundamental(sweep), 1j * steps * SHAPE * phasor, rtol=3e-4)
-
-
 # ------------------------------------------------------------------------------- how it ended
 
 
@@ -301,22 +238,6 @@ def test_wrong_settings_of_a_settled_motion_are_named(options, message):
     given = {"force": 1.0, "frequency": OMEGA} | options
     with pytest.raises(ValueError, match=message):
         settled_motion(oscillator(), **given)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"frequencies": []}, "`frequencies` must have at least one number"),
-        ({"frequencies": [500.0, -1.0]}, "`frequencies` must be positive and finite, but is"),
-        ({"test_orders": [0.0]}, r"`test_orders` must have shape \(2,\), but has \(1,\)"),
-        ({"cycles_per_step": 3}, "needs 8 cycles"),
-        ({"force": -1.0}, "`force`"),
-    ],
-)
-def test_wrong_settings_of_a_sweep_are_named(options, message):
-    given = {"force": 1.0, "frequencies": [500.0, 510.0]} | options
-    with pytest.raises(ValueError, match=message):
-        stepped_motions(oscillator(), **given)
 
 
 def test_without_diffrax_the_extra_is_named(monkeypatch):

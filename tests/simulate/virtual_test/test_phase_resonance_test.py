@@ -12,7 +12,6 @@ from snrmjax.model.effects import make_effect
 from snrmjax.model.modes import RigidBodyModes, linear_modes, linear_response
 from snrmjax.model.structures import structure
 from snrmjax.simulate.virtual_test.phase_resonance_test import (
-    SweepSimulation,
     _swept,
     phase_resonance_test,
 )
@@ -310,56 +309,6 @@ def test_a_drifting_structure_is_recorded_as_it_is_at_the_time():
     assert np.all((indicator > 0.5) & (indicator < 0.7))
 
 
-# ----------------------------------------------------------------------------------- in time
-
-
-@pytest.mark.long
-def test_a_drifting_structure_is_stepped_through_in_time():
-    test = phase_resonance_test(
-        drifting(0.02),
-        [1.0, 2.0],
-        470.0,
-        540.0,
-        simulation=SweepSimulation(by="time_integration", steps_per_sweep=71),
-    )
-    states = test.steady_states
-    assert test.jumps == ()
-    assert test.curves == ()
-    assert np.all(np.diff(states.order) > 0)
-    assert np.all(np.diff(states.level) >= 0)
-    # One step a rad/s, recorded at the time of the step.
-    assert np.all(np.asarray(states.frequency) % 1 < 1e-9)
-    np.testing.assert_allclose(
-        states.velocity[:, 0], response_of_drifting(0.02, states), rtol=3e-4
-    )  # `stepped_motions` settles to an estimated 1e-4
-    assert np.all(np.abs(np.cos(phases(states)) ** 2 - 0.6) < 0.1)
-
-
-@pytest.mark.long
-def test_in_time_a_test_jumps_and_records_what_is_settled(exact):
-    in_time = SweepSimulation(by="time_integration", steps_per_sweep=81)
-    test = run(simulation=in_time, appropriation=(0.4, 0.8))
-    states = test.steady_states
-    assert 10 <= states.n_states <= 16
-    # Every state lies on the exact curve, on a stable part, by interpolation to about 1e-2.
-    for k in range(states.n_states):
-        curve = exact.curves[int(states.level[k]) - 1]
-        away = np.abs(curve.frequency / states.frequency[k] - 1) + np.abs(
-            curve.velocity[:, 1, 0] / states.velocity[k, 0] - 1
-        )
-        assert away.min() < 0.06
-        assert curve.is_stable[int(np.argmin(away))]
-    # Finite steps and transients: jumps are within two steps of the folds, or earlier.
-    step = 80 * HZ / 80
-    assert {level for level, _ in test.jumps} == {1, 2}
-    for level, frequency in test.jumps:
-        curve = exact.curves[level - 1]
-        left = np.concatenate(
-            [curve.frequency[curve.at_events("fold")], curve.frequency[curve.is_unstable]]
-        )
-        assert np.abs(left - frequency).min() < 2 * step
-
-
 def test_errors_and_chain_are_those_of_any_test():
     errors = MeasurementErrors(amplitude=0.01, phase=0.02, force=0.03)
     noisy, plain = Recording(errors, seed=3), Recording(seed=3)
@@ -400,15 +349,6 @@ def test_errors_and_chain_are_those_of_any_test():
         ),
         ({"recording": Recording(MeasurementErrors(force=np.nan))}, "the error `force`"),
         ({"forces": [0.0]}, "`forces` must be positive"),
-        (
-            {"simulation": SweepSimulation(by="magic")},
-            "`by` must be one of .*'time_integration'.*, but is 'magic'",
-        ),
-        (
-            {"simulation": SweepSimulation(steps_per_sweep=1)},
-            "`steps_per_sweep` must be 2 or more, but is 1",
-        ),
-        ({"simulation": SweepSimulation("time_integration", cycles_per_step=3)}, "needs 8 cycles"),
     ],
 )
 def test_wrong_settings_are_named(options, message):
