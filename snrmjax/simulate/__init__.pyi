@@ -3,7 +3,7 @@ from .continuation.continuation import CurveStatus, StepControl
 from .continuation.response_curve import ResponseCurve
 from .continuation.stability import Stability, floquet_multipliers
 from .solutions.controlled import damped_normal_mode, phase_controlled, response_controlled
-from .solutions.event_curves import EventCurve, follow_event, starts_beside_folds
+from .solutions.event_curves import EventCurve, follow_event
 from .solutions.forced_response import (
     ResponseSettings,
     forced_response,
@@ -73,7 +73,6 @@ __all__ = [
     "s_curve",
     "settled_motion",
     "solve_at_frequency",
-    "starts_beside_folds",
     "steady_states_of",
     "stepped_sine_test",
     "velocity_phasors",

@@ -30,10 +30,12 @@ from snrmjax.simulate.continuation.continuation import (
     on_host,
     trace_curve,
 )
+from snrmjax.simulate.continuation.event_equations import FORCE, EventEquations
 from snrmjax.simulate.continuation.response_curve import MotionCurve, motions_of
+from snrmjax.simulate.solutions.event_curves import trace_events
 
 DEFAULT_STEPS = StepControl(max_points=2000)
-_SMALL = 0.01  # of the largest amplitude: where a damped mode begins
+_SMALL = 0.01  # of the largest amplitude or force: where a curve begins
 _PASSES = 8  # in which shape and averages of a small motion agree
 
 
@@ -168,28 +170,24 @@ def phase_controlled(
     model: Structure,
     largest_force: float,
     *,
-    phase: float = 0.0,
     harmonic_order: int = 9,
     steps: StepControl = DEFAULT_STEPS,
     n_samples: int | None = None,
 ) -> ControlledCurve:
-    """Steady states at a fixed phase of the mode of interest, under a rising force.
+    """Phase resonances of the mode of interest under a rising force.
 
-    With `phase` = 0 (velocity in phase with the force) this is the force-appropriated backbone:
-    what a phase-locked loop tracks, unstable states of the open loop included. Solves the
-    harmonic balance with Im(V₁ e^{−iφ}) = 0 and the force as an unknown.
+    The velocity is in phase with the force: the force-appropriated backbone, what a phase-locked
+    loop tracks, unstable states of the open loop included. It is the curve that `follow_event`
+    follows from a phase resonance, begun at a small force.
 
-    Arguments: `largest_force` in N; the curve starts at a hundredth of it. `phase` φ in rad.
+    Arguments: `largest_force` in N; the curve starts at a hundredth of it.
     Returns a `ControlledCurve`; its `status` is UPPER_END when the largest force was reached.
-    Raises `ValueError` for a force that is not positive, a phase beyond ±π/2 and a force that does
-    not move the mode of interest.
+    Raises `ValueError` for a force that is not positive or does not move the mode of interest.
     Not differentiable: differentiate single motions: `snrmjax.simulate.periodic_motion`.
     Reference: Peeters, Kerschen & Golinval, J. Sound Vib. 330 (2011) 486,
     doi:10.1016/j.jsv.2010.08.028.
     """
     positive("largest_force", largest_force)
-    if not abs(phase) < np.pi / 2:
-        raise ValueError(f"`phase` must lie between -π/2 and π/2, but is {phase:g} rad.")
     model = simulated_structure(model)
     if not model.modes.driven()[model.modes.mode_of_interest]:
         raise ValueError("the force does not move the mode of interest: it has no phase to hold.")
@@ -200,40 +198,22 @@ def phase_controlled(
         harmonic_order=harmonic_order,
         n_samples=n_samples,
     )
-    curve = on_host(_trace_phase(balance, float(phase), steps))
+    equations = EventEquations(
+        *(model, balance, jnp.asarray(float(largest_force))),
+        kind="phase_resonance",
+        parameter=FORCE,
+    )
+    terms, j = model.linear_terms(), model.modes.mode_of_interest
+    natural = jnp.sqrt(terms.stiffness[j] / terms.mass[j])
+    x = linear_coefficients(model, _SMALL * balance.force, natural, harmonic_order)
+    start = jnp.append(balance.point(x, natural), _SMALL)
+    ends = np.array([0.0, 1.0])
+    curve = on_host(trace_events(equations, start, ends, steps, np.array(1.0)))
     return ControlledCurve(
         **motions_of(balance, curve.points[:, :-1]),
         status=curve.status,
         force=curve.points[:, -1] * largest_force,
     )
-
-
-@compiled
-def _trace_phase(
-    balance: HarmonicBalance, phase: Float[Array, ""] | float, steps: StepControl
-) -> Curve:
-    model, j, n = balance.model, balance.model.modes.mode_of_interest, balance.model.n_modes
-    # Velocity phasor ∝ i(a − ib) = b + ia: in phase with the force turned by φ.
-    quadrature = jnp.zeros(balance.size + 2)
-    quadrature = quadrature.at[n + j].set(jnp.cos(phase)).at[2 * n + j].set(-jnp.sin(phase))
-
-    def linearised(point: Array) -> tuple[Array, Array]:
-        """Unknowns x, Ω/ω₀ and the share of the largest force."""
-        residual, jacobian = _with_force(balance, point[:-1], point[-1])
-        return (
-            jnp.append(residual, quadrature @ point),
-            jnp.concatenate([jacobian, quadrature[None]]),
-        )
-
-    share = 0.01
-    terms = model.linear_terms()
-    natural = jnp.sqrt(terms.stiffness[j] / terms.mass[j])
-    # Off resonance by the phase: tan φ = (ω² − Ω²)/(2ζωΩ), to first order in the damping.
-    begin = natural - 0.5 * terms.damping[j] / terms.mass[j] * jnp.tan(phase)
-    x = linear_coefficients(model, share * balance.force, begin, balance.harmonic_order)
-    start = jnp.append(balance.point(x, begin), share)
-    rising = jnp.zeros_like(start).at[-1].set(1.0)
-    return trace_curve(linearised, start, rising, CurveRange(lower=0.0, upper=1.0), steps)
 
 
 @on_numbers(

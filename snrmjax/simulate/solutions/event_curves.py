@@ -29,15 +29,12 @@ from snrmjax.simulate.continuation.event_equations import (
     FORCE,
     EventEquations,
     EventKind,
-    bordered,
 )
-from snrmjax.simulate.continuation.newton import correct
 from snrmjax.simulate.continuation.parameter_turns import with_turns
 from snrmjax.simulate.continuation.response_curve import MotionCurve, motions_of
 from snrmjax.simulate.continuation.stability import floquet_multipliers
 
 DEFAULT_STEPS = StepControl(max_points=2000)
-_BESIDE = (0.02, 4e-3, 8e-4)  # distances from a fold, in scaled unknowns, of starts on its response
 _SAME = 1e-10  # distance in scaled unknowns below which two points are one
 _ROUNDING = 1e-12  # relative, of a parameter's value
 _SHOWN = 6  # turns that a summary lists
@@ -195,7 +192,7 @@ def follow_event(
     scale = float(equations.parameter_scale)
     lower, upper = (end / scale for end in to)
     ways = [
-        on_host(_trace(equations, point, np.array([lower, upper]), steps, np.array(up)))
+        on_host(trace_events(equations, point, np.array([lower, upper]), steps, np.array(up)))
         for up in (1.0, -1.0)
     ]
     if kind == "neimark_sacker":
@@ -222,37 +219,6 @@ def follow_event(
         n_not_located=missed,
         n_solves=curve.n_solves,
     )
-
-
-@on_numbers("Differentiate single motions: `sj.simulate.periodic_motion`.")
-@on_one_core
-def starts_beside_folds(model: Structure, folds: EventCurve, value: float) -> list[Start]:
-    """Motions beside the folds at one value of a fold curve's parameter, for `IsolatedSearch`.
-
-    Every fold there lies on a response: on the one from rest, or on an isolated one. A fold
-    itself is no start at its frequency; these lie a little off it along the response, on the
-    flank toward which the null vector points.
-
-    Arguments: `model` and `folds` as `follow_event` took and gave them.
-    Returns one motion for every fold that was found. Raises `ValueError` for a curve of another
-    event.
-    Not differentiable: differentiate single motions: `snrmjax.simulate.periodic_motion`.
-    """
-    if folds.kind != "fold":
-        raise ValueError(f'`folds` must be a curve of kind "fold", but is one of {folds.kind!r}.')
-    ends = (float(folds.value.min()), float(folds.value.max()))
-    found = []
-    for start in folds.near(value):
-        force = value if folds.parameter == FORCE else float(folds.force[0])
-        equations, point = _problem(model, force, start, "fold", ends, folds.parameter, None)
-        at = value / float(equations.parameter_scale)
-        for distance in _BESIDE:  # a loop that has just begun is shorter than the first
-            beside, ok = _beside(equations, point.at[-1].set(at), distance)
-            if bool(ok):
-                x, frequency = equations.balance.motions(np.asarray(beside)[None])
-                found.append((x[0], float(frequency[0])))
-                break
-    return found
 
 
 def _problem(
@@ -321,9 +287,10 @@ def _second_frequency(model: Structure, coefficients: np.ndarray, frequency: flo
 
 
 @compiled
-def _trace(
+def trace_events(
     equations: EventEquations, start: Array, ends: Array, steps: StepControl, up: Array
 ) -> Curve:
+    """One way from a start, the parameter rising (`up` 1) or falling (-1), until it leaves `ends`."""
     direction = jnp.zeros_like(start).at[-1].set(up)
     return trace_curve(equations.linearised, start, direction, CurveRange(ends[0], ends[1]), steps)
 
@@ -362,18 +329,3 @@ def _joined(up: TracedCurve, down: TracedCurve) -> TracedCurve:
     ends = (CurveStatus.UPPER_END, CurveStatus.LOWER_END)
     stopped = [way.status for way in (up, down) if way.status not in ends]
     return TracedCurve(points[keep], tangents[keep], (*stopped, up.status)[0], solves)
-
-
-@compiled
-def _beside(equations: EventEquations, point: Array, distance: Array | float) -> tuple:
-    """A motion of the response on which a fold lies, a little off it."""
-    size = equations.balance.size
-    fixed = jnp.zeros_like(point).at[-1].set(1.0)
-    fold = correct(equations.linearised, point, fixed, 1e-10, 30)
-    balance = equations.at(fold.point[-1])
-    motion = fold.point[: size + 1]
-    null = bordered(balance.linearised(motion)[1][:, :size]).right
-    across = jnp.append(null / jnp.linalg.norm(null), 0.0)
-    found = correct(balance.linearised, motion + distance * across, across, 1e-10, 30)
-    moved = jnp.linalg.norm(found.point - motion)
-    return found.point, fold.converged & found.converged & (moved < 2 * distance)

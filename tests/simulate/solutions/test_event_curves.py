@@ -19,7 +19,6 @@ from snrmjax.model.effects import make_effect
 from snrmjax.simulate.solutions.event_curves import (
     EventCurveEnd,
     follow_event,
-    starts_beside_folds,
 )
 
 HZ = 2 * np.pi
@@ -201,31 +200,6 @@ def test_isola_and_main_response_merge_where_the_closed_form_says():
 
 
 @pytest.mark.long
-def test_folds_lead_to_the_isolated_response():
-    model, unit = cantilever(), 0.1
-    # The outer fold of the joined response, at a higher force, is the isola's at a lower one.
-    start = event_of(model, 1.9e-3 * unit, (6.95, 7.05), "fold", number=0)
-    folds = follow_event(model, 1.9e-3 * unit, start, kind="fold", to=(1e-5, 3e-4))
-    assert set(folds.event) == {""}
-    for strength, n_loops in ((1e-3, 1), (1.7e-3, 1), (1.8e-3, 1), (1.9e-3, 0)):
-        starts = starts_beside_folds(model, folds, strength * unit)
-        assert len(starts) == 1
-        found = sj.simulate.isolated_responses(
-            *(model, strength * unit, 6.9, 7.1),
-            search=sj.simulate.IsolatedSearch(starts=starts, n_starts=0),
-            settings=SINGLE,
-        )
-        assert len(found) == n_loops
-        assert [loop.status.name for loop in found] == ["CLOSED"] * n_loops
-        if strength == 1e-3:
-            tip = np.abs(found[0].velocity[:, 1, 0]) / found[0].frequency
-            above = found[0].frequency > 7.00426
-            k = np.flatnonzero(above[1:] != above[:-1])
-            # Published for five harmonics and all modes.
-            np.testing.assert_allclose(np.sort(tip[k]), (0.03926, 0.04355), rtol=5e-3)
-
-
-@pytest.mark.long
 def test_resonances_lead_to_the_isolated_response():
     model, load = cantilever(), 1e-4
     start = event_of(model, load, (6.95, 7.05), "phase_resonance")
@@ -255,25 +229,6 @@ def test_an_isolated_response_begins_where_the_closed_form_says():
         found = displacement(folds)[k], folds.frequency[k], folds.value[k]
         # |sin|sin of the drag by 512 samples: its harmonics fall with the third power.
         np.testing.assert_allclose(found, exact[:3], rtol=3e-7)
-    # Just above its birth the loop is small, and found from its folds.
-    for above in (0.02, 1e-4):
-        load = (1 + above) * birth[2]
-        starts = starts_beside_folds(model, folds, load)
-        assert len(starts) == 2
-        for (x, omega), fold in zip(starts, folds.near(load), strict=True):
-            tip = sj.simulate.periodic_motion(model, load, fold, condition="fold")
-            off = np.linalg.norm(x - np.asarray(tip.coefficients)) / np.abs(x).max()
-            assert 5e-4 < off < 0.05
-            assert omega != pytest.approx(float(tip.frequency), rel=1e-10)
-        found = sj.simulate.isolated_responses(
-            *(model, load, *ends),
-            known=[],
-            search=sj.simulate.IsolatedSearch(starts=starts, n_starts=0),
-            settings=SINGLE,
-        )
-        (loop,) = [c for c in found if c.branch.name == "GIVEN_START"]
-        assert loop.status.name == "CLOSED"
-    assert not starts_beside_folds(model, folds, 0.98 * birth[2])
 
 
 def test_the_coefficient_of_an_effect_is_followed():
@@ -590,10 +545,6 @@ def test_a_curve_says_where_it_stopped():
     short = follow_event(model, P, start, kind="fold", to=(0.01, 0.4), steps=steps)
     assert EventCurveEnd.POINT_LIMIT in short.ends
     assert 5 <= len(short.frequency) <= 10
-    peak = event_of(model, P, (0.5, 1.6), "peak")
-    peaks = follow_event(model, P, peak, kind="peak", to=(0.1, 0.2))
-    with pytest.raises(ValueError, match="must be a curve of kind"):
-        starts_beside_folds(model, peaks, 0.15)
     # A linear structure has no folds.
     linear = sj.model.with_parameters(model, ["potential.1111"], np.zeros(1))
     none = follow_event(linear, P, start, kind="fold", to=(0.01, 0.4))
