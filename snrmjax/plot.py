@@ -36,7 +36,6 @@ from snrmjax.report.figures.simulation import (
     simulated_response_figure,
 )
 from snrmjax.report.figures.uncertainty import (
-    propagation_figure,
     sensitivity_figure,
 )
 from snrmjax.report.style import save_figure
@@ -62,7 +61,6 @@ __all__ = [
     "next_measurements_figure",
     "normal_mode_figure",
     "parts_figure",
-    "propagation_figure",
     "residuals_figure",
     "response_figure",
     "save_figure",
