@@ -104,7 +104,6 @@ _FIGURES: dict[str, Callable[..., Figure]] = {
     "Identification": lambda one, **settings: figures.backbone_figure(
         one.points, one.backbone, **settings
     ),
-    "IntegratedMotion": _motions,
     "InverseForce": lambda one: simulation_figures.force_velocity_points(
         np.asarray(one.force), np.asarray(one.velocity)[:, 1, 0]
     ),

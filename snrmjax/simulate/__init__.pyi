@@ -15,7 +15,6 @@ from .solutions.mode_at_velocities import normal_mode_at_velocities
 from .solutions.normal_modes import nonlinear_normal_mode
 from .solutions.periodic_motion import periodic_motion
 from .solutions.quasi_periodic import quasi_periodic_branch
-from .solutions.time_integration import IntegrationAccuracy, MotionStatus, settled_motion
 from .solutions.tracked_motion import TrackedMotion
 from .virtual_test.equipment import Instruments, Shaker
 from .virtual_test.laboratory import AbstractController, Laboratory, run_test
@@ -39,12 +38,10 @@ __all__ = [
     "EventCurve",
     "FeedbackSettings",
     "Instruments",
-    "IntegrationAccuracy",
     "IsolatedSearch",
     "Laboratory",
     "LoopGains",
     "MeasurementErrors",
-    "MotionStatus",
     "Playback",
     "Recording",
     "ResponseCurve",
@@ -71,7 +68,6 @@ __all__ = [
     "response_controlled",
     "run_test",
     "s_curve",
-    "settled_motion",
     "solve_at_frequency",
     "steady_states_of",
     "stepped_sine_test",

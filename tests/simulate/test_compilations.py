@@ -35,7 +35,7 @@ VERBS = {
         oscillator(0.02 + 0.001 * k), 1.0 + 0.1 * k, harmonic_order=3
     ),
     "phase_controlled": lambda k: sj.simulate.phase_controlled(
-        oscillator(0.02 + 0.001 * k), 0.1 + 0.01 * k, phase=0.1 * k, harmonic_order=3
+        oscillator(0.02 + 0.001 * k), 0.1 + 0.01 * k, harmonic_order=3
     ),
     "response_controlled": lambda k: sj.simulate.response_controlled(
         oscillator(0.02 + 0.001 * k), 0.5 + 0.1 * k, 1.7 + 0.1 * k, 2.5 + 0.1 * k, harmonic_order=3
@@ -52,11 +52,6 @@ VERBS = {
     ),
     "solve_at_frequency": lambda k: sj.simulate.solve_at_frequency(
         oscillator(0.02 + 0.001 * k), 0.02 + 0.001 * k, 1.5 + 0.01 * k, motion(k)[0][None]
-    ),
-    "settled_motion": lambda k: sj.simulate.settled_motion(
-        *(oscillator(0.2 + 0.01 * k), 0.02 + 0.001 * k, 1.5 + 0.01 * k),
-        harmonic_order=3,
-        accuracy=sj.simulate.IntegrationAccuracy(1e-3 * (1 + k), 1e-6 * (1 + k)),
     ),
 }
 

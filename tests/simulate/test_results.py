@@ -76,10 +76,6 @@ RESULTS = {
         ),
         ("VirtualTest: 10 states", "force_n", "N"),
     ),
-    "settled motion": (
-        lambda: sj.simulate.settled_motion(oscillator(), FORCE, 1.5, harmonic_order=3),
-        ("IntegratedMotion: 4 harmonics", "velocity_re_m_s", "m/s"),
-    ),
 }
 
 

@@ -113,12 +113,11 @@ def isolated_responses(
 ) -> IsolatedResponses:
     """Search for response curves that are not connected to the one from rest, and trace them.
 
-    Newton's method starts from the motions given (such as settled motions of a time integration,
-    from other initial states), from every phase resonance that the force-appropriated backbone has
-    at this force (traced to twice the force: the tips of loops are among them), from vibrations
-    about every stable equilibrium, and from random amplitudes and phases of the mode of interest
-    across the frequency range. Through each motion that lies on no known curve a curve is traced
-    both ways, around if it is closed.
+    Newton's method starts from the motions given, from every phase resonance that the force-
+    appropriated backbone has at this force (traced to twice the force: the tips of loops are among
+    them), from vibrations about every stable equilibrium, and from random amplitudes and phases of
+    the mode of interest across the frequency range. Through each motion that lies on no known
+    curve a curve is traced both ways, around if it is closed.
 
     Arguments: `force` in N, frequencies in rad/s; `known` curves of this force, those of
     `forced_response` if not given; `search` says where to start; `settings` as in

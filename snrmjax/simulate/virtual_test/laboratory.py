@@ -33,19 +33,19 @@ from snrmjax.model.elements import elements_of
 from snrmjax.model.modes import reference_sensor
 from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.numerics.compiled import on_numbers
-from snrmjax.simulate.solutions.hysteresis_cycles import (
-    friction_rows,
-    inner_force,
-    memory_after_step,
-    memory_at_rest,
-    scaled_friction,
-)
 from snrmjax.simulate.virtual_test.equipment import (
     Instruments,
     Shaker,
     check_instruments,
     check_shaker,
     filter_sections,
+)
+from snrmjax.simulate.virtual_test.friction_memory import (
+    friction_rows,
+    inner_force,
+    memory_after_step,
+    memory_at_rest,
+    scaled_friction,
 )
 
 _FEWEST_STEPS = 20  # a cycle of the fastest linear motion, that the integration can follow it
@@ -109,6 +109,7 @@ class Laboratory(eqx.Module):
     cycle. Effects with memory (friction) need `largest_displacement`, in m at
     the reference sensor: their sliders, and the width of a smoothed Coulomb force, are set for
     motions up to it. With `attached` False the shaker is away and nothing drives the structure.
+    `Shaker(1e-6, 1e-6)` is a source of force without dynamics, one newton a volt.
     What is left of the voltage's images aliases into the force by about (ω period)⁴/38 of the
     shaker's own force, which near resonance may be several times the force on the structure.
     Raises `ValueError` for numbers that cannot be, a rate too low, and effects of the measurement

@@ -86,10 +86,7 @@ def test_an_unbalance_drives_by_the_square_of_the_frequency(tmp_path):
     other = read(tmp_path, ROTOR.replace(f"= {UNBALANCE}", f"= {2 * UNBALANCE}"))
     (same,) = sj.forced_response(other, [1.0], 14 * HERTZ, 15 * HERTZ, stability=False)
     np.testing.assert_allclose(twice.velocity, same.velocity, atol=1e-9)
-    # In time, and its force in the table.
-    omega = float(twice.frequency[-1])
-    settled = sj.simulate.settled_motion(model, 2.0, omega)
-    np.testing.assert_allclose(settled.velocity[1], twice.velocity[-1, 1], rtol=1e-3)
+    # Its force in the table.
     results.write_response(tmp_path / "response.csv", [twice])
     rows = np.genfromtxt(tmp_path / "response.csv", delimiter=",", names=True)
     wanted = 2 * UNBALANCE * (HERTZ * rows["frequency_hz"]) ** 2

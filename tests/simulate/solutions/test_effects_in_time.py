@@ -19,7 +19,6 @@ from snrmjax.model.modes import linear_modes
 from snrmjax.model.structures import simulated_structure, structure
 from snrmjax.simulate.continuation.stability import Stability, floquet_multipliers, stability_of
 from snrmjax.simulate.solutions.forced_response import solve_at_frequency
-from snrmjax.simulate.solutions.time_integration import settled_motion
 
 OMEGA, RATIO, PARTICIPATION = 500.0, 0.03, 3.0  # rad/s, -, kg^-1/2
 STATIC = PARTICIPATION / OMEGA**2  # kg^1/2 m, of 1 N
@@ -358,18 +357,6 @@ def test_harmonic_balance_is_the_settled_motion(group, kind):
     # What a motion settles to is stable.
     multipliers = floquet_multipliers(simulated_structure(model), coefficients, FREQUENCIES)
     assert np.all(stability_of(multipliers) == Stability.STABLE)
-
-
-@pytest.mark.parametrize("kind", ["gap_stiffness", *FRICTION])
-def test_the_packages_integration_settles_there_too(kind):
-    group = "kinked" if kind in KINKED else "friction"
-    motion = settled_motion(model_with(group, kind), 1.0, FREQUENCIES[0])
-    wanted = truth(kind)[:1]
-    assert motion.converged
-    found = as_phasors(motion.coefficients[None])
-    scale = abs(wanted[0, 1])
-    # Contacts are sharp here and Coulomb's force is not; the motion may be 1e-5 from the settled.
-    np.testing.assert_allclose(found / scale, wanted / scale, atol=tolerance(group, kind))
 
 
 def test_no_effect_with_a_force_is_left_out():

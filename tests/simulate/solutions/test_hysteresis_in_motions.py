@@ -50,16 +50,6 @@ def test_the_balance_is_the_settled_motion(hysteretic, in_time):
         np.testing.assert_allclose(found, wanted[:, of], atol=2e-4 * np.abs(wanted[:, 0]).max())
 
 
-def test_our_integration_is_the_same(hysteretic, in_time):
-    model, curve, place = hysteretic
-    motion = sj.simulate.settled_motion(model, 0.3, in_time[0], harmonic_order=9)
-    np.testing.assert_allclose(
-        motion.coefficients,
-        curve.coefficients[place],
-        atol=3e-4 * np.abs(motion.coefficients).max(),
-    )
-
-
 def test_multipliers_are_those_of_the_map_over_a_period(hysteretic, in_time):
     model, curve, place = hysteretic
     omega, begin, _ = in_time
@@ -134,6 +124,3 @@ def test_a_contact_slips_with_its_normal_force_and_parts(normal_force):
         np.testing.assert_allclose(found, 2 * wanted[order], atol=1e-3 * size)
     parts = np.min(np.fft.irfft(wanted[:, 1] * 64, 64)) < 0
     assert parts == (normal_force > 1)
-    if normal_force < 1:
-        settled = sj.simulate.settled_motion(model, force, omega, harmonic_order=21)
-        np.testing.assert_allclose(settled.coefficients, motion.coefficients, atol=1e-3 * size)
