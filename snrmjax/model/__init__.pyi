@@ -1,5 +1,4 @@
 from .averaging import averaged_effect
-from .builders.arches import ArchSettings, shallow_arch
 from .builders.beams import CURVED_BEAM_FORCES, FLAT_BEAM_FORCES, curved_beam, flat_beam
 from .builders.matrices import Matrices, beam, chain, from_matrices
 from .effect_base import (
@@ -49,7 +48,6 @@ __all__ = [
     "AbstractLinearChange",
     "AbstractMeasurementEffect",
     "AbstractMemoryless",
-    "ArchSettings",
     "Argument",
     "BaseMotion",
     "Confusion",
@@ -83,7 +81,6 @@ __all__ = [
     "polynomial_potential",
     "register_effect",
     "residual_velocity",
-    "shallow_arch",
     "shape_of",
     "structure",
     "with_parameters",

@@ -4,13 +4,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from truths.shallow_arch import ArchSettings, shallow_arch
 
 from snrmjax.condense.elements.beam import Beam, PointMass, Support, rise_of_radius
 from snrmjax.condense.elements.beam_modes import beam_modes
 from snrmjax.condense.elements.statics import static_cases
 from snrmjax.condense.load_set import modal_loads
 from snrmjax.condense.potential_fit import fit_potential
-from snrmjax.model.builders.arches import ArchSettings, shallow_arch
 
 _FLAT = {"young": 204.8e9, "density": 7870.0}
 
