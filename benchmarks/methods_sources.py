@@ -178,18 +178,19 @@ def continuation() -> None:
 
 
 def held_displacements(model, sizes, frequencies=None):
-    """Response-controlled stepped sines in the laboratory, one level a displacement."""
-    shaker = sj.simulate.Shaker(30.0, 8.0, mass=0.05, damping=1.0, stiffness=500.0)
-    laboratory = sj.simulate.Laboratory(model, shaker, sj.simulate.Instruments(), 4000.0)
+    """Response-controlled stepped sines by inverse harmonic balance, one level a displacement."""
     tables = []
     for level, size in enumerate(sizes, 1):
         middle = np.sqrt(REST**2 + 0.75 * CUBIC * size**2)
-        test = sj.simulate.stepped_sine_test(
-            *(laboratory, size),
-            middle * np.linspace(0.975, 1.025, 13) if frequencies is None else frequencies,
-            held="displacement",
+        omega = middle * np.linspace(0.975, 1.025, 13) if frequencies is None else frequencies
+        asked = sj.measure.steady_states(
+            np.full(len(omega), level), omega, np.ones(len(omega)), omega * size + 0j
         )
-        tables.append(sj.simulate.steady_states_of(laboratory, test, level=level))
+        force = np.asarray(sj.identify.inverse_force(model, asked).force)
+        velocity = omega * size * np.conj(force) / np.abs(force)
+        tables.append(
+            sj.measure.steady_states(np.full(len(omega), level), omega, np.abs(force), velocity)
+        )
     return sj.measure.join_steady_states(tables)
 
 

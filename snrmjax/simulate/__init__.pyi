@@ -21,7 +21,6 @@ from .virtual_test.laboratory import AbstractController, Laboratory, run_test
 from .virtual_test.phase_loop import LoopGains, phase_sweep
 from .virtual_test.phase_resonance_test import phase_resonance_test
 from .virtual_test.programmes import (
-    AmplitudeGains,
     Playback,
     decay_test,
     multisine_test,
@@ -33,7 +32,6 @@ from .virtual_test.target_feedback import FeedbackSettings, s_curve
 
 __all__ = [
     "AbstractController",
-    "AmplitudeGains",
     "CurveStatus",
     "EventCurve",
     "FeedbackSettings",

@@ -1,19 +1,8 @@
-"""Programmes of a test: stepped sines, multisines, decays and tables of voltages, in time.
-
-A stepped sine may hold the voltage (open loop: force and response find themselves, and jump where
-a branch ends), or by its voltage the amplitude of force, velocity or displacement. The law is
-proportional and integral in the logarithm: ln U = I + k e, İ = λ e with e = 1 − |X|/target, |X|
-from adaptive filters at the frequency of the drive.
-
-References: for response control, T. Karaağaçlı & H. N. Özgüven, Mech. Syst. Signal Process. 144
-(2020) 107023, doi:10.1016/j.ymssp.2020.107023; for phases of multisines, M. R. Schroeder, IEEE
-Trans. Inf. Theory 16 (1970) 85, doi:10.1109/TIT.1970.1054411.
-"""
+"""Programmes of a test: stepped sines, multisines, decays and tables of voltages, in time."""
 
 import dataclasses
-from typing import Literal, NamedTuple, get_args
+from typing import NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -33,18 +22,7 @@ from snrmjax.simulate.virtual_test.laboratory import (
     run_test,
 )
 from snrmjax.simulate.virtual_test.phase_loop import LoopGains, locked_motions
-from snrmjax.simulate.virtual_test.record_phasors import (
-    FourierState,
-    HeldMotion,
-    followed,
-    nothing_followed,
-)
-
-Held = Literal["voltage", "force", "velocity", "displacement"]
-
-_ORDERS = np.arange(1, 6)  # harmonics that the filters follow beside the mean
-_APPROACH = 5.0  # times 1/λ, that a law has to find its first voltage
-_LARGEST_ERROR = 1.0  # of an amplitude, relative: what the law acts on at most
+from snrmjax.simulate.virtual_test.record_phasors import HeldMotion
 
 
 class TestSteps(NamedTuple):
@@ -71,18 +49,6 @@ class DecayTest(NamedTuple):
     resonance: HeldMotion  # `held` where the loop had locked
 
 
-class AmplitudeGains(NamedTuple):
-    """How a stepped sine holds an amplitude.
-
-    A branch that folds over at fixed frequency needs k > −d ln F/d ln X there; far from resonance
-    a large k meets the filters' delay, and the loop rings.
-    """
-
-    filter_rate: float  # 1/s
-    proportional: float  # k
-    integral_rate: float  # λ, 1/s
-
-
 class Playback(AbstractController):
     """A table of voltages, one a sample; zero after its end."""
 
@@ -105,103 +71,62 @@ class StepState(NamedTuple):
 
     samples: Int[Array, ""]  # so far
     angle: Float[Array, ""]
-    integral: Float[Array, ""]  # of the logarithm of the voltage
-    filters: FourierState  # force, velocity
 
 
 class SteppedSineDrive(AbstractController):
-    """A sine whose frequency steps while its phase goes on; it may hold an amplitude."""
+    """A sine of one voltage whose frequency steps while its phase goes on."""
 
     frequencies: Float[Array, " step"]  # rad/s
-    target: Float[Array, ""]  # of what is held: V, N, m/s or m
-    first_voltage: Float[Array, ""]
-    filter_rate: Float[Array, ""]  # 1/s
-    proportional: Float[Array, ""]
-    integral_rate: Float[Array, ""]  # 1/s
+    voltage: Float[Array, ""]
     dwell: Int[Array, ""]  # samples a step
-    approach: Int[Array, ""]  # samples before the first step, at its frequency
-    held: Held = eqx.field(static=True)
 
     def initial(self) -> StepState:
-        """At rest, with nothing followed."""
-        zero = jnp.zeros(())
-        return StepState(jnp.asarray(0), zero, zero, nothing_followed(2, _ORDERS))
+        """Before the first step."""
+        return StepState(jnp.asarray(0), jnp.zeros(()))
 
     def step(
         self, state: StepState, sample: Sample, period: Float[Array, ""]
     ) -> tuple[StepState, Array, Array]:
-        """A sine of the step's frequency, as large as what is held wants it."""
-        number = (state.samples - self.approach) // self.dwell
-        omega = self.frequencies[jnp.clip(number, 0, self.frequencies.size - 1)]
-        seen = jnp.stack([sample.force, sample.velocity])
-        filters = followed(state.filters, seen, state.angle, _ORDERS, self.filter_rate * period)
-        integral, size = state.integral, self.target
-        if self.held != "voltage":
-            found = jnp.abs(filters.harmonics[0 if self.held == "force" else 1, 0])
-            found = found / omega if self.held == "displacement" else found
-            error = jnp.clip(1 - found / self.target, -_LARGEST_ERROR, _LARGEST_ERROR)
-            integral = integral + self.integral_rate * period * error
-            size = self.first_voltage * jnp.exp(integral + self.proportional * error)
-        angle = jnp.mod(state.angle + omega * period, 2 * jnp.pi)
-        after = StepState(state.samples + 1, angle, integral, filters)
-        return after, size * jnp.cos(angle), angle
+        """A sine of the step's frequency."""
+        number = jnp.clip(state.samples // self.dwell, 0, self.frequencies.size - 1)
+        angle = jnp.mod(state.angle + self.frequencies[number] * period, 2 * jnp.pi)
+        return StepState(state.samples + 1, angle), self.voltage * jnp.cos(angle), angle
 
 
 @on_numbers("Differentiate the steady states of a model by `sj.simulate.periodic_motion`.")
 def stepped_sine_test(
     laboratory: Laboratory,
-    target: float,
+    voltage: float,
     frequencies: Float[np.ndarray, " step"],
     *,
-    held: Held = "voltage",
-    gains: AmplitudeGains | None = None,
-    first_voltage: float = 0.1,
     settle_cycles: int = 200,
     record_cycles: int = 30,
     seed: int = 0,
 ) -> LaboratoryTest:
-    """Step the frequency of a sine without ever stopping the motion.
+    """Step the frequency of a sine without ever stopping the motion, in open loop.
 
-    Arguments: `target` is the amplitude of what is `held`: voltage (V; open loop), force (N),
-    velocity (m/s) or displacement (m) at the reference sensor; `frequencies` in rad/s in the order
-    of the test; cycles of the linear mode of interest at each of them, to settle and then to
-    record; `gains` by default filters of ω/3 of the mode of interest, k = 1.5 and λ = ζω;
-    `first_voltage` (V) is where a law
-    begins, given five times 1/λ at the first frequency before the first step.
-    Returns a `LaboratoryTest` with its steps, for `steady_states_of`. An amplitude that is not
-    reached is seen there: the law has no status. Raises `ValueError` for numbers that are not
-    positive and for an unknown quantity to hold.
+    Force and response find themselves, and jump where a branch ends.
+
+    Arguments: `voltage` in V; `frequencies` in rad/s in the order of the test; cycles of the linear
+    mode of interest at each of them, to settle and then to record.
+    Returns a `LaboratoryTest` with its steps, for `steady_states_of`. Raises `ValueError` for
+    numbers that are not positive.
     Not differentiable: differentiate the steady states of a model by
     `snrmjax.simulate.periodic_motion`.
     """
-    if held not in get_args(Held):
-        raise ValueError(f"`held` must be one of {', '.join(get_args(Held))}, but is {held!r}.")
-    rates = AmplitudeGains(laboratory.frequency / 3, 1.5, laboratory.decay)
-    rates = rates if gains is None else gains
     steps = np.atleast_1d(np.asarray(frequencies, dtype=float))
     for name, values in (
-        *(("target", target), ("frequencies", steps), ("first_voltage", first_voltage)),
-        *(("settle_cycles", settle_cycles), ("record_cycles", record_cycles), ("gains", rates)),
+        *(("voltage", voltage), ("frequencies", steps)),
+        *(("settle_cycles", settle_cycles), ("record_cycles", record_cycles)),
     ):
         positive(name, values)
     settle, keep = laboratory.samples(settle_cycles), laboratory.samples(record_cycles)
-    approach = 0
-    if held != "voltage":
-        approach = round(_APPROACH / rates.integral_rate * laboratory.sampling_rate)
     programme = SteppedSineDrive(
-        frequencies=jnp.asarray(steps),
-        target=jnp.asarray(float(target)),
-        first_voltage=jnp.asarray(float(first_voltage)),
-        filter_rate=jnp.asarray(float(rates.filter_rate)),
-        proportional=jnp.asarray(float(rates.proportional)),
-        integral_rate=jnp.asarray(float(rates.integral_rate)),
-        dwell=jnp.asarray(settle + keep),
-        approach=jnp.asarray(approach),
-        held=held,
+        jnp.asarray(steps), jnp.asarray(float(voltage)), jnp.asarray(settle + keep)
     )
-    count = approach + len(steps) * (settle + keep)
+    count = len(steps) * (settle + keep)
     record, _ = run_test(laboratory, programme, count, seed=seed)
-    first = approach + settle + np.arange(len(steps)) * (settle + keep)
+    first = settle + np.arange(len(steps)) * (settle + keep)
     return LaboratoryTest(record, count / laboratory.sampling_rate, TestSteps(steps, first, keep))
 
 
@@ -213,13 +138,12 @@ def multisine_test(
     period_samples: int,
     periods: int,
     *,
-    phases: Literal["random", "schroeder"] = "random",
     seed: int = 0,
 ) -> LaboratoryTest:
     """A periodic multisine of equal lines.
 
     Arguments: `rms_voltage` in V of the whole; `lines` are multiples of the sampling rate over
-    `period_samples`; `phases` drawn from `seed`, or after Schroeder for a low crest.
+    `period_samples`; phases are drawn from `seed`.
     Returns a `LaboratoryTest` of `periods` periods, the first of them with the transient.
     Raises `ValueError` for lines outside 1 to half of `period_samples`, and for numbers that are
     not positive.
@@ -237,15 +161,9 @@ def multisine_test(
             f"`lines` must lie between 1 and half of `period_samples`, {period_samples / 2:g}, but "
             f"are {lines}."
         )
-    order = np.arange(len(distinct))
-    turned = {
-        "random": np.random.default_rng(seed).uniform(0, 2 * np.pi, len(distinct)),
-        "schroeder": -np.pi * order * (order + 1) / len(distinct),
-    }
-    if phases not in turned:
-        raise ValueError(f"`phases` must be random or schroeder, but is {phases!r}.")
+    phases = np.random.default_rng(seed).uniform(0, 2 * np.pi, len(distinct))
     spectrum = np.zeros(period_samples // 2 + 1, dtype=complex)
-    spectrum[distinct] = np.exp(1j * turned[phases])
+    spectrum[distinct] = np.exp(1j * phases)
     once = np.fft.irfft(spectrum, period_samples)
     voltages = np.tile(once * rms_voltage / np.sqrt(np.mean(once**2)), periods)
     record, _ = run_test(laboratory, Playback(jnp.asarray(voltages)), len(voltages), seed=seed)
