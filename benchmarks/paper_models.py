@@ -206,7 +206,7 @@ def condensed(
     else:
         size = np.full(len(basis.numbers), scale * beam.thickness)
     loads = modal_loads(basis, size)
-    found = reduced_model(basis, solve(np.asarray(loads.force)), expand=False)
+    found = reduced_model(basis, solve(np.asarray(loads.force)))
     signs = _signs(beam, midspan)
     coefficients = np.asarray(found.potential.coefficient)
     force = {

@@ -243,7 +243,7 @@ else:
         modes = sj.io.calculix.modes_of_deck(deck, (1,), folder)
         single = fe.modal_loads(modes.basis, 0.25 * 0.787e-3)
         run = sj.io.calculix.run_static_cases(modes, single.force, folder)
-        by_calculix = fe.reduced_model(modes.basis, run.cases, expand=False)
+        by_calculix = fe.reduced_model(modes.basis, run.cases)
     there = 4 * float(by_calculix.potential.coefficient[1])
     print(f"{modes.basis.frequency[0] / HERTZ:.2f} Hz, β {there:.4g}, {there / first:.4f} of ours")
     print(f"{np.sum(run.seconds):.1f} s for {len(run.status)} load cases")

@@ -27,7 +27,7 @@ from snrmjax.condense.potential_fit import (
     require_determined,
 )
 from snrmjax.model.modes import linear_modes
-from snrmjax.model.potential import Monomial, PolynomialPotential, monomial_key
+from snrmjax.model.potential import PolynomialPotential, monomial_key
 from snrmjax.model.structures import Structure, structure
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, Variable, setting
@@ -53,25 +53,6 @@ class FitQuality(eqx.Module):
     energy_error: Float[np.ndarray, " case"] | None  # relative
 
 
-class MembraneExpansion(eqx.Module):
-    """u(q) = Φq + Σ_k s_k p_k(q), with products p_k of modal displacements as coordinates.
-
-    The shapes s_k are fitted to what static load cases left of u − Φq: the quadratic ones are the
-    membrane basis of a flat structure, the cubic ones the bending that the modes kept do not have.
-    """
-
-    shapes: Float[Array, "dof mode"]  # Φ, kg^-1/2
-    static_shapes: Float[Array, "dof product"]  # s_k, kg^-1 m^-1 and kg^-3/2 m^-2
-    misfit: float  # rms of what is left of u − Φq, over its rms
-    products: tuple[Monomial, ...] = eqx.field(static=True)
-
-    def expand(self, displacement: Float[Array, "*batch mode"]) -> Float[Array, "*batch dof"]:
-        """The displacement of all degrees of freedom (m, rad) at modal displacements."""
-        q = jnp.asarray(displacement)
-        products = [jnp.prod(q[..., list(modes)], axis=-1) for modes in self.products]
-        return q @ self.shapes.T + jnp.stack(products, axis=-1) @ self.static_shapes.T
-
-
 class Condensation(AbstractResult):
     """A reduced-order model out of static load cases: ω²q + ∂V/∂q = f, and how good it is.
 
@@ -85,7 +66,6 @@ class Condensation(AbstractResult):
     cases: StaticCases
     potential: PolynomialPotential
     quality: FitQuality
-    expansion: MembraneExpansion | None  # None where the cases have no displacements
     warnings: tuple[Fact, ...] = setting()
     degree: int = setting()
 
@@ -107,15 +87,6 @@ class Condensation(AbstractResult):
         """Static modal force at modal displacements, linear part included, kg^1/2 m/s²."""
         q = jnp.asarray(displacement)
         return q * jnp.asarray(self.basis.frequency) ** 2 + self.potential.force(q)
-
-    def expand(self, displacement: Float[Array, "*batch mode"]) -> Float[Array, "*batch dof"]:
-        """Displacement of all degrees of freedom at modal displacements, membrane included.
-
-        Raises `ValueError` where the load cases had no displacements.
-        """
-        if self.expansion is None:
-            raise ValueError("the load cases had no displacements: there is no expansion.")
-        return self.expansion.expand(displacement)
 
     def structure(
         self,
@@ -146,13 +117,10 @@ class Condensation(AbstractResult):
         return structure(modes, self.potential, name=name)
 
 
-def reduced_model(
-    basis: ReductionBasis, cases: StaticCases, *, degree: int = 3, expand: bool = True
-) -> Condensation:
+def reduced_model(basis: ReductionBasis, cases: StaticCases, *, degree: int = 3) -> Condensation:
     """Fit one potential V to static load cases, f = ω²q + ∂V/∂q, and check both.
 
-    Arguments: `degree` of the nonlinear force (3: quadratic and cubic), up to 7; `expand` False
-    leaves the displacements beyond the modes out.
+    Arguments: `degree` of the nonlinear force (3: quadratic and cubic), up to 7.
     Returns the model with residuals, condition, cross-validated error and warnings. Within
     `jax.jit` and derivatives it is the same fit without checks, with coefficients of NaN where a
     load case did not converge. Raises
@@ -199,13 +167,11 @@ def reduced_model(
         fit_potential(basis, solved, degree=degree), coefficient_std=spread
     )
     view = FitView(basis, solved, potential, system, left_out, degree)
-    has_shapes = expand and cases.displacement is not None
     return Condensation(
         basis=basis,
         cases=cases,
         potential=potential,
         quality=_quality(view, used, len(cases.force)),
-        expansion=_membrane(basis, cases) if has_shapes else None,
         warnings=case_warnings(cases, view),
         degree=degree,
     )
@@ -220,32 +186,7 @@ def _unchecked(basis: ReductionBasis, cases: StaticCases, degree: int) -> Conden
     nothing = FitQuality(
         *(np.nan, np.nan, by_mode, by_mode, by_case, by_case, by_mode, np.nan), energy_error=None
     )
-    return Condensation(basis, cases, potential, nothing, None, (), degree)
-
-
-def _membrane(basis: ReductionBasis, cases: StaticCases) -> MembraneExpansion:
-    """The static part of the displacement, as products of two or three modal displacements.
-
-    Of two alone where there are not twice as many load cases.
-    Reference: Hollkamp & Gordon, J. Sound Vib. 318 (2008) 1139, doi:10.1016/j.jsv.2008.04.035
-    (expansion by quadratic products).
-    """
-    used = cases.usable
-    q = np.asarray(cases.modal_displacement)[used]
-    products = monomials_of(q.shape[1], 2, 1)
-    if 2 * len(products) > len(q):
-        products = monomials_of(q.shape[1], 1, 1)
-    scale = np.sqrt(np.mean(q**2, axis=0))
-    left = np.asarray(cases.displacement)[used] - q @ np.asarray(basis.shapes).T
-    columns = np.stack([np.prod(q[:, list(m)] / scale[list(m)], axis=1) for m in products], axis=1)
-    # The smallest shapes that fit, where the cases do not tell all products apart.
-    found = np.linalg.pinv(columns, rcond=1e-10) @ left
-    unit = np.array([np.prod(scale[list(m)]) for m in products])
-    size = float(np.sum(left**2))
-    misfit = float(np.sqrt(np.sum((left - columns @ found) ** 2) / size)) if size else 0.0
-    return MembraneExpansion(
-        jnp.asarray(basis.shapes), jnp.asarray((found / unit[:, None]).T), misfit, products
-    )
+    return Condensation(basis, cases, potential, nothing, (), degree)
 
 
 def _quality(fit: FitView, used: np.ndarray, n_cases: int) -> FitQuality:

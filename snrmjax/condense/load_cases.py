@@ -38,7 +38,7 @@ class StaticCases(eqx.Module):
     Case c has the external force F = M Φ f_c, so that ΦᵀF = f_c; its displacement u_c is
     q_c = filter @ u_c in modal coordinates. Rows that did not converge are kept, marked, and
     left out of fits. `energy` is the strain energy (J) where the finite-element code gave it:
-    a free check of the potential. `displacement` is needed for the membrane expansion only.
+    a free check of the potential; `displacement` u where it is known.
     """
 
     force: Float[Array, "case mode"]  # f, kg^1/2 m/s²

@@ -168,7 +168,7 @@ def test_load_cases_that_were_written_condense_to_the_same_model(source, tmp_pat
         main()
     assert ended.value.code == 0
     assert {p.name for p in out.iterdir()} == WRITTEN
-    direct = sj.condense.reduced_model(of_truth.basis, cases, expand=False)
+    direct = sj.condense.reduced_model(of_truth.basis, cases)
     model = sj.read_model(out / "model.toml")
     np.testing.assert_allclose(
         model.potential.coefficient, direct.potential.coefficient, rtol=1e-10

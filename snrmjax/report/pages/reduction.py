@@ -140,7 +140,6 @@ def reduction_summary(reduction: Reduction) -> dict:
             "energy_error": None
             if quality.energy_error is None
             else float(np.nanmax(np.abs(quality.energy_error))),
-            "expansion_misfit": None if found.expansion is None else found.expansion.misfit,
         },
         "load_scale_study": None,
         "warnings": [
@@ -233,12 +232,6 @@ def _fit(folder: Path, reduction: Reduction) -> Section:
         text.append(
             "The strain energy of the reduced model, which no fit has used, is at most "
             f"{number(100 * worst, 2)} % off the finite elements'."
-        )
-    expansion = reduction.condensation.expansion
-    if expansion is not None:
-        text.append(
-            f"The expansion by products of the modes leaves {number(100 * expansion.misfit, 2)} % "
-            "of the displacement that the modes themselves do not have."
         )
     return Section("Fit", text, [figure], [table])
 

@@ -10,7 +10,7 @@ from snrmjax.io.reduction.load_tables import read_load_tables
 
 def coefficients(folder):
     source = read_load_tables(folder.path)
-    found = sj.condense.reduced_model(source.basis, source.cases, expand=False)
+    found = sj.condense.reduced_model(source.basis, source.cases)
     return found.potential
 
 
