@@ -61,7 +61,6 @@ class AbstractEffect(eqx.Module):
       of a force that states none it is computed (see `shape_of`);
     - `confusions`: other effects that the same data may show, and the measurement that separates
       them;
-    - `is_linear`: a linear structure remains linear with it;
     - `like_force_gain`: a gain of all forces does the same;
     - `follows_force`: it adds a linear motion that the force drives, which beside a force of any
       size could be all that one sees;
@@ -74,7 +73,6 @@ class AbstractEffect(eqx.Module):
     description: ClassVar[str] = ""
     shape: ClassVar[Shape | None] = None
     confusions: ClassVar[tuple[Confusion, ...]] = ()
-    is_linear: ClassVar[bool] = False
     like_force_gain: ClassVar[bool] = False
     follows_force: ClassVar[bool] = False
     only_phase: ClassVar[bool] = False
@@ -272,8 +270,6 @@ class AbstractHysteresis(AbstractForce):
 
 class AbstractLinearChange(AbstractEffect):
     """A change of the linear terms of the mode of interest."""
-
-    is_linear: ClassVar[bool] = True
 
     @abstractmethod
     def linear_terms(

@@ -76,7 +76,6 @@ class ForceGainError(AbstractMeasurementEffect):
         "mass between it and the structure."
     )
     confusions: ClassVar[tuple[Confusion, ...]] = (SIZE_OF_RESPONSE, FORCE_OR_SENSOR_GAIN)
-    is_linear: ClassVar[bool] = True
     like_force_gain: ClassVar[bool] = True
     gain: Scalar = parameter(*("1", "relative error of the force"), **_RELATIVE)
 
@@ -115,7 +114,6 @@ class SensorGainError(AbstractMeasurementEffect):
         "values taken for amplitudes."
     )
     confusions: ClassVar[tuple[Confusion, ...]] = (SIZE_OF_RESPONSE, FORCE_OR_SENSOR_GAIN)
-    is_linear: ClassVar[bool] = True
     like_force_gain: ClassVar[bool] = True
     gain: Scalar = parameter(*("1", "relative error of the velocity"), **_RELATIVE)
 
@@ -137,7 +135,6 @@ class SensorPhaseError(AbstractMeasurementEffect):
         "the channels makes it."
     )
     confusions: ClassVar[tuple[Confusion, ...]] = (FAR_MODE_OR_PHASE_ERROR,)
-    is_linear: ClassVar[bool] = True
     only_phase: ClassVar[bool] = True
     phase_deg: Scalar = parameter(
         *("°", "phase by which the recorded velocity leads"),
@@ -163,7 +160,6 @@ class ResidualMode(AbstractMeasurementEffect):
         "is proportional to the force."
     )
     confusions: ClassVar[tuple[Confusion, ...]] = (FAR_MODE_OR_PHASE_ERROR,)
-    is_linear: ClassVar[bool] = True
     follows_force: ClassVar[bool] = True
     stage: ClassVar[int] = 1
     receptance: Scalar = parameter(
@@ -192,7 +188,6 @@ class CloseMode(AbstractMeasurementEffect):
         "response."
     )
     confusions: ClassVar[tuple[Confusion, ...]] = (FURTHER_MODE,)
-    is_linear: ClassVar[bool] = True
     searched: ClassVar[bool] = False
     follows_force: ClassVar[bool] = True
     stage: ClassVar[int] = 1
