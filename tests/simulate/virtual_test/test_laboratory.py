@@ -120,6 +120,17 @@ def test_contacts_and_friction_move_as_in_a_plain_integration(kind):
         np.testing.assert_allclose(seen, true, atol=2e-3 * np.abs(true).max())
 
 
+def test_a_shaker_may_be_a_source_of_force_without_dynamics():
+    laboratory = Laboratory(structure(), Shaker(1e-6, 1e-6), Instruments(), RATE)
+    omega = REST * np.array([0.98, 1.0])
+    test = sj.simulate.stepped_sine_test(laboratory, 3.0, omega, settle_cycles=300)
+    states = sj.simulate.steady_states_of(laboratory, test)
+    np.testing.assert_allclose(states.force, 3.0, rtol=1e-6)
+    exact = sj.model.linear_response(structure().modes, omega, np.full(2, 3.0))
+    # What e^(−ζωt) has left after 300 cycles at 1 %: 7e-9; the integrator errs by 1e-6.
+    np.testing.assert_allclose(states.velocity, exact, rtol=1e-5)
+
+
 @pytest.mark.long
 def test_microslip_settles_where_the_steady_cycle_is():
     joint = effect("iwan_microslip", coefficient=3e5, exponent=1.5)
