@@ -335,7 +335,7 @@ def test_data_that_do_not_do_are_told(exact):
         calibrate_model(sj.model.flat_beam(), dataclasses.replace(exact, sensors=("a",)), NAMES)
     nothing = jnp.full(exact.n_states, jnp.nan)
     unknown = dataclasses.replace(exact, force=nothing, drive=jnp.ones(exact.n_states))
-    with pytest.raises(ValueError, match="calibrate_force"):
+    with pytest.raises(ValueError, match="needs the force in newtons"):
         calibrate_model(curved(), unknown, NAMES)
     with pytest.raises(ValueError, match="level_gain_std"):
         calibrate_model(curved(), exact, NAMES, level_gain_std=-0.1)

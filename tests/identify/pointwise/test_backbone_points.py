@@ -396,7 +396,7 @@ class TestRefusals:
         )
         with pytest.raises(
             ValueError,
-            match=r"only a drive voltage .* `--fit auto --free force_gain`.*calibrate_force",
+            match=r"only a drive voltage .* `--fit auto --free force_gain`",
         ):
             identify_points(data, three_modes((0,)))
 
