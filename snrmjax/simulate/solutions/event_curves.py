@@ -290,7 +290,7 @@ def _second_frequency(model: Structure, coefficients: np.ndarray, frequency: flo
 def trace_events(
     equations: EventEquations, start: Array, ends: Array, steps: StepControl, up: Array
 ) -> Curve:
-    """One way from a start, the parameter rising (`up` 1) or falling (-1), until it leaves `ends`."""
+    """One way from a start, `up` 1 for a rising parameter and -1 for a falling one."""
     direction = jnp.zeros_like(start).at[-1].set(up)
     return trace_curve(equations.linearised, start, direction, CurveRange(ends[0], ends[1]), steps)
 
