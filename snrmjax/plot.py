@@ -36,6 +36,7 @@ from snrmjax.report.figures.simulation import (
     simulated_response_figure,
 )
 from snrmjax.report.figures.uncertainty import (
+    propagation_figure,
     sensitivity_figure,
 )
 from snrmjax.report.style import save_figure
@@ -61,6 +62,7 @@ __all__ = [
     "next_measurements_figure",
     "normal_mode_figure",
     "parts_figure",
+    "propagation_figure",
     "residuals_figure",
     "response_figure",
     "save_figure",
