@@ -13,7 +13,7 @@ import numpy as np
 from snrmjax.identify.inference.contributions import Contribution
 from snrmjax.identify.inference.fitted_curves import values_to_the_largest
 from snrmjax.identify.inference.fitted_response import FittedResponse
-from snrmjax.identify.inference.located_points import FittedPoint
+from snrmjax.identify.inference.forced_motion import FittedPoint
 from snrmjax.identify.inference.optimal_design import NextMeasurement, NextMeasurements
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.test_model.states import LEVEL_ERRORS

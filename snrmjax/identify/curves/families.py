@@ -38,8 +38,7 @@ class SumOfPowers(AbstractFamily):
 
     def coefficients(self) -> tuple[Coefficient, ...]:
         """See `AbstractFamily`."""
-        pairs = self.powers(self.order).items()
-        return tuple(Coefficient(name, power, True) for name, power in pairs)
+        return tuple(Coefficient(name, True) for name in self.powers(self.order))
 
     @classmethod
     def starts(
@@ -128,9 +127,8 @@ class PowerLaw(AbstractFamily):
     def coefficients(self) -> tuple[Coefficient, ...]:
         """See `AbstractFamily`; the coefficient is the contribution at the largest amplitude."""
         return (
-            Coefficient("at_zero", 0.0, True),
-            Coefficient("at_largest", 0.0, True),
-            Coefficient("logit_exponent", 0.0, False),
+            *(Coefficient("at_zero", True), Coefficient("at_largest", True)),
+            Coefficient("logit_exponent", False),
         )
 
     @classmethod

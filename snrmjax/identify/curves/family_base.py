@@ -30,10 +30,9 @@ _SIZE = 12  # parameters and powers in programs; a larger family takes a multipl
 
 
 class Coefficient(NamedTuple):
-    """A parameter as an engineer writes it: coefficient·amplitude^power, or a bare number."""
+    """A parameter of a family."""
 
     name: str
-    power: float  # of the amplitude that the coefficient multiplies
     is_value: bool  # False: a number without unit, such as an exponent
 
 
@@ -192,7 +191,7 @@ class AbstractFamily(AbstractCurve):
 
     @abstractmethod
     def coefficients(self) -> tuple[Coefficient, ...]:
-        """What the parameters are called and the power of amplitude that each belongs to."""
+        """What the parameters are called, and which are values."""
 
     @classmethod
     @abstractmethod

@@ -76,8 +76,8 @@ class OwnFamily(AbstractFamily):
 
     def coefficients(self) -> tuple[Coefficient, ...]:
         """See `AbstractFamily`."""
-        values = (Coefficient(name, 0.0, True) for name in self.names)
-        return (*values, *(Coefficient(f"log_{name}", 0.0, False) for name in self.numbers))
+        values = (Coefficient(name, True) for name in self.names)
+        return (*values, *(Coefficient(f"log_{name}", False) for name in self.numbers))
 
     @classmethod
     def starts(

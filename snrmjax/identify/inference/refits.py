@@ -8,12 +8,12 @@ Reference: Griewank & Walther, Evaluating Derivatives (2008), ch. 15, doi:10.113
 """
 
 import dataclasses
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float
 
 from snrmjax.identify.joint.force_balance import (
@@ -21,14 +21,8 @@ from snrmjax.identify.joint.force_balance import (
     Unknowns,
     filled,
     force_balance,
-    nearest_errors,
 )
-from snrmjax.identify.joint.free_unknowns import (
-    Unravel,
-    all_residuals,
-    padded_problem,
-    prior_residuals,
-)
+from snrmjax.identify.joint.free_unknowns import Unravel, padded_problem, prior_residuals
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.numerics.compiled import compiled, on_numbers
 
@@ -123,29 +117,45 @@ class _Refit(eqx.Module):
 
     def solved(
         self, start: Float[Array, " unknown"]
-    ) -> tuple[Float[Array, " unknown"], Bool[Array, ""]]:
-        """The optimum by Gauss–Newton iterations, and whether it was reached."""
+    ) -> tuple[Float[Array, " unknown"], Float[Array, "state input"], Bool[Array, ""]]:
+        """The optimum, the states' errors there in their 1σ, and whether it was reached.
 
-        def step(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-            point, _, count = state
-            errors, weighting = nearest_errors(self.unravel(self.entries(point)), self.problem)
-            at = self.problem.with_data(correction=errors)
+        By Gauss–Newton iterations with all errors as unknowns, which are eliminated state by state:
+        balances b made straight leave (SSᵀ)⁻¹(b − Se + J dθ) of each, and errors −Sᵀ times it.
+        """
+        expected = jax.jacfwd(self.expected)
 
-            def left(point: Array) -> tuple[Array, Array]:
-                rows = all_residuals(self.entries(point), self.unravel, at, weighting)
-                return rows, rows
+        def step(state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
+            point, errors, _, count = state
+            slopes = self.by_error(point, errors)
+            by_unknown = jax.jacfwd(lambda p: self.balances(p, errors))(point)
+            left = self.balances(point, errors) - jnp.einsum("sie,se->si", slopes, errors)
+            both = jnp.concatenate([left[:, :, None], by_unknown], axis=2)
+            pulled = jnp.linalg.solve(slopes @ slopes.mT, both)
+            prior = expected(point)
+            normal = jnp.einsum("sie,sif->ef", by_unknown, pulled[:, :, 1:]) + prior.T @ prior
+            gradient = jnp.einsum("sie,si->e", by_unknown, pulled[:, :, 0])
+            moved = jnp.linalg.solve(normal, gradient + prior.T @ self.expected(point))
+            errors = jnp.einsum("sie,si->se", slopes, pulled[:, :, 1:] @ moved - pulled[:, :, 0])
+            return point - moved, errors, jnp.max(jnp.abs(moved)), count + 1
 
-            slopes, now = jax.jacfwd(left, has_aux=True)(point)
-            directions, triangle = jnp.linalg.qr(slopes)
-            moved = solve_triangular(triangle, directions.T @ now)
-            return point - moved, jnp.max(jnp.abs(moved)), count + 1
+        def goes_on(state: tuple[Array, Array, Array, Array]) -> Array:
+            return (state[2] > _ARRIVED) & (state[3] < _MOST_STEPS)
 
-        def goes_on(state: tuple[Array, Array, Array]) -> Array:
-            return (state[1] > _ARRIVED) & (state[2] < _MOST_STEPS)
+        exact = jnp.zeros_like(self.problem.data.std)
+        first = (start, exact, jnp.array(jnp.inf), jnp.array(0))
+        point, errors, moved, _ = jax.lax.while_loop(goes_on, step, first)
+        return point, errors, moved <= _ARRIVED
 
-        first = (start, jnp.array(jnp.inf), jnp.array(0))
-        point, moved, _ = jax.lax.while_loop(goes_on, step, first)
-        return point, moved <= _ARRIVED
+    def expected(self, point: Float[Array, " unknown"]) -> Float[Array, " row"]:
+        """What the priors expect near zero, in its own 1σ."""
+        return prior_residuals(self.unravel(self.entries(point)), self.problem.prior)
+
+    def by_error(
+        self, point: Float[Array, " unknown"], errors: Float[Array, "state input"]
+    ) -> Float[Array, "state part input"]:
+        """Derivatives of the balances by each state's own errors, in their 1σ."""
+        return _state_by_state(lambda errors: self.balances(point, errors), errors)
 
     def balances(
         self, point: Float[Array, " unknown"], errors: Float[Array, "state input"]
@@ -168,18 +178,26 @@ class _Refit(eqx.Module):
 
         def lagrangian(point: Array, errors: Array) -> tuple[Array, Array]:
             left = self.balances(point, errors)
-            expected = prior_residuals(self.unravel(self.entries(point)), self.problem.prior)
-            squares = jnp.sum(expected**2) + jnp.sum(errors**2)
+            squares = jnp.sum(self.expected(point) ** 2) + jnp.sum(errors**2)
             return 0.5 * squares + jnp.sum(multipliers * left), left
 
         by, left = jax.grad(lagrangian, argnums=(0, 1), has_aux=True)(point, errors)
         return *by, left
 
 
+def _state_by_state(
+    function: Callable[[Array], Array], errors: Float[Array, "state input"]
+) -> Float[Array, "state row input"]:
+    """Derivatives of what every state has by its own errors: a push forward for each kind."""
+    kinds = jnp.broadcast_to(jnp.eye(errors.shape[1])[:, None], (errors.shape[1], *errors.shape))
+    along = jax.vmap(lambda direction: jax.jvp(function, (errors,), (direction,))[1])
+    return jnp.moveaxis(along(kinds), 0, 2)
+
+
 @eqx.filter_custom_jvp
 def _optimum(problem: _Refit) -> Float[Array, " unknown"]:
     """The unknowns at the optimum, in 1σ from where they begin."""
-    point, good = problem.solved(jnp.zeros(len(problem.own)))
+    point, _, good = problem.solved(jnp.zeros(len(problem.own)))
     return jnp.where(good, point, jnp.nan)
 
 
@@ -187,25 +205,13 @@ def _optimum(problem: _Refit) -> Float[Array, " unknown"]:
 def _implicit(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     """By the implicit function theorem, errors and multipliers eliminated state by state."""
     (problem,), (moved,) = primals, tangents
-    point = _optimum(problem)
-    errors = nearest_errors(problem.unravel(problem.entries(point)), problem.problem)[0]
-    std, weight = problem.problem.data.std, problem.problem.data.weight
-    errors = errors * jnp.sqrt(jnp.maximum(weight, _NO_WEIGHT))[:, None]
-    errors = jnp.where(std > 0, errors / jnp.where(std > 0, std, 1.0), 0.0)
-    kinds = jnp.broadcast_to(jnp.eye(errors.shape[1])[:, None], (errors.shape[1], *errors.shape))
-    # Balances by errors: (state, part, input).
-    by_error = jax.vmap(lambda d: jax.jvp(lambda e: problem.balances(point, e), (errors,), (d,))[1])
-    slopes = jnp.moveaxis(by_error(kinds), 0, 2)
+    point, errors, good = problem.solved(jnp.zeros(len(problem.own)))
+    point = jnp.where(good, point, jnp.nan)
+    slopes = problem.by_error(point, errors)
     square = slopes @ slopes.mT
     multipliers = -jnp.linalg.solve(square, (slopes @ errors[:, :, None]))[:, :, 0]
 
-    def by_errors(direction: Array) -> Array:
-        def given(errors: Array) -> Array:
-            return problem.stationary(point, errors, multipliers)[1]
-
-        return jax.jvp(given, (errors,), (direction,))[1]
-
-    inner = jnp.moveaxis(jax.vmap(by_errors)(kinds), 0, 2)
+    inner = _state_by_state(lambda e: problem.stationary(point, e, multipliers)[1], errors)
     none = jnp.zeros((len(errors), 2, 2))
     blocks = jnp.block([[inner, slopes.mT], [slopes, none]])
     hessian, *sensitivities = jax.jacfwd(lambda p: problem.stationary(p, errors, multipliers))(
@@ -308,7 +314,7 @@ def bootstrap(
 def _resampled(refit: _Refit, weights: Array) -> Float[Array, "sample unknown"]:
     def again(weight: Array) -> Array:
         weighted = dataclasses.replace(refit, problem=refit.problem.with_data(weight=weight))
-        point, good = weighted.solved(jnp.zeros(len(refit.own)))
+        point, _, good = weighted.solved(jnp.zeros(len(refit.own)))
         return jnp.where(good, point, jnp.nan)
 
     return jax.lax.map(again, weights)

@@ -49,7 +49,6 @@ from snrmjax.identify.joint.posterior_view import (
     viewed_covariance,
     viewed_unknowns,
 )
-from snrmjax.identify.test_model.states import LEVEL_ERRORS
 from snrmjax.measure.phase_convention import naming_wrong_phases
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.modes import LinearModes
@@ -243,9 +242,7 @@ class JointFit(AbstractResult):
         }
 
 
-@on_numbers(
-    "Differentiate `sj.identify.identify_points`, or the fitted curves themselves (`fit.unknowns`)."
-)
+@on_numbers("Differentiate `sj.identify.refit`.")
 @on_one_core
 @naming_wrong_phases
 def fit_jointly(
@@ -287,8 +284,7 @@ def fit_jointly(
     than there are data, a gain, an offset or a phase that the data do not determine, and a fit that
     needs a modal mass or a damping below zero.
     Validity: one nonlinear mode whose ω̃ and 2ζ̃ω̃ are functions of amplitude alone.
-    Not differentiable: differentiate `snrmjax.identify.identify_points`, or the fitted curves
-    themselves (`fit.unknowns`).
+    Not differentiable: differentiate `snrmjax.identify.refit`.
     """
     level_std = stated_level_std(modes)
     for k, std in enumerate((level_gain_std, level_phase_std)):
@@ -341,7 +337,7 @@ def fit_jointly(
         status=FitStatus.CONVERGED if posterior.settled else FitStatus.NOT_SETTLED,
         level_numbers=numbers,
     )
-    notes = notes_on_instruments(fit, LEVEL_ERRORS)
+    notes = notes_on_instruments(fit)
     curve, mass = fit.unknowns.modal_damping, fit.problem.constant_of(fit.unknowns)
     require_passive(
         released,
@@ -353,16 +349,13 @@ def fit_jointly(
     return dataclasses.replace(fit, notes=tuple(notes))
 
 
-@on_numbers(
-    "Differentiate `sj.identify.identify_points`, or the fitted curves themselves (`fit.unknowns`)."
-)
+@on_numbers("Differentiate `sj.identify.refit`.")
 def corrected_states(data: SteadyStates, fit: JointFit) -> SteadyStates:
     """The states with the force and the phase that a joint fit found for their instruments.
 
     Where only a drive voltage is known, the force in N is that voltage times the fitted gain.
 
-    Not differentiable: differentiate `snrmjax.identify.identify_points`, or the fitted curves
-    themselves (`fit.unknowns`).
+    Not differentiable: differentiate `snrmjax.identify.refit`.
     """
     unknowns = fit.unknowns
     nominal = np.asarray(data.drive if fit.drive_known_only else data.force)

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import chdtri, ndtri
 
-from snrmjax.identify.curves.remainder import WithRemainder
+from snrmjax.identify.curves.splines import WithRemainder
 from snrmjax.identify.joint.force_balance import BalanceProblem, Motion, Unknowns
 from snrmjax.identify.test_model.states import LEVEL_ERRORS
 from snrmjax.numerics.facts import Fact

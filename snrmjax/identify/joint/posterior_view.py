@@ -12,8 +12,7 @@ from scipy.optimize import nnls
 from snrmjax.identify.checks.instruments import require_passive
 from snrmjax.identify.curves.families import ARGUMENTS, FAMILIES, Choice
 from snrmjax.identify.curves.family_base import AbstractFamily
-from snrmjax.identify.curves.remainder import WithRemainder
-from snrmjax.identify.curves.splines import SmoothingSpline
+from snrmjax.identify.curves.splines import SmoothingSpline, WithRemainder
 from snrmjax.identify.joint.force_balance import (
     EXPONENTS,
     STATE_ERRORS,

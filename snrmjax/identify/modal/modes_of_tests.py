@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from snrmjax.identify.modal.amplitude_fit import (
     amplitude_dependent_modes,
+    over_reference,
     pole_of_states,
     rows_of_levels,
 )
@@ -19,7 +20,7 @@ from snrmjax.identify.modal.response_data import coherence_std
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses, frequency_responses
 from snrmjax.measure.recordings.time_recording import TimeRecording
-from snrmjax.measure.states import SteadyStates, relative_errors
+from snrmjax.measure.states import SteadyStates
 from snrmjax.model.moving_base import SensorMotion
 from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.facts import Fact
@@ -139,20 +140,12 @@ def responses_of_states(data: SteadyStates, level: int) -> StateResponses:
         raise ValueError(f"there is no level {level}; there are {listed}.")
     if np.any(np.asarray(data.phase_unknown)[rows]):
         raise ValueError("modes need phases, but velocities of amplitude alone were measured.")
-    force = np.asarray(data.force)[rows]
-    volts = not np.isfinite(force).any()
-    if volts:
-        force = np.asarray(data.drive)[rows]
-    reference = Channel("drive", "voltage", "V") if volts else Channel("force", "force", "N")
-    if data.base is not None:
-        reference = Channel("base", "acceleration", "m/s^2")
-    seen = np.asarray(data.measured)[rows]
-    velocity = np.where(seen, np.asarray(data.velocity)[rows], np.nan)
-    mobility = velocity / force[:, None]
-    errors = np.asarray(relative_errors(data))[rows]
-    stated = np.isfinite(errors).all(axis=2)
-    parts = np.sqrt(np.nansum(errors**2, axis=2) / 2) * np.abs(mobility)
-    known = bool(np.all(stated[seen]) and np.all(parts[seen] > 0))
+    reference, load, velocity, std, known = over_reference(data, rows)
+    seen, mobility, parts = (
+        np.isfinite(velocity),
+        velocity / load[:, None],
+        std / np.abs(load[:, None]),
+    )
     omega, place = np.unique(np.asarray(data.frequency)[rows], return_inverse=True)
     shape = (velocity.shape[1], len(omega))
     total, count, variance = np.zeros(shape, dtype=complex), np.zeros(shape), np.zeros(shape)

@@ -58,9 +58,7 @@ ON_THE_CURVES = NewLevel(np.zeros(len(LEVEL_ERRORS)))
 """No level at all: the force in newtons moves the fitted mode itself."""
 
 
-@on_numbers(
-    "Differentiate `sj.identify.identify_points`, or the fitted curves themselves (`fit.unknowns`)."
-)
+@on_numbers("Differentiate `sj.identify.refit`.")
 def new_level(
     fit: JointFit,
     force: float,
@@ -78,8 +76,7 @@ def new_level(
     it, whose gain then errs too; `day` what another day's test differs by; `at` the sensor or point
     where the force acts, if not where it did in the test.
     Raises what `LinearModes.forced_at` raises.
-    Not differentiable: differentiate `snrmjax.identify.identify_points`, or the fitted curves
-    themselves (`fit.unknowns`).
+    Not differentiable: differentiate `snrmjax.identify.refit`.
     """
     std = np.array(fit.prior.new_level, dtype=float)
     forced = None if at is None else fit.modes.forced_at(at)

@@ -9,8 +9,7 @@ from jaxtyping import Bool, Float
 from snrmjax.identify.modal.free_decay import DecayModes
 from snrmjax.identify.modal.modal_fit import LinearModalFit
 from snrmjax.identify.scaling.added_mass import squared_shapes
-from snrmjax.identify.scaling.rigid_body import rigid_body_mode
-from snrmjax.identify.scaling.scaled_modes import ScaledModes
+from snrmjax.identify.scaling.scaled_modes import ScaledModes, rigid_body_mode
 from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.facts import Fact
 

@@ -12,7 +12,7 @@ from truths.joint_fits import noisy_fit
 
 import snrmjax as sj
 from snrmjax.identify.inference.fitted_curves import as_backbone
-from snrmjax.identify.inference.located_points import Place, solved_point
+from snrmjax.identify.inference.forced_motion import Place, solved_point
 from snrmjax.identify.inference.optimal_design import AdviceStatus
 from snrmjax.identify.joint.joint_fit import FitStatus
 from snrmjax.identify.prediction.new_level import ON_THE_CURVES
