@@ -60,7 +60,6 @@ class ChosenTerms(NamedTuple):
     """How probable choices of terms are."""
 
     best: Bool[np.ndarray, " term"]
-    included: Float[np.ndarray, " term"]  # probability of each
     coupled: float  # that one that resonates is there
 
 
@@ -96,7 +95,6 @@ def chosen_terms(
     weight /= weight.sum()
     return ChosenTerms(
         best=choices[np.argmax(weight)],
-        included=weight @ choices,
         coupled=float(weight[couples].sum()),
     )
 

@@ -11,11 +11,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 from scipy.linalg import block_diag
 
-from snrmjax.identify.joint.force_balance import (
-    Unknowns,
-    log_modal_mass,
-    with_deviations,
-)
+from snrmjax.identify.joint.force_balance import Unknowns, log_modal_mass, with_deviations
 from snrmjax.identify.joint.free_unknowns import Unravel
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.pointwise.prediction import Resonance

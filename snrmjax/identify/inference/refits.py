@@ -16,12 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from snrmjax.identify.joint.force_balance import (
-    BalanceProblem,
-    Unknowns,
-    filled,
-    force_balance,
-)
+from snrmjax.identify.joint.force_balance import BalanceProblem, Unknowns, filled, force_balance
 from snrmjax.identify.joint.free_unknowns import Unravel, padded_problem, prior_residuals
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.numerics.compiled import compiled, on_numbers
@@ -54,8 +49,7 @@ class FitInputs(eqx.Module):
         states, modes = jnp.zeros(len(fit.data.level)), jnp.zeros(fit.modes.n_modes)
         linear, four = jnp.zeros(len(fit.prior.linear)), jnp.zeros(4)
         return cls(
-            *(states, states, states, modes, modes, modes),
-            *(four, four, linear, jnp.zeros(2)),
+            *(states, states, states, modes, modes, modes), *(four, four, linear, jnp.zeros(2))
         )
 
 
@@ -283,12 +277,11 @@ def _slopes(refit: _Refit, none: FitInputs) -> FitInputs:
 
 @on_numbers("Differentiate `sj.identify.refit`.")
 def bootstrap(
-    fit: JointFit, n_samples: int = 200, *, seed: int = 0, levels: bool = False
+    fit: JointFit, n_samples: int = 200, *, seed: int = 0
 ) -> Float[np.ndarray, "sample unknown"]:
     """Unknowns of refits to states drawn with replacement, within every level.
 
-    With `levels` whole levels are drawn instead, which needs more of them than a curve has
-    parameters. A refit that does not converge is a row of NaN.
+    A refit that does not converge is a row of NaN. What levels share is not seen by it.
 
     Not differentiable: differentiate `sj.identify.refit`.
     """
@@ -296,13 +289,9 @@ def bootstrap(
     level = np.asarray(fit.data.level)
     weights = np.zeros((n_samples, len(level)))
     for row in weights:
-        if levels:
-            drawn = rng.integers(fit.data.n_levels, size=fit.data.n_levels)
-            row += np.bincount(drawn, minlength=fit.data.n_levels)[level]
-        else:
-            for number in range(fit.data.n_levels):
-                mine = np.flatnonzero(level == number)
-                np.add.at(row, rng.choice(mine, size=mine.size), 1.0)
+        for number in range(fit.data.n_levels):
+            mine = np.flatnonzero(level == number)
+            np.add.at(row, rng.choice(mine, size=mine.size), 1.0)
     refit = _Refit.of(fit)
     room, weights = len(refit.problem.data.level), weights * np.asarray(fit.data.weight)
     rows = jax.device_put(np.stack([filled(row, room, 0.0) for row in weights]))

@@ -240,11 +240,7 @@ class Motion(eqx.Module):
 
 @compiled
 def _velocity_of_others(
-    modes: LinearModes,
-    change: tuple[Array, Array],
-    frequency: Array,
-    load: Array,
-    share: Array,
+    modes: LinearModes, change: tuple[Array, Array], frequency: Array, load: Array, share: Array
 ) -> Array:
     modes = with_deviations(modes, *change)
     return jnp.sum(share * residual_velocity(modes, frequency, load), axis=1)
@@ -291,9 +287,7 @@ def recorded_motion(unknowns: Unknowns, problem: BalanceProblem) -> Motion:
 
 @compiled
 def force_balance(
-    unknowns: Unknowns,
-    problem: BalanceProblem,
-    error: Float[Array, "state input"],
+    unknowns: Unknowns, problem: BalanceProblem, error: Float[Array, "state input"]
 ) -> Float[Array, "state part"]:
     """Force needed for the measured motion minus the force, over the force: real and imaginary."""
     data, prior = problem.data, problem.prior

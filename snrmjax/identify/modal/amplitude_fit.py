@@ -260,11 +260,7 @@ def _of_kind(
 
 
 def _start(
-    rows: LevelRows,
-    mode: tuple[float, float],
-    start: LinearModalFit,
-    power: int,
-    damping: bool,
+    rows: LevelRows, mode: tuple[float, float], start: LinearModalFit, power: int, damping: bool
 ) -> tuple[AmplitudeDependence, np.ndarray | None]:
     """The dependence with the amplitudes as measured; and ω, ζ, s, t by linear least squares.
 

@@ -52,8 +52,8 @@ class BackbonePoints(AbstractResult):
     backbone_velocity: Float[Array, " state"] = quantity(
         "state", "m/s", "velocity amplitude where the point lies on the backbone"
     )
-    sensitivity: Float[Array, "state output input"]  # of ω̃², 2ζ̃ω̃, log amplitude to `INPUTS`
-    relative_std: Float[Array, "state input"]  # 1σ of `INPUTS`
+    sensitivity: Float[Array, "state output input"]  # of ω̃², 2ζ̃ω̃, log amplitude
+    relative_std: Float[Array, "state input"]  # 1σ of log force, log velocity and phase
     filter_residual: Float[Array, " state"]  # part of the mode's motion that its shape misses
     status: Int[Array, " state"] = quantity("state", "", "outcome", of=PointStatus)
     sensor: str = setting()
@@ -87,14 +87,8 @@ class BackbonePoints(AbstractResult):
 
 AmplitudeMeasure = Literal["fundamental", "peak"]
 
-INPUTS = ("log_force", "log_velocity", "phase")
-"""The measured quantities whose errors are carried to the points."""
-
 NOISE_GROWTH = 4.0
 """Error of a point 90° off resonance over that of one at resonance, where no noise is stated."""
-
-OUTPUTS = ("squared_frequency", "modal_damping", "log_amplitude")
-"""The quantities whose derivatives `BackbonePoints.sensitivity` holds."""
 
 
 def identify_points(
@@ -143,11 +137,7 @@ def identify_points(
 
 @compiled
 def _identify(
-    data: SteadyStates,
-    modes: LinearModes,
-    r: int,
-    amplitude: Argument,
-    measure: AmplitudeMeasure,
+    data: SteadyStates, modes: LinearModes, r: int, amplitude: Argument, measure: AmplitudeMeasure
 ) -> BackbonePoints:
     # States without a force or a frequency are solved for harmless ones and masked afterwards:
     # in a derivative `where` does not stop a NaN that was computed.
@@ -263,10 +253,7 @@ def _ratios_std(
     # ζ̃ = δ/(2ω̃): dζ̃ = dδ/(2ω̃) − ζ̃ dω̃²/(2ω̃²).
     slope = jnp.stack([-damping / (2 * natural**2), 1 / (2 * natural)], axis=1)
     of_damping = jnp.einsum("so,sop,sp->s", slope, covariance[:, :2, :2], slope)
-    return (
-        jnp.where(known, natural_std, jnp.nan),
-        jnp.where(known, _root(of_damping), jnp.nan),
-    )
+    return (jnp.where(known, natural_std, jnp.nan), jnp.where(known, _root(of_damping), jnp.nan))
 
 
 def peak_ratio(data: SteadyStates) -> Float[Array, "state sensor"]:

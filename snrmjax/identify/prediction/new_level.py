@@ -1,6 +1,5 @@
 """Errors of a level that was not measured: as levels differ, with their trend, on another day."""
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -86,17 +85,10 @@ def new_level(
     for trend in trends:
         place = LEVEL_ERRORS.index(trend.kind)
         std[place] = np.hypot(std[place], trend.there)
+    if day is not None:
+        std = np.hypot(std, [day.gain, 0.0, 2 * day.frequency, day.damping])
     record = float(fit.recorded_force(np.array(force))) if as_recorded else None
-    return new._replace(std=further_std(std, day), drive=record, trends=trends)
-
-
-def further_std(
-    level: Sequence[float] | np.ndarray, day: DayToDay | None
-) -> Float[np.ndarray, " error"]:
-    """1σ of `LEVEL_ERRORS` of a level of this test, or of another day's."""
-    if day is None:
-        return np.array(level, dtype=float)
-    return np.hypot(level, [day.gain, 0.0, 2 * day.frequency, day.damping])
+    return new._replace(std=std, drive=record, trends=trends)
 
 
 def _trends(fit: JointFit, force: float) -> tuple[LevelTrend, ...]:

@@ -6,14 +6,12 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from snrmjax.identify.modal.modal_fit import LinearModalFit
+from snrmjax.identify.modal.modal_fit import WIDE, LinearModalFit
 from snrmjax.model.modes import Beside, LinearModes, LinearModesStd, RigidBodyModes, linear_modes
 from snrmjax.model.moving_base import BaseMotion
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
 from snrmjax.numerics.units import HERTZ
-
-_WIDE = 1.96  # standard deviations of a 95 % band
 
 
 class ScaledModes(AbstractResult):
@@ -91,9 +89,9 @@ class ScaledModes(AbstractResult):
             top = int(np.argmax(np.abs(self.shape[:, k])))
             lines.append(
                 f"mode {k + 1}: {self.natural_frequency[k] / HERTZ:.7g} ± "
-                f"{_WIDE * self.natural_frequency_std[k] / HERTZ:.2g} Hz, damping "
+                f"{WIDE * self.natural_frequency_std[k] / HERTZ:.2g} Hz, damping "
                 f"{100 * self.damping_ratio[k]:.4g} ± "
-                f"{_WIDE * 100 * self.damping_ratio_std[k]:.2g} %, shape "
+                f"{WIDE * 100 * self.damping_ratio_std[k]:.2g} %, shape "
                 f"{self.shape[top, k]:.5g} at {self.sensors[top]}, participation "
                 f"{self.participation[k]:.5g} per {self.per}"
             )
@@ -165,7 +163,7 @@ def rigid_body_mode(
         what = (
             "is not known"
             if np.isnan(residual)
-            else f"is {residual:.3g} ± {1.96 * residual_std:.2g} 1/kg"
+            else f"is {residual:.3g} ± {WIDE * residual_std:.2g} 1/kg"
         )
         raise ValueError(
             f"a free structure answers −1/(m Ω²) at low frequency, but the low residual at the "
