@@ -15,8 +15,8 @@ from snrmjax.identify.curves.family_base import (
     Argument,
     Coefficient,
     Linearised,
+    Scattered,
     Terms,
-    linear_start,
 )
 from snrmjax.identify.curves.splines import SmoothingSpline, Spline, spline_terms
 
@@ -45,19 +45,11 @@ class SumOfPowers(AbstractFamily):
         return tuple(Coefficient(name, True) for name in self.powers(self.order))
 
     @classmethod
-    def starts(
-        cls,
-        order: int,
-        argument: Argument,
-        amplitude: np.ndarray,
-        values: np.ndarray,
-        weight: np.ndarray,
-    ) -> list[AbstractFamily]:
+    def starts(cls, order: int, near: Scattered) -> list[AbstractFamily]:
         """See `AbstractFamily`."""
-        scale = float(np.max(amplitude))
-        columns = np.stack([(amplitude / scale) ** p for p in cls.powers(order).values()], axis=1)
-        start = linear_start(columns, values, weight)
-        return [cls(jnp.asarray(start), jnp.asarray(scale, dtype=jnp.float64), argument)]
+        relative = near.amplitude / near.largest
+        start = near.fitted(np.stack([relative**p for p in cls.powers(order).values()], axis=1))
+        return [cls(jnp.asarray(start), jnp.asarray(near.largest), near.argument)]
 
 
 class Polynomial(SumOfPowers):
@@ -136,22 +128,15 @@ class PowerLaw(AbstractFamily):
         )
 
     @classmethod
-    def starts(
-        cls,
-        order: int,
-        argument: Argument,
-        amplitude: np.ndarray,
-        values: np.ndarray,
-        weight: np.ndarray,
-    ) -> list[AbstractFamily]:
+    def starts(cls, order: int, near: Scattered) -> list[AbstractFamily]:
         """See `AbstractFamily`."""
-        scale = float(np.max(amplitude))
         members: list[AbstractFamily] = []
+        relative, scale = near.amplitude / near.largest, jnp.asarray(near.largest)
         for power in cls.tried:
-            columns = np.stack([np.ones(len(values)), (amplitude / scale) ** power], axis=1)
+            columns = np.stack([np.ones(len(relative)), relative**power], axis=1)
             share = power / cls.largest_exponent
-            start = [*linear_start(columns, values, weight), np.log(share / (1 - share))]
-            members.append(cls(jnp.asarray(start), jnp.asarray(scale, dtype=jnp.float64), argument))
+            start = [*near.fitted(columns), np.log(share / (1 - share))]
+            members.append(cls(jnp.asarray(start), scale, near.argument))
         return members
 
 
@@ -281,20 +266,12 @@ class OwnFamily(AbstractFamily):
         return (*values, *(Coefficient(f"log_{name}", False) for name in self.numbers))
 
     @classmethod
-    def starts(
-        cls,
-        order: int,
-        argument: Argument,
-        amplitude: np.ndarray,
-        values: np.ndarray,
-        weight: np.ndarray,
-    ) -> list[AbstractFamily]:
+    def starts(cls, order: int, near: Scattered) -> list[AbstractFamily]:
         """See `AbstractFamily`: one at every combination of its numbers."""
         members: list[AbstractFamily] = []
-        n, scale = len(cls.names), jnp.asarray(float(np.max(amplitude)))
+        n, scale = len(cls.names), jnp.asarray(near.largest)
         for numbers in itertools.product(*cls.numbers.values()):
-            blank = cls(jnp.append(jnp.ones(n), jnp.log(jnp.array(numbers))), scale, argument)
-            columns = blank.linearised(amplitude).by_parameters[:, :n]
-            start = linear_start(columns, values, weight)
+            blank = cls(jnp.append(jnp.ones(n), jnp.log(jnp.array(numbers))), scale, near.argument)
+            start = near.fitted(blank.linearised(near.amplitude).by_parameters[:, :n])
             members.append(blank.at(np.append(start, blank.parameters[n:])))
         return members

@@ -13,9 +13,9 @@ from snrmjax.identify.curves.family_base import (
     AbstractFamily,
     Argument,
     Coefficient,
+    Scattered,
     Terms,
     hats,
-    linear_start,
 )
 
 _CROWD = 4  # states between two knots, at most
@@ -50,24 +50,17 @@ class Spline(AbstractFamily):
         return tuple(Coefficient(f"knot_{k}", True) for k in range(n))
 
     @classmethod
-    def starts(
-        cls,
-        order: int,
-        argument: Argument,
-        amplitude: np.ndarray,
-        values: np.ndarray,
-        weight: np.ndarray,
-    ) -> list[AbstractFamily]:
+    def starts(cls, order: int, near: Scattered) -> list[AbstractFamily]:
         """See `AbstractFamily`; knots at zero and where the amplitudes divide into equal parts."""
-        scale = float(np.max(amplitude))
-        shares = np.quantile(amplitude / scale, np.linspace(0, 1, order)[1:])
+        scale = near.largest
+        shares = np.quantile(near.amplitude / scale, np.linspace(0, 1, order)[1:])
         # Knots that coincide, of levels at one amplitude, are drawn apart evenly instead.
         knots = np.concatenate([[0.0], shares**2])
         if np.min(np.diff(knots)) < 0.02 / order:
             knots = np.linspace(0.0, 1.0, order) ** 2
         unit = jax.device_put(scale)
-        blank = cls.through(knots, np.zeros(order), unit, argument)
-        start = linear_start(blank.linearised(amplitude).by_parameters, values, weight)
+        blank = cls.through(knots, np.zeros(order), unit, near.argument)
+        start = near.fitted(blank.linearised(near.amplitude).by_parameters)
         return [eqx.tree_at(lambda f: f.parameters, blank, jax.device_put(start))]
 
     @classmethod

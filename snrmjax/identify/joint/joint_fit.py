@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from snrmjax.identify.checks.residual_autocorrelation import (
-    along_resonance,
     residual_autocorrelation,
+    states_of_levels,
 )
 from snrmjax.identify.curves.families import parse_family
 from snrmjax.identify.curves.splines import SmoothingSpline
@@ -316,7 +316,7 @@ def fit_jointly(
     covariance = viewed_covariance(view)
     level, frequency = np.asarray(measured.level), np.asarray(measured.frequency)
     autocorrelation = residual_autocorrelation(
-        posterior.residuals, along_resonance(level, frequency)
+        posterior.residuals, states_of_levels(level, frequency)
     )
     # What levels differ by is said where the data ask for it or the fit made use of it, and stays
     # possible elsewhere.

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import chdtri, ndtri
 
+from snrmjax.identify.checks.residual_autocorrelation import states_of_levels
 from snrmjax.identify.curves.splines import WithRemainder
 from snrmjax.identify.joint.force_balance import BalanceProblem, Motion, Unknowns
 from snrmjax.identify.test_model.states import LEVEL_ERRORS
@@ -296,9 +297,7 @@ def outlying_states(fit: Any) -> np.ndarray:
     level, frequency = np.asarray(fit.data.level), np.asarray(fit.data.frequency)
     beyond = np.sqrt(2 * np.log(_ONE_TEST_IN * max(1, len(residuals))))
     alone = np.zeros_like(residuals)
-    for number in np.unique(level):
-        rows = np.flatnonzero(level == number)
-        rows = rows[np.argsort(frequency[rows], kind="stable")]
+    for rows in states_of_levels(level, frequency):
         for k, row in enumerate(rows):
             near = np.r_[rows[max(0, k - _NEIGHBOURS) : k], rows[k + 1 : k + 1 + _NEIGHBOURS]]
             if near.size > 1:
