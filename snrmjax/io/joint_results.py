@@ -25,7 +25,7 @@ from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.status import Status
 
 BAND_POINTS = 200
-_FORMAT = 5
+_FORMAT = 6
 
 
 def write_fitted_backbone(
@@ -75,7 +75,7 @@ def summarise_fit(
     level = dict(zip(LEVEL_ERRORS, np.asarray(fit.noise.level_std).tolist(), strict=True))
     return {
         "converged": fit.converged,
-        "status": fit.status.name.lower(),
+        "status": "converged" if fit.converged else "not_settled",
         "backbone": fit.unknowns.squared_frequency.label,
         "damping": fit.unknowns.modal_damping.label,
         "parameters": {

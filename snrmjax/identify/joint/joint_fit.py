@@ -54,19 +54,7 @@ from snrmjax.numerics.blocks import on_one_core
 from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
-from snrmjax.numerics.status import Status
 from snrmjax.numerics.units import HERTZ
-
-
-class FitStatus(Status):
-    """How a joint fit ended."""
-
-    CONVERGED = 0, "converged"
-    NOT_SETTLED = (
-        1,
-        "not converged: fit and noise estimate still changed one another in the last round",
-    )
-
 
 _MOVED = 2.0  # standard deviations of a level's error, from which on the fit says so
 
@@ -93,13 +81,14 @@ class JointFit(AbstractResult):
     drive_known_only: bool = eqx.field(static=True)
     free: tuple[str, ...] = eqx.field(static=True)
     notes: tuple[Fact, ...] = setting()
-    status: FitStatus = eqx.field(static=True)
+    converged: bool = eqx.field(static=True)
     level_numbers: tuple[int, ...] = eqx.field(static=True)  # of the file; `data` counts from 0
 
     @property
-    def converged(self) -> bool:
-        """Whether the fit converged."""
-        return self.status == FitStatus.CONVERGED
+    def status(self) -> str:
+        """How the fit ended, in words."""
+        more = "not converged: fit and noise estimate still changed one another in the last round"
+        return "converged" if self.converged else more
 
     @property
     def data(self) -> BalanceData:
@@ -202,7 +191,7 @@ class JointFit(AbstractResult):
             f"natural frequency {omega.min() / HERTZ:.6g} to {omega.max() / HERTZ:.6g} Hz, "
             f"damping ratio {100 * ratio.min():.3g} to {100 * ratio.max():.3g} %",
             f"residuals: {noise}",
-            f"status: {self.status.message}",
+            f"status: {self.status}",
             *(f"note: {note}" for note in self.notes),
         )
 
@@ -234,7 +223,7 @@ class JointFit(AbstractResult):
             "backbone": self.unknowns.squared_frequency.label,
             "damping": self.unknowns.modal_damping.label,
             "noise_scale": self.noise.scale,
-            "status": self.status.message,
+            "status": self.status,
             **super().attributes(),
         }
 
@@ -331,7 +320,7 @@ def fit_jointly(
         drive_known_only=driven,
         free=released,
         notes=(),
-        status=FitStatus.CONVERGED if posterior.settled else FitStatus.NOT_SETTLED,
+        converged=bool(posterior.settled),
         level_numbers=numbers,
     )
     notes = notes_on_instruments(fit)
@@ -375,7 +364,7 @@ def _notes(
     notes = []
     if not fit.converged:
         is_stated = {"noise_stated": fit.noise.stated, "levels_stated": bool(np.all(stated > 0))}
-        reason = fit.status.message
+        reason = fit.status
         notes.append(Fact("fit_not_converged", reason=reason, named=named, **is_stated))
     level, n_levels = np.asarray(fit.data.level), fit.data.n_levels
     notes += notes_on_noise(
