@@ -188,38 +188,28 @@ def _state_by_state(
     return jnp.moveaxis(along(kinds), 0, 2)
 
 
-@eqx.filter_custom_jvp
 def _optimum(problem: _Refit) -> Float[Array, " unknown"]:
-    """The unknowns at the optimum, in 1σ from where they begin."""
-    point, _, good = problem.solved(jnp.zeros(len(problem.own)))
-    return jnp.where(good, point, jnp.nan)
+    """The unknowns at the optimum, in 1σ from where they begin; NaN where it is not reached.
 
-
-@_optimum.def_jvp
-def _implicit(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    """By the implicit function theorem, errors and multipliers eliminated state by state."""
-    (problem,), (moved,) = primals, tangents
-    point, errors, good = problem.solved(jnp.zeros(len(problem.own)))
-    point = jnp.where(good, point, jnp.nan)
-    slopes = problem.by_error(point, errors)
+    A last Newton step from there, errors and multipliers eliminated state by state, carries the
+    derivatives by all that the problem holds.
+    """
+    fixed = jax.lax.stop_gradient(problem)
+    point, errors, good = fixed.solved(jnp.zeros(len(problem.own)))
+    slopes = fixed.by_error(point, errors)
     square = slopes @ slopes.mT
     multipliers = -jnp.linalg.solve(square, (slopes @ errors[:, :, None]))[:, :, 0]
-
-    inner = _state_by_state(lambda e: problem.stationary(point, e, multipliers)[1], errors)
+    inner = _state_by_state(lambda e: fixed.stationary(point, e, multipliers)[1], errors)
     none = jnp.zeros((len(errors), 2, 2))
     blocks = jnp.block([[inner, slopes.mT], [slopes, none]])
-    hessian, *sensitivities = jax.jacfwd(lambda p: problem.stationary(p, errors, multipliers))(
-        point
-    )
+    by_point = jax.jacfwd(lambda p: fixed.stationary(p, errors, multipliers))
+    hessian, *sensitivities = by_point(point)
     by_unknown = jnp.concatenate(sensitivities, axis=1)  # (state, input and part, unknown)
     solved = jnp.linalg.solve(blocks, by_unknown)
     whole = hessian - jnp.einsum("sie,sif->ef", by_unknown, solved)
-    right = eqx.filter_jvp(
-        lambda given: given.stationary(point, errors, multipliers), (problem,), (moved,)
-    )[1]
-    of_states = jnp.concatenate(right[1:], axis=1)
-    change = right[0] - jnp.einsum("sie,si->e", solved, of_states)
-    return point, -jnp.linalg.solve(whole, change)
+    of_point, *of_states = problem.stationary(point, errors, multipliers)
+    left = of_point - jnp.einsum("sie,si->e", solved, jnp.concatenate(of_states, axis=1))
+    return jnp.where(good, point - jnp.linalg.solve(whole, left), jnp.nan)
 
 
 def refit(fit: JointFit, changes: FitInputs) -> Unknowns:
