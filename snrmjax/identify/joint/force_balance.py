@@ -279,10 +279,10 @@ def _freed(unknowns: Unknowns, problem: BalanceProblem, error: Any, xp: Any) -> 
 
 def recorded_motion(unknowns: Unknowns, problem: BalanceProblem) -> Motion:
     """The mode's motion in the states as they were recorded, by the host."""
-    host, exact = jax.tree.map(np.asarray, (unknowns, problem)), no_errors(len(problem.data.level))
-    force, velocity = _freed(*host, exact, np)
+    found, given = jax.tree.map(np.asarray, (unknowns, problem))
+    force, velocity = _freed(found, given, no_errors(len(given.data.level)), np)
     of_mode = velocity - velocity_of_others(problem, unknowns.linear, force)
-    return Motion(of_mode, np.abs(of_mode) / host[1].data.frequency, force)
+    return Motion(of_mode, np.abs(of_mode) / given.data.frequency, force)
 
 
 @compiled
