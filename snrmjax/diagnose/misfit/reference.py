@@ -18,7 +18,7 @@ from jaxtyping import Array, Complex
 from snrmjax.diagnose import priors
 from snrmjax.diagnose.misfit.predictions import Predictions, predictions_of
 from snrmjax.diagnose.misfit.weighted_misfit import weighted_misfit
-from snrmjax.identify.joint.notes import force_gain_undetermined
+from snrmjax.identify.checks.instruments import force_gain_undetermined
 from snrmjax.identify.pointwise.snrm import participation_of, sensed_mode
 from snrmjax.identify.test_model.posterior import TestPosterior, fit_test
 from snrmjax.identify.test_model.priors import INSTRUMENT_PHASE

@@ -1,1 +1,1 @@
-"""Whether what a fit leaves is noise."""
+"""Whether data determine what a fit was asked for, said in words or refused."""

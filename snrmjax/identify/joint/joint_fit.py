@@ -8,6 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from snrmjax.identify.checks.instruments import notes_on_instruments, require_passive
 from snrmjax.identify.checks.residual_autocorrelation import (
     residual_autocorrelation,
     states_of_levels,
@@ -37,13 +38,11 @@ from snrmjax.identify.joint.notes import (
     NoiseEstimate,
     notes_on_autocorrelation,
     notes_on_families,
-    notes_on_instruments,
     notes_on_level_errors,
     notes_on_modal_mass,
     notes_on_noise,
     notes_on_reach,
     notes_on_stated_errors,
-    require_passive,
 )
 from snrmjax.identify.joint.posterior_view import view_of, viewed_covariance, viewed_unknowns
 from snrmjax.measure.phase_convention import naming_wrong_phases

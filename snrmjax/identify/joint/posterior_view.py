@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 from scipy.optimize import nnls
 
+from snrmjax.identify.checks.instruments import require_passive
 from snrmjax.identify.curves.families import ARGUMENTS, FAMILIES, Choice
 from snrmjax.identify.curves.family_base import AbstractFamily, Scattered
 from snrmjax.identify.curves.splines import SmoothingSpline, WithRemainder
@@ -19,7 +20,7 @@ from snrmjax.identify.joint.force_balance import (
     Unknowns,
     velocity_of_others,
 )
-from snrmjax.identify.joint.notes import NoiseEstimate, require_passive
+from snrmjax.identify.joint.notes import NoiseEstimate
 from snrmjax.identify.test_model.balance import off_resonance
 from snrmjax.identify.test_model.curve_basis import MOST_KNOTS, CurveBasis
 from snrmjax.identify.test_model.curve_terms import CurveTerms

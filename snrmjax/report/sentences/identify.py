@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from snrmjax.identify.joint.notes import Determination
+from snrmjax.identify.checks.instruments import Determination
 from snrmjax.identify.test_model.states import LEVEL_ERRORS
 from snrmjax.report.sentences import Wording, enumerated, number_of
 

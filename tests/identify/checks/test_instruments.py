@@ -5,8 +5,8 @@ import pytest
 from truths.exact_states import GAIN, driven, modes
 
 import snrmjax as sj
+from snrmjax.identify.checks.instruments import notes_on_instruments
 from snrmjax.identify.inference.fitted_curves import as_backbone, values_to_the_largest
-from snrmjax.identify.joint.notes import notes_on_instruments
 
 
 def on_the_gain(fit):
