@@ -31,7 +31,8 @@ class BackbonePoints(AbstractResult):
     """One natural frequency and damping ratio from every steady state.
 
     Amplitudes are those of the nonlinear mode at one sensor, `sensor`. Standard deviations (1σ)
-    are NaN where no noise is stated.
+    are NaN where no noise is stated. `alternative_…` is what amplitude and phase alone would also
+    allow; NaN where there is no other root.
     """
 
     coordinates: ClassVar[tuple[str, ...]] = ("state", "level")
@@ -52,6 +53,8 @@ class BackbonePoints(AbstractResult):
     backbone_velocity: Float[Array, " state"] = quantity(
         "state", "m/s", "velocity amplitude where the point lies on the backbone"
     )
+    alternative_natural_frequency: Float[Array, " state"]  # rad/s
+    alternative_damping_ratio: Float[Array, " state"]
     sensitivity: Float[Array, "state output input"]  # of ω̃², 2ζ̃ω̃, log amplitude
     relative_std: Float[Array, "state input"]  # 1σ of log force, log velocity and phase
     filter_residual: Float[Array, " state"]  # part of the mode's motion that its shape misses
