@@ -22,7 +22,7 @@ from generate import gradient
 from scipy.optimize import fsolve
 
 import snrmjax as sj
-from snrmjax.identify.coupled.single_mode_bias import single_mode_bias
+from snrmjax.identify.coupled.coupled_test import single_mode_bias
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 from harness import options, teller

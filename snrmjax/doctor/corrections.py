@@ -18,6 +18,7 @@ from snrmjax.doctor.priors import (
     OTHER_GAIN,
     SCATTER,
 )
+from snrmjax.identify.checks.residual_autocorrelation import states_of_levels
 from snrmjax.identify.test_model.states import TestStates
 
 _OWN_OF_CURVES = 2  # states, beyond which both curves' value and slope are no matter of a limit
@@ -105,9 +106,7 @@ def sweeps(
     """
     sweep, rising = np.zeros(len(level), dtype=int), np.zeros(len(level))
     count = 0
-    for one in range(level.max() + 1):
-        of_level = np.flatnonzero(level == one)
-        of_level = of_level[np.argsort(order[of_level], kind="stable")]
+    for of_level in states_of_levels(level, order):
         up = np.diff(frequency[of_level]) > 0
         begins = [0]
         for k in range(len(up)):
@@ -207,9 +206,7 @@ def _unsettled(seen: CheckedStates, states: TestStates, base: Judged) -> Iterato
     omega = np.sqrt(np.maximum(base.stiffness, 0.25 * states.frequency**2))
     typical = float(np.median(damping)) / 2
     before = np.full(len(states.level), -1)
-    for k in range(states.n_levels):
-        of_level = np.flatnonzero(states.level == k)
-        of_level = of_level[np.argsort(seen.order[of_level], kind="stable")]
+    for of_level in states_of_levels(states.level, seen.order):
         before[of_level[1:]] = of_level[:-1]
     pace = (-damping / 2 + 1j * (omega - states.frequency)) / typical if typical > 0 else 0.0
     for decay in (pace, -1.0):

@@ -38,10 +38,7 @@ def scale_findings(
     kappa = scale.mass
     asked = {"ratio": kappa, "ratio_std": kappa * scale.std}
     size = Fact(
-        "other_scale",
-        **asked,
-        misfit=scale.judged.misfit,
-        misfit_as_modelled=as_modelled.misfit,
+        "other_scale", **asked, misfit=scale.judged.misfit, misfit_as_modelled=as_modelled.misfit
     )
     off, near = float(np.log(kappa)), float(np.hypot(MODAL_MASS, 3 * scale.std))
     if abs(abs(off) - 0.5 * np.log(2)) < near:

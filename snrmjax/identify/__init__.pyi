@@ -1,19 +1,13 @@
-from .calibrate.backbone_calibration import (
-    MeasuredBackbone,
-    calibrate_to_backbone,
-)
+from .calibrate.backbone_calibration import MeasuredBackbone, calibrate_to_backbone
 from .calibrate.calibration import calibrate_model
 from .calibrate.inverse_force import inverse_force
 from .coupled.coupled_modes import coupled_modes
-from .curves.families import FAMILIES
-from .curves.own_family import OwnFamily
+from .curves.families import FAMILIES, OwnFamily
 from .inference.contributions import contributions
 from .inference.fitted_curves import fitted_values
 from .inference.fitted_response import fitted_response, predicted_resonance
 from .inference.identification import Identification, identify_backbone
-from .inference.optimal_design import (
-    next_measurements,
-)
+from .inference.optimal_design import next_measurements
 from .inference.refits import FitInputs, bootstrap, influence, refit
 from .joint.joint_fit import JointFit, corrected_states, fit_jointly
 from .modal.free_decay import fit_free_decay

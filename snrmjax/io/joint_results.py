@@ -13,7 +13,7 @@ import numpy as np
 from snrmjax.identify.inference.contributions import Contribution
 from snrmjax.identify.inference.fitted_curves import values_to_the_largest
 from snrmjax.identify.inference.fitted_response import FittedResponse
-from snrmjax.identify.inference.located_points import FittedPoint
+from snrmjax.identify.inference.forced_motion import FittedPoint
 from snrmjax.identify.inference.optimal_design import NextMeasurement, NextMeasurements
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.test_model.states import LEVEL_ERRORS
@@ -25,7 +25,7 @@ from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.status import Status
 
 BAND_POINTS = 200
-_FORMAT = 5
+_FORMAT = 6
 
 
 def write_fitted_backbone(
@@ -75,7 +75,7 @@ def summarise_fit(
     level = dict(zip(LEVEL_ERRORS, np.asarray(fit.noise.level_std).tolist(), strict=True))
     return {
         "converged": fit.converged,
-        "status": fit.status.name.lower(),
+        "status": "converged" if fit.converged else "not_settled",
         "backbone": fit.unknowns.squared_frequency.label,
         "damping": fit.unknowns.modal_damping.label,
         "parameters": {

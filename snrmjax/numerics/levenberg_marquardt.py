@@ -53,9 +53,8 @@ class StepRule:
     Marquardt's damping begins at `damping`, is multiplied by `eased` after a step that lowers the
     sum of squares and by `stiffened` after one that does not; beyond `largest_damping` no step
     will. A fit ends when a step lowers the sum by less than `settled`, or after `steps`. After
-    `screened` steps only the `kept` best starting points go on, and those whose next step promises
-    a sum below `hopeless`. With `trust_short_steps` a step that promises less than `settled` is
-    the last and is not evaluated.
+    `screened` steps only the `kept` best starting points go on. With `trust_short_steps` a step
+    that promises less than `settled` is the last and is not evaluated.
     """
 
     steps: int = 30
@@ -66,7 +65,6 @@ class StepRule:
     largest_damping: float = 1e6
     screened: int | None = None
     kept: int = 1
-    hopeless: float = np.inf
     trust_short_steps: bool = False
 
 
@@ -127,8 +125,6 @@ def minimise(
             if rule.trust_short_steps and free and promised < rule.settled:
                 point[t], last_step[t], square[t] = moved[t], step, float(after @ after)
                 status[t], active[t] = MinimisationStatus.CONVERGED, False
-            elif turn >= (rule.screened or 0) and float(after @ after) > rule.hopeless:
-                status[t], active[t] = MinimisationStatus.GIVEN_UP, False
         at = np.flatnonzero(active)
         if not at.size:
             break

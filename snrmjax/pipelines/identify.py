@@ -24,10 +24,10 @@ from snrmjax.identify.inference.optimal_design import (
     next_measurements,
 )
 from snrmjax.identify.joint.joint_fit import JointFit, corrected_states, fit_jointly
-from snrmjax.identify.joint.outlying_states import note_on_outlying, outlying_states
+from snrmjax.identify.joint.notes import note_on_outlying, outlying_states
 from snrmjax.identify.pointwise.backbone import BackboneValues
-from snrmjax.identify.pointwise.prediction_result import PredictedResponse, Resonance
-from snrmjax.identify.prediction.notes import notes_on_negative_damping
+from snrmjax.identify.pointwise.prediction import PredictedResponse, Resonance
+from snrmjax.identify.prediction.resonance_distribution import notes_on_negative_damping
 from snrmjax.measure.states import SteadyStates, check_force, check_phases
 from snrmjax.model.structures import Structure, driven_in_newtons
 from snrmjax.numerics.facts import Fact

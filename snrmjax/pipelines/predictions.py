@@ -23,8 +23,11 @@ from snrmjax.identify.pointwise.prediction import (
     resonances,
 )
 from snrmjax.identify.prediction.new_level import DayToDay, new_level
-from snrmjax.identify.prediction.notes import notes_on_resonance, notes_on_trends
-from snrmjax.identify.prediction.resonance_distribution import ResonanceDistribution
+from snrmjax.identify.prediction.resonance_distribution import (
+    ResonanceDistribution,
+    notes_on_resonance,
+    notes_on_trends,
+)
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.facts import Fact

@@ -13,7 +13,7 @@ import numpy as np
 from snrmjax.doctor.check import check_test
 from snrmjax.doctor.column_misreadings import doubt
 from snrmjax.doctor.findings import Checkup
-from snrmjax.identify.joint.outlying_states import outlying_states
+from snrmjax.identify.joint.notes import outlying_states
 from snrmjax.identify.modal.modes_of_tests import find_modes
 from snrmjax.identify.modal.response_data import joined_responses
 from snrmjax.identify.scaling.scale import DrivePoint, scale_modes

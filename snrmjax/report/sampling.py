@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from jax.typing import ArrayLike
 
-from snrmjax.identify.pointwise.prediction_result import PredictedResponse
+from snrmjax.identify.pointwise.prediction import PredictedResponse
 from snrmjax.io.units import DEGREE, HERTZ
 from snrmjax.measure.states import SteadyStates
 from snrmjax.simulate.continuation.response_curve import (

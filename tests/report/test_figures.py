@@ -15,7 +15,7 @@ from truths.beam_forces import FORCES
 from truths.printed_page import unreadable
 
 import snrmjax as sj
-from snrmjax.identify.pointwise.points_result import BackbonePoints
+from snrmjax.identify.pointwise.backbone_points import BackbonePoints
 from snrmjax.io.results import write_backbone
 from snrmjax.io.units import DEGREE, HERTZ
 from snrmjax.report import style as drawing

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from scipy.interpolate import CubicSpline
 
 import snrmjax as sj
-from snrmjax.identify.pointwise.prediction_result import Resonance
+from snrmjax.identify.pointwise.prediction import Resonance
 from snrmjax.io.units import HERTZ
 from snrmjax.report import html as reports
 from snrmjax.report.figures.identification import backbone_figure, response_figure

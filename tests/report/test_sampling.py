@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import snrmjax as sj
-from snrmjax.identify.pointwise.prediction_result import PredictedResponse
+from snrmjax.identify.pointwise.prediction import PredictedResponse
 from snrmjax.io.units import HERTZ
 from snrmjax.report import sampling as plot_data
 

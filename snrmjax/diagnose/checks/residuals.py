@@ -10,7 +10,6 @@ from snrmjax.diagnose import priors
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
 from snrmjax.diagnose.misfit.noise_model import (
     chi_square_p_value,
-    shared_covariance,
     unit_columns,
 )
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
@@ -23,7 +22,6 @@ class HeldOut(NamedTuple):
     before: float
     after: float
     p_value: float  # of `after`, by noise alone
-    uncertain_p_value: float  # by noise and the uncertainty of parameters from the other levels
 
 
 def held_out(
@@ -35,32 +33,15 @@ def held_out(
     baseline's stated uncertainty are predicted too; its own gain and phase are not. `noise` is
     the variance over the stated one for which probabilities are given.
     """
-    kept = ~rows_of_level(misfit, level)
-    before, after = (_refitted(misfit, one, kept)[1:] for one in (baseline, fit))
-    return held_out_by(misfit, level, before, after, noise)
-
-
-def held_out_by(
-    misfit: WeightedMisfit,
-    level: int,
-    before: tuple[Float[np.ndarray, " row"], Float[np.ndarray, "row any"]],
-    after: tuple[Float[np.ndarray, " row"], Float[np.ndarray, "row any"]],
-    noise: float,
-) -> HeldOut:
-    """A level left out, by fits to the others: `before` and `after` any effect.
-
-    Of each all rows, and the root of the covariance of the parameters' part of them.
-    """
     out = rows_of_level(misfit, level)
-    first, _ = _chi_square_of_level(misfit, *before, out)
-    known, open_too = _chi_square_of_level(misfit, *after, out)
-    n = int(out.sum())
+    given, n = misfit.noise.covariance.given_rows(~out), int(out.sum())
+    left = [given.decorrelated(_refitted(misfit, one, ~out)[1]) for one in (baseline, fit)]
+    before, after = (float(rows @ rows) for rows in left)
     return HeldOut(
         int(misfit.level_numbers[level]),
-        float(np.sqrt(first / n)),
-        float(np.sqrt(known / n)),
-        chi_square_p_value(known / noise, n),
-        chi_square_p_value(open_too / noise, n),
+        float(np.sqrt(before / n)),
+        float(np.sqrt(after / n)),
+        chi_square_p_value(after / noise, n),
     )
 
 
@@ -98,7 +79,7 @@ def without_level(
 ) -> tuple[Float[np.ndarray, " parameter"], dict[str, float]]:
     """A fit's parameters, and the baseline's: one step to the best fit without a level's rows."""
     kept = ~rows_of_level(misfit, level)
-    change, rows, _ = _refitted(misfit, fit, kept)
+    change, rows = _refitted(misfit, fit, kept)
     values = np.clip(fit.values + change, fit.lower, fit.upper)
     return values, misfit.baseline_parameters(rows, kept)
 
@@ -116,37 +97,15 @@ def rows_of_level(misfit: WeightedMisfit, level: int) -> Bool[np.ndarray, " row"
 
 def _refitted(
     misfit: WeightedMisfit, fit: EffectFit, kept: Bool[np.ndarray, " row"]
-) -> tuple[
-    Float[np.ndarray, " parameter"], Float[np.ndarray, " row"], Float[np.ndarray, "row any"]
-]:
-    """The refit of a fit's parameters to some rows, to first order.
-
-    Returns the change of the parameters, all rows after it, and the root of its covariance: what
-    independent unit errors of the change add to all rows.
+) -> tuple[Float[np.ndarray, " parameter"], Float[np.ndarray, " row"]]:
+    """The refit of a fit's parameters to some rows, to first order: their change, and all rows
+    after it.
     """
     scaled, size = unit_columns(fit.slopes)
     both = misfit.noise.decorrelated(np.column_stack([scaled, fit.rows]).T, kept)
     arms, left = both[:-1].T, both[-1]
-    matrix = arms.T @ arms
-    change = -np.linalg.pinv(matrix, rcond=1e-12) @ (arms.T @ left)
-    values, vectors = np.linalg.eigh(matrix)
-    # What the kept rows do not determine at all is open: it may have any size.
-    root = vectors / np.sqrt(np.maximum(values, 1e-12))
-    return change / size, fit.rows + scaled @ change, scaled @ root
-
-
-def _chi_square_of_level(
-    misfit: WeightedMisfit,
-    rows: Float[np.ndarray, " row"],
-    root: Float[np.ndarray, "row any"],
-    out: Bool[np.ndarray, " row"],
-) -> tuple[float, float]:
-    """χ² of rows left out, given the others, with parameters taken as known and as uncertain."""
-    given = misfit.noise.covariance.given_rows(~out)
-    left, spread = given.decorrelated(rows), given.decorrelated(root.T).T
-    known = float(left @ left)
-    uncertain = float(np.sum(shared_covariance(spread).decorrelated(left) ** 2))
-    return known, uncertain
+    change = -np.linalg.pinv(arms.T @ arms, rcond=1e-12) @ (arms.T @ left)
+    return change / size, fit.rows + scaled @ change
 
 
 def along(

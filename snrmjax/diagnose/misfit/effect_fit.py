@@ -87,12 +87,10 @@ def fit_effect(
     misfit: WeightedMisfit,
     candidate: EffectCandidate,
     beside: EffectFit | None = None,
-    hopeless: float = np.inf,
 ) -> EffectFit:
     """The best fit of a candidate from all its starting points, beside what was fitted before.
 
-    All parameters are free, those of `beside` too. A fit that promises no χ² below `hopeless` is
-    given up. The `status` says whether a minimum was found.
+    All parameters are free, those of `beside` too. The `status` says whether a minimum was found.
     """
     before = beside or baseline_fit(misfit)
     labels = (*parameter_labels(candidate.kind), *before.labels)
@@ -126,8 +124,7 @@ def fit_effect(
         points[lost, 0] *= 0.3  # too strong to have a motion
         for t, one in zip(lost, linearised(points[lost]), strict=True):
             at_points[t] = one
-    rule = dataclasses.replace(_RULE, hopeless=hopeless)
-    ends = minimise(linearised, points, at_points, (lower / unit, upper / unit), rule)
+    ends = minimise(linearised, points, at_points, (lower / unit, upper / unit), _RULE)
     best = min(ends, key=lambda end: end.sum_of_squares)
     at, values = best.linearised, best.linearised.values
     if np.any(best.last_step):

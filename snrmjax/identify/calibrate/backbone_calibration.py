@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from snrmjax.identify.calibrate.calibrated_model import AbstractCalibration
+from snrmjax.identify.pointwise.backbone_points import BackbonePoints
 from snrmjax.identify.pointwise.inversion_result import PointStatus
-from snrmjax.identify.pointwise.points_result import BackbonePoints
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.compiled import compiled, on_numbers
 from snrmjax.numerics.facts import Fact

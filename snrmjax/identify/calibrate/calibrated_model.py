@@ -69,10 +69,6 @@ class AbstractCalibration(AbstractResult):
         """Those of the fields, with 1σ of the values."""
         return {**super().variables(), "std": Variable(("parameter",), self.std, "SI", "1σ")}
 
-    def attributes(self) -> dict[str, str | float | int]:
-        """How the fit ended, and what it has to tell."""
-        return {**super().attributes(), "status": str(self.status)}
-
 
 class CalibratedModel(AbstractCalibration):
     """A model with parameters fitted to steady states; see `calibrate_model`.

@@ -12,14 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from snrmjax.identify.calibrate.calibrated_model import CalibratedModel
-from snrmjax.identify.calibrate.calibration_states import (
-    ComparedColumns,
-    calibration_states,
-)
-from snrmjax.identify.calibrate.held_modes import (
-    held_at_orders,
-    held_columns,
-)
+from snrmjax.identify.calibrate.calibration_states import ComparedColumns, calibration_states
+from snrmjax.identify.calibrate.held_modes import held_at_orders, held_columns
 from snrmjax.identify.calibrate.state_fit import (
     FitAim,
     FitSettings,
@@ -39,9 +33,7 @@ from snrmjax.model.structures import Structure
 from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.least_squares import inverse_of
-from snrmjax.numerics.levenberg_marquardt import (
-    MinimisationStatus,
-)
+from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
 
 
 @on_numbers("Differentiate the force that a motion needs: `sj.identify.inverse_force`.")

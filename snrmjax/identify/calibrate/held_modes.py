@@ -21,9 +21,8 @@ from snrmjax.identify.calibrate.inverse_force import StateWithErrors
 from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, harmonic_balance
 from snrmjax.simulate.balance.harmonics import velocity_phasors
+from snrmjax.simulate.balance.prescribed_motion import newton_solved
 
-_STEPS = 20
-_NEAR = 1e-6  # relative size of a Newton step after which one more is exact to rounding
 _FLOOR = 1e-6  # 1σ of every column, over the force: rounding must not count as an error
 
 
@@ -80,27 +79,8 @@ class HeldState(eqx.Module):
         )
 
     def solved(self, start: Float[Array, " unknown"]) -> Float[Array, " unknown"]:
-        """The solution near `start` by Newton's method, NaN where it did not converge.
-
-        The last step is taken with what the equations depend on: it carries the derivatives.
-        """
-        fixed = jax.lax.stop_gradient(self)
-
-        def step(state: tuple) -> tuple:
-            point, count, _ = state
-            left, jacobian = fixed.linearised(point)
-            move = jnp.linalg.solve(jacobian, left)
-            return point - move, count + 1, jnp.max(jnp.abs(move))
-
-        def going(state: tuple) -> Array:
-            _, count, size = state
-            return (count < _STEPS) & (size > _NEAR)  # false for NaN
-
-        first = (jax.lax.stop_gradient(start), jnp.array(0), jnp.array(jnp.inf))
-        point, _, size = jax.lax.while_loop(going, step, first)
-        _, jacobian = fixed.linearised(point)
-        last = jnp.linalg.solve(jacobian, self.equations(point))
-        return jnp.where(size <= _NEAR, point - last, jnp.nan)
+        """The solution near `start` by Newton's method, NaN where it did not converge."""
+        return newton_solved(self, start)[0]
 
     def grown(self) -> Float[Array, " unknown"]:
         """The held modes as measured and nothing else, as a start for `solved`."""

@@ -14,25 +14,13 @@ from snrmjax.identify.calibrate.calibration_states import (
     state_whitener,
     whitened_columns,
 )
-from snrmjax.identify.calibrate.held_modes import (
-    HeldModes,
-    HeldState,
-    columns_of_held,
-    held_motion,
-)
+from snrmjax.identify.calibrate.held_modes import HeldModes, HeldState, columns_of_held, held_motion
 from snrmjax.identify.calibrate.inverse_force import StateWithErrors, residual_columns
-from snrmjax.model.parameters import (
-    with_parameters,
-)
+from snrmjax.model.parameters import with_parameters
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import mapped
 from snrmjax.numerics.compiled import compiled
-from snrmjax.numerics.levenberg_marquardt import (
-    MinimisationStatus,
-    Minimum,
-    StepRule,
-    minimise,
-)
+from snrmjax.numerics.levenberg_marquardt import MinimisationStatus, Minimum, StepRule, minimise
 from snrmjax.simulate.balance.prescribed_motion import PrescribedMotion
 
 

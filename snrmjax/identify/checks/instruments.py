@@ -10,9 +10,6 @@ from jaxtyping import Float
 from snrmjax.numerics.facts import Fact
 
 _BESIDE_RESONANCE = np.radians(20)  # a state's phase, up to which inertia hardly counts
-_CAP = 0.99  # of the largest level-to-level variance that a fit allows: where it has stopped short
-LARGEST_LEVEL_STD = 0.3
-"""1σ of what levels share beyond which they are not levels of one structure's test."""
 
 # 1σ from which on an unknown is doubted, and from which on there is no answer: of a gain's
 # logarithm, of an offset over the smallest force, of a phase in rad.
@@ -38,18 +35,13 @@ def _determined(name: str, std: float) -> Determination:
     return Determination.HARDLY if std < refused else Determination.NOT_AT_ALL
 
 
-def force_gain_determined(std: float) -> Determination:
-    """How well a force gain is known, by the 1σ of its logarithm."""
-    return _determined("force_gain", std)
-
-
 def force_gain_undetermined(std: float, farthest: float) -> Fact | None:
     """That data do not determine a force gain; None where they do.
 
     Arguments: `std` 1σ of the gain's logarithm; `farthest` the largest phase of a state from
     resonance, rad.
     """
-    how = force_gain_determined(std)
+    how = _determined("force_gain", std)
     if how is not Determination.WELL:
         return Fact("force_gain_undetermined", std=std, how=how)
     if farthest > _BESIDE_RESONANCE:
@@ -77,13 +69,10 @@ def require_passive(
         raise ValueError(str(Fact("fit_not_passive", what="damping", free=turned)))
 
 
-def notes_on_instruments(fit: Any, level_errors: Sequence[str]) -> list[Fact]:
-    """What data hardly determine of the unknowns that a fit freed.
+def notes_on_instruments(fit: Any) -> list[Fact]:
+    """What data hardly determine of the unknowns that a joint fit freed.
 
-    Arguments: `fit` a `JointFit`; `level_errors` are the names of what the states of a level may
-    share.
-    Raises `ValueError` where one is not determined at all, so that the answer would mean nothing,
-    or where beside a free gain the levels' gains had to be as large as a fit allows.
+    Raises `ValueError` where one is not determined at all, so that the answer would mean nothing.
     """
     names, notes = fit.names(), []
     std = np.sqrt(np.abs(np.diag(fit.covariance)))
@@ -100,12 +89,4 @@ def notes_on_instruments(fit: Any, level_errors: Sequence[str]) -> list[Fact]:
         if how is Determination.NOT_AT_ALL:
             raise ValueError(str(note))
         notes += [] if note is None else [note]
-    at_cap = np.asarray(fit.noise.level_std) >= _CAP * LARGEST_LEVEL_STD
-    capped = tuple(name for name, is_ in zip(level_errors, at_cap, strict=True) if is_)
-    if capped:
-        beside = "force_gain" in fit.free
-        note = Fact("level_errors_at_limit", errors=capped, limit=LARGEST_LEVEL_STD, gain=beside)
-        if beside:
-            raise ValueError(str(note))
-        notes.append(note)
     return notes

@@ -14,11 +14,11 @@ _FAR_BELOW_NOISE = 0.1  # of the noise: the correlation of smaller residuals doe
 _LARGEST = 0.98  # correlation: an estimate may exceed what a band can be widened by
 
 
-def along_resonance(
-    level: Int[np.ndarray, " state"], frequency: Float[np.ndarray, " state"]
+def states_of_levels(
+    level: Int[np.ndarray, " state"], by: Float[np.ndarray, " state"]
 ) -> list[Int[np.ndarray, " place"]]:
-    """The states of every level in the order of their frequencies."""
-    order = np.argsort(frequency, kind="stable")
+    """The states of every level, in the order of their frequencies, or of what else is given."""
+    order = np.argsort(by, kind="stable")
     return [order[level[order] == number] for number in np.unique(level)]
 
 
@@ -30,7 +30,7 @@ def residual_autocorrelation(
     Under noise of its own, slow misfits have a smaller correlation at lag one than at larger lags:
     that of a first-order process with the same sum of correlations counts if it is larger.
     Zero where white noise may well have it, or residuals are far below the noise.
-    Arguments: whitened `residuals`; `levels` from `along_resonance`.
+    Arguments: whitened `residuals`; `levels` from `states_of_levels`.
     Reference: for the sum up to the first negative one, Geyer, Stat. Sci. 7 (1992) 473,
     doi:10.1214/ss/1177011137.
     """
@@ -62,7 +62,7 @@ def share_told_by(
     independent ones; the mean of both parts counts, whatever the size of the residuals is.
     """
     size = np.sqrt(np.mean(residuals**2, axis=0))
-    levels = along_resonance(level, frequency)
+    levels = states_of_levels(level, frequency)
     correlation = residual_autocorrelation(residuals / size, levels)
     return float(np.mean((1 - correlation) / (1 + correlation)))
 

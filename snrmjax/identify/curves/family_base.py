@@ -30,10 +30,9 @@ _SIZE = 12  # parameters and powers in programs; a larger family takes a multipl
 
 
 class Coefficient(NamedTuple):
-    """A parameter as an engineer writes it: coefficient·amplitude^power, or a bare number."""
+    """A parameter of a family."""
 
     name: str
-    power: float  # of the amplitude that the coefficient multiplies
     is_value: bool  # False: a number without unit, such as an exponent
 
 
@@ -179,6 +178,25 @@ class PackedCurve(AbstractCurve):
         return jnp.asarray(self.made_of.prior @ self.parameters)
 
 
+class Scattered(NamedTuple):
+    """Points that a family begins near, over one of the two amplitudes."""
+
+    argument: Argument
+    amplitude: Float[np.ndarray, " point"]
+    values: Float[np.ndarray, " point"]
+    weight: Float[np.ndarray, " point"]
+
+    @property
+    def largest(self) -> float:
+        """The largest amplitude."""
+        return float(np.max(self.amplitude))
+
+    def fitted(self, columns: Float[np.ndarray, "point column"]) -> Float[np.ndarray, " column"]:
+        """Coefficients of columns, nearest to the weighted values."""
+        weighted, goal = columns * self.weight[:, None], self.values * self.weight
+        return np.asarray(np.linalg.lstsq(weighted, goal, rcond=1e-10)[0])
+
+
 class AbstractFamily(AbstractCurve):
     """A curve of amplitude by name; `argument` says of which amplitude."""
 
@@ -192,18 +210,11 @@ class AbstractFamily(AbstractCurve):
 
     @abstractmethod
     def coefficients(self) -> tuple[Coefficient, ...]:
-        """What the parameters are called and the power of amplitude that each belongs to."""
+        """What the parameters are called, and which are values."""
 
     @classmethod
     @abstractmethod
-    def starts(
-        cls,
-        order: int,
-        argument: Argument,
-        amplitude: Float[np.ndarray, " point"],
-        values: Float[np.ndarray, " point"],
-        weight: Float[np.ndarray, " point"],
-    ) -> list["AbstractFamily"]:
+    def starts(cls, order: int, near: Scattered) -> list["AbstractFamily"]:
         """Members near scattered points: one where the family is linear, several elsewhere."""
 
     @property
@@ -301,11 +312,3 @@ def packed(family: AbstractFamily, room: int = 0) -> PackedCurve:
         of_velocity=xp.asarray(family.argument == "velocity"),
     )
     return curve if traced else jax.device_put(curve)
-
-
-def linear_start(
-    columns: np.ndarray, values: np.ndarray, weight: np.ndarray
-) -> Float[np.ndarray, " parameter"]:
-    """Parameters of a family that is linear in them, nearest to weighted values."""
-    solution = np.linalg.lstsq(columns * weight[:, None], values * weight, rcond=1e-10)[0]
-    return np.asarray(solution)

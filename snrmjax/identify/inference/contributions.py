@@ -1,30 +1,54 @@
 """What the uncertainty of a joint fit comes from: shares of every source of error."""
 
-import dataclasses
-from typing import ClassVar, NamedTuple
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, ClassVar, Generic, NamedTuple, TypeVar, overload
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from snrmjax.identify.inference.fitted_curves import values_at_displacement
-from snrmjax.identify.inference.table_result import AbstractTable
-from snrmjax.identify.joint.force_balance import (
-    STATE_ERRORS,
-    BalanceProblem,
-    slopes_by_error,
-    weighting_at,
-)
-from snrmjax.identify.joint.free_unknowns import (
-    Unravel,
-    all_residuals,
-    padded_problem,
-)
+from snrmjax.identify.joint.force_balance import STATE_ERRORS
+from snrmjax.identify.joint.free_unknowns import padded_problem, whitened_slopes
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.test_model.states import LEVEL_ERRORS
-from snrmjax.numerics.compiled import compiled, on_numbers
+from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.least_squares import inverse_of
+from snrmjax.numerics.result import AbstractResult, Variable
+
+Row = TypeVar("Row")
+
+
+class AbstractTable(AbstractResult, Generic[Row]):
+    """A result that is a sequence of rows, each a `NamedTuple`."""
+
+    # Of a row, unit and meaning.
+    columns: ClassVar[Mapping[str, tuple[Callable[[Any], Any], str, str]]]
+    rows: tuple[Row, ...]
+
+    def __len__(self) -> int:
+        """Number of rows."""
+        return len(self.rows)
+
+    @overload
+    def __getitem__(self, place: int) -> Row: ...
+    @overload
+    def __getitem__(self, place: slice) -> tuple[Row, ...]: ...
+    def __getitem__(self, place: int | slice) -> Row | tuple[Row, ...]:
+        """The row at a place, or those of a slice."""
+        return self.rows[place]
+
+    def __iter__(self) -> Iterator[Row]:
+        """The rows in their order."""
+        return iter(self.rows)
+
+    def variables(self) -> dict[str, Variable]:
+        """One of every entry of `columns`."""
+        return {
+            name: Variable(("row",), np.array([of(row) for row in self.rows]), unit, meaning)
+            for name, (of, unit, meaning) in self.columns.items()
+        }
+
 
 _LISTED = 8  # sources on one screen
 _OWN = ("stiffness off resonance", "damping off resonance", "modal mass")
@@ -99,9 +123,7 @@ def _bend_slopes(fit: JointFit) -> Float[np.ndarray, "row unknown"]:
     return slopes
 
 
-@on_numbers(
-    "Differentiate `sj.identify.identify_points`, or the fitted curves themselves (`fit.unknowns`)."
-)
+@on_numbers("Differentiate `sj.identify.refit`.")
 def contributions(fit: JointFit) -> Contributions:
     """What noise, every level's errors and every linear parameter add to the bands of both curves.
 
@@ -111,17 +133,13 @@ def contributions(fit: JointFit) -> Contributions:
 
     Returns shares of the variance between the smallest and the largest measured displacement,
     largest first; they sum to one but for rounding.
-    Not differentiable: differentiate `snrmjax.identify.identify_points`, or the fitted curves
-    themselves (`fit.unknowns`).
+    Not differentiable: differentiate `snrmjax.identify.refit`.
     """
-    program, problem = fit.packed(), padded_problem(fit.problem)
-    as_in_bands = dataclasses.replace(problem.prior, level_ratio=jnp.ones(len(LEVEL_ERRORS)))
-    problem = dataclasses.replace(problem, prior=as_in_bands)
-    derivatives = _first_order(program.vector, program.unravel, problem)
-    p, n, n_levels = len(program.own), len(fit.data.level), fit.data.n_levels
-    jacobian, by_error = np.asarray(derivatives[0])[:, program.own], np.asarray(derivatives[1])[:n]
-    inverse = inverse_of(jacobian)
-    points = jacobian[: 2 * len(problem.data.level)].reshape(-1, 2, p)[:n]
+    n, n_levels = len(fit.data.level), fit.data.n_levels
+    points, by_error = whitened_slopes(fit.packed(), padded_problem(fit.problem), n)
+    p, n_linear = points.shape[2], len(fit.unknowns.linear)
+    deviations = np.eye(p)[-n_linear - n_levels * len(LEVEL_ERRORS) :]
+    inverse = inverse_of(np.concatenate([points.reshape(-1, p), deviations, _bend_slopes(fit)]))
     by_state = np.einsum("pq,siq,sie->pse", inverse, points, by_error) * np.asarray(fit.data.std)
     measured = np.asarray(fit.motion().displacement)
     at = np.linspace(measured.min(), measured.max(), _AMPLITUDES)
@@ -132,7 +150,7 @@ def contributions(fit: JointFit) -> Contributions:
         if np.any(by_state[:, :, k]):
             name = f"random error of {kind}"
             rows.append((name, name, by_state[:, :, k]))
-    n_linear, linear_std = len(fit.unknowns.linear), np.asarray(fit.prior.linear)
+    linear_std = np.asarray(fit.prior.linear)
     levels = inverse[:, p - n_linear - n_levels * len(LEVEL_ERRORS) : p - n_linear]
     levels = levels.reshape(p, n_levels, len(LEVEL_ERRORS))
     for k, kind in enumerate(LEVEL_ERRORS):
@@ -159,12 +177,3 @@ def contributions(fit: JointFit) -> Contributions:
     ]
     ranked = sorted(listed, key=lambda row: -row.frequency_share - row.damping_share)
     return Contributions(tuple(ranked))
-
-
-@compiled
-def _first_order(vector: Array, unravel: Unravel, problem: BalanceProblem) -> tuple[Array, Array]:
-    """Slopes of the residuals by the unknowns, and of the states' by their own errors."""
-    slopes = slopes_by_error(unravel(vector), problem)
-    weighting = weighting_at(unravel(vector), problem)
-    jacobian = jax.jacfwd(lambda v: all_residuals(v, unravel, problem, weighting))(vector)
-    return jacobian, jnp.sqrt(problem.data.weight)[:, None, None] * (weighting.whiten @ slopes)

@@ -18,9 +18,7 @@ _KNOTS = 120  # of curves of families by name, for what takes a `Backbone`
 _DOUBLINGS = 6  # of the displacement, to reach a velocity
 
 
-@on_numbers(
-    "Differentiate `sj.identify.identify_points`, or the fitted curves themselves (`fit.unknowns`)."
-)
+@on_numbers("Differentiate `sj.identify.refit`.")
 def fitted_values(
     fit: JointFit,
     velocity: Float[np.ndarray, " point"] | None = None,
@@ -34,8 +32,7 @@ def fitted_values(
     the bands are those of the next test: they include by how much one level differs from another.
     Raises `ValueError` for a velocity that the backbone has at several displacements, as it can
     have where it softens: give displacements there.
-    Not differentiable: differentiate `snrmjax.identify.identify_points`, or the fitted curves
-    themselves (`fit.unknowns`).
+    Not differentiable: differentiate `snrmjax.identify.refit`.
     """
     if (velocity is None) == (displacement is None):
         raise ValueError("give either `velocity` or `displacement`.")

@@ -6,10 +6,10 @@ import numpy as np
 from jaxtyping import Float
 
 from snrmjax.identify.inference.fitted_curves import as_backbone, values_at_displacement
-from snrmjax.identify.inference.forced_motion import banded_curve
-from snrmjax.identify.inference.located_points import (
+from snrmjax.identify.inference.forced_motion import (
     FittedPoint,
     Place,
+    banded_curve,
     located,
     turns,
 )
@@ -17,10 +17,10 @@ from snrmjax.identify.joint.force_balance import with_deviations
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.pointwise.prediction import (
     LARGEST_AMPLITUDE_RATIO,
+    PredictedResponse,
     predict_response,
     resonances,
 )
-from snrmjax.identify.pointwise.prediction_result import PredictedResponse
 from snrmjax.identify.pointwise.snrm import is_single, sensed_mode
 from snrmjax.identify.prediction.new_level import NewLevel, new_level
 from snrmjax.identify.prediction.resonance_distribution import (
@@ -78,9 +78,7 @@ class FittedResponse(PredictedResponse):
         return super().attributes() | more
 
 
-@on_numbers(
-    "Differentiate `sj.identify.identify_points`, or the fitted curves themselves (`fit.unknowns`)."
-)
+@on_numbers("Differentiate `sj.identify.refit`.")
 def fitted_response(
     fit: JointFit,
     force: float,
@@ -103,8 +101,7 @@ def fitted_response(
     Returns the connected curves, the main one first; resonances and folds with the first curve
     that has them; the `note` of each says where it extrapolates.
     Raises `ValueError` for a force or a ratio that is not positive.
-    Not differentiable: differentiate `snrmjax.identify.identify_points`, or the fitted curves
-    themselves (`fit.unknowns`).
+    Not differentiable: differentiate `snrmjax.identify.refit`.
     """
     ratio = {"largest_amplitude_ratio": largest_amplitude_ratio}
     level = new_level(fit, force) if of is None else of
@@ -156,9 +153,7 @@ def _notes_on(missing: tuple[FittedPoint, ...], force: float) -> tuple[Fact, ...
     return (Fact("points_not_located", points=points, force=force),) if points else ()
 
 
-@on_numbers(
-    "Differentiate `sj.identify.identify_points`, or the fitted curves themselves (`fit.unknowns`)."
-)
+@on_numbers("Differentiate `sj.identify.refit`.")
 def predicted_resonance(
     fit: JointFit,
     force: float,
@@ -174,8 +169,7 @@ def predicted_resonance(
 
     Arguments: `force` in N, looked for up to `largest_amplitude_ratio` times the largest measured
     amplitude; `of` the level where it is not `new_level`'s; `self_excited` allows negative damping.
-    Not differentiable: differentiate `snrmjax.identify.identify_points`, or the fitted curves
-    themselves (`fit.unknowns`).
+    Not differentiable: differentiate `snrmjax.identify.refit`.
     """
     new = new_level(fit, force) if of is None else of
     amplitude = amplitudes_to(fit.largest[0], largest_amplitude_ratio)

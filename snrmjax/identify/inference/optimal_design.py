@@ -8,27 +8,25 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Complex, Float
 
+from snrmjax.identify.inference.contributions import AbstractTable
 from snrmjax.identify.inference.fitted_curves import values_at_displacement
 from snrmjax.identify.inference.fitted_response import FittedResponse, fitted_response
-from snrmjax.identify.inference.table_result import AbstractTable
 from snrmjax.identify.joint.force_balance import (
     BalanceData,
     BalanceProblem,
-    Unknowns,
     filled,
     no_errors,
     relative_participation,
-    weighting_at,
 )
-from snrmjax.identify.joint.free_unknowns import Unravel, padded_levels, whitened
+from snrmjax.identify.joint.free_unknowns import packed_unknowns, padded_levels, whitened_slopes
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.pointwise.snrm import sensed_mode
 from snrmjax.identify.test_model.balance import off_resonance
 from snrmjax.identify.test_model.states import LEVEL_ERRORS
 from snrmjax.numerics.blocks import padded
-from snrmjax.numerics.compiled import compiled, on_numbers
+from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import Variable, setting
 from snrmjax.numerics.status import Status
@@ -126,9 +124,7 @@ class NextMeasurements(AbstractTable[NextMeasurement]):
         return {**super().attributes(), "status": self.status.message}
 
 
-@on_numbers(
-    "Differentiate `sj.identify.identify_points`, or the fitted curves themselves (`fit.unknowns`)."
-)
+@on_numbers("Differentiate `sj.identify.refit`.")
 def next_measurements(
     fit: JointFit,
     count: int,
@@ -154,8 +150,7 @@ def next_measurements(
     where the fitted data know the drive only. Frequencies in rad/s.
     Returns at most `count` states: fewer, or none, when a test can reach no more; `status` says so,
     and `notes` say that the fit has not converged.
-    Not differentiable: differentiate `snrmjax.identify.identify_points`, or the fitted curves
-    themselves (`fit.unknowns`).
+    Not differentiable: differentiate `snrmjax.identify.refit`.
     Reference: the one-step rule of sequential design, Fedorov, Theory of Optimal Experiments
     (1972), for a mean of standard deviations.
     """
@@ -299,39 +294,19 @@ def _information(fit: JointFit, states: _States) -> Float[np.ndarray, "state par
         n_levels=n_levels,
         sensor=fit.data.sensor,
     )
-    program, n_padded = fit.packed(), len(padded(states.frequency))
+    n_padded, room = len(padded(states.frequency)), padded_levels(n_levels)
     padded_states = jax.tree.map(lambda rows: filled(rows, n_padded, None), data)
-    levels = dataclasses.replace(padded_states, n_levels=padded_levels(n_levels))
+    levels = dataclasses.replace(padded_states, n_levels=room)
     of_new = dataclasses.replace(fit.prior, level=fit.prior.new_level)
     problem = BalanceProblem(levels, fit.modes, of_new)
-    by_unknowns = _slopes(program.vector, program.unravel, problem)
-    by_vector, by_level = (np.asarray(part)[:n] for part in by_unknowns)
-    rows = np.zeros((n, 2, fit.covariance.shape[0] + n_levels * len(LEVEL_ERRORS)))
-    rows[:, :, : fit.covariance.shape[0]] = by_vector[:, :, program.own]
-    for k in range(len(LEVEL_ERRORS)):
-        place = fit.covariance.shape[0] + states.level * len(LEVEL_ERRORS) + k
-        rows[np.arange(n)[:, None], np.arange(2), place[:, None]] = by_level[:, :, k]
-    return rows
-
-
-@compiled
-def _slopes(vector: Array, unravel: Unravel, problem: BalanceProblem) -> tuple[Array, Array]:
-    new = jnp.zeros((problem.data.n_levels, len(LEVEL_ERRORS)))
-
-    def unknowns_of(vector: Array, level: Array) -> Unknowns:
-        return eqx.tree_at(lambda u: u.level, unravel(vector), level)
-
-    weighting = weighting_at(unknowns_of(vector, new), problem)
-
-    def residuals(vector: Array, level: Array) -> Array:
-        return whitened(unknowns_of(vector, level), problem, weighting)
-
-    # The levels of the fit have no part in a new one: their columns come out as zeros.
-    by_vector = jax.jacfwd(residuals)(vector, new)
-    kinds = new.shape[1]
-    directions = jnp.broadcast_to(jnp.eye(kinds)[:, None, :], (kinds, *new.shape))
-    by_level = jax.vmap(lambda d: jax.jvp(lambda b: residuals(vector, b), (new,), (d,))[1])
-    return by_vector, jnp.moveaxis(by_level(directions), 0, 2)
+    # New levels in place of the fit's, which have no part in them.
+    new = np.zeros((n_levels, len(LEVEL_ERRORS)))
+    unknowns = eqx.tree_at(lambda u: u.level, fit.unknowns, new)
+    slopes, _ = whitened_slopes(packed_unknowns(unknowns, fit.free, room), problem, n)
+    n_linear = len(unknowns.linear)
+    first, of_levels, last = np.split(slopes, [-n_linear - new.size, -n_linear], axis=2)
+    nothing = np.zeros((n, 2, fit.unknowns.level.size))
+    return np.concatenate([first, nothing, last, of_levels], axis=2)
 
 
 def _mean_band(slopes: np.ndarray, covariance: np.ndarray) -> float:

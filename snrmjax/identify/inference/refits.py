@@ -8,27 +8,16 @@ Reference: Griewank & Walther, Evaluating Derivatives (2008), ch. 15, doi:10.113
 """
 
 import dataclasses
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float
 
-from snrmjax.identify.joint.force_balance import (
-    BalanceProblem,
-    Unknowns,
-    filled,
-    force_balance,
-    nearest_errors,
-)
-from snrmjax.identify.joint.free_unknowns import (
-    Unravel,
-    all_residuals,
-    padded_problem,
-    prior_residuals,
-)
+from snrmjax.identify.joint.force_balance import BalanceProblem, Unknowns, filled, force_balance
+from snrmjax.identify.joint.free_unknowns import Unravel, padded_problem, prior_residuals
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.numerics.compiled import compiled, on_numbers
 
@@ -60,8 +49,7 @@ class FitInputs(eqx.Module):
         states, modes = jnp.zeros(len(fit.data.level)), jnp.zeros(fit.modes.n_modes)
         linear, four = jnp.zeros(len(fit.prior.linear)), jnp.zeros(4)
         return cls(
-            *(states, states, states, modes, modes, modes),
-            *(four, four, linear, jnp.zeros(2)),
+            *(states, states, states, modes, modes, modes), *(four, four, linear, jnp.zeros(2))
         )
 
 
@@ -123,29 +111,45 @@ class _Refit(eqx.Module):
 
     def solved(
         self, start: Float[Array, " unknown"]
-    ) -> tuple[Float[Array, " unknown"], Bool[Array, ""]]:
-        """The optimum by Gauss–Newton iterations, and whether it was reached."""
+    ) -> tuple[Float[Array, " unknown"], Float[Array, "state input"], Bool[Array, ""]]:
+        """The optimum, the states' errors there in their 1σ, and whether it was reached.
 
-        def step(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-            point, _, count = state
-            errors, weighting = nearest_errors(self.unravel(self.entries(point)), self.problem)
-            at = self.problem.with_data(correction=errors)
+        By Gauss–Newton iterations with all errors as unknowns, which are eliminated state by state:
+        balances b made straight leave (SSᵀ)⁻¹(b − Se + J dθ) of each, and errors −Sᵀ times it.
+        """
+        expected = jax.jacfwd(self.expected)
 
-            def left(point: Array) -> tuple[Array, Array]:
-                rows = all_residuals(self.entries(point), self.unravel, at, weighting)
-                return rows, rows
+        def step(state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
+            point, errors, _, count = state
+            slopes = self.by_error(point, errors)
+            by_unknown = jax.jacfwd(lambda p: self.balances(p, errors))(point)
+            left = self.balances(point, errors) - jnp.einsum("sie,se->si", slopes, errors)
+            both = jnp.concatenate([left[:, :, None], by_unknown], axis=2)
+            pulled = jnp.linalg.solve(slopes @ slopes.mT, both)
+            prior = expected(point)
+            normal = jnp.einsum("sie,sif->ef", by_unknown, pulled[:, :, 1:]) + prior.T @ prior
+            gradient = jnp.einsum("sie,si->e", by_unknown, pulled[:, :, 0])
+            moved = jnp.linalg.solve(normal, gradient + prior.T @ self.expected(point))
+            errors = jnp.einsum("sie,si->se", slopes, pulled[:, :, 1:] @ moved - pulled[:, :, 0])
+            return point - moved, errors, jnp.max(jnp.abs(moved)), count + 1
 
-            slopes, now = jax.jacfwd(left, has_aux=True)(point)
-            directions, triangle = jnp.linalg.qr(slopes)
-            moved = solve_triangular(triangle, directions.T @ now)
-            return point - moved, jnp.max(jnp.abs(moved)), count + 1
+        def goes_on(state: tuple[Array, Array, Array, Array]) -> Array:
+            return (state[2] > _ARRIVED) & (state[3] < _MOST_STEPS)
 
-        def goes_on(state: tuple[Array, Array, Array]) -> Array:
-            return (state[1] > _ARRIVED) & (state[2] < _MOST_STEPS)
+        exact = jnp.zeros_like(self.problem.data.std)
+        first = (start, exact, jnp.array(jnp.inf), jnp.array(0))
+        point, errors, moved, _ = jax.lax.while_loop(goes_on, step, first)
+        return point, errors, moved <= _ARRIVED
 
-        first = (start, jnp.array(jnp.inf), jnp.array(0))
-        point, moved, _ = jax.lax.while_loop(goes_on, step, first)
-        return point, moved <= _ARRIVED
+    def expected(self, point: Float[Array, " unknown"]) -> Float[Array, " row"]:
+        """What the priors expect near zero, in its own 1σ."""
+        return prior_residuals(self.unravel(self.entries(point)), self.problem.prior)
+
+    def by_error(
+        self, point: Float[Array, " unknown"], errors: Float[Array, "state input"]
+    ) -> Float[Array, "state part input"]:
+        """Derivatives of the balances by each state's own errors, in their 1σ."""
+        return _state_by_state(lambda errors: self.balances(point, errors), errors)
 
     def balances(
         self, point: Float[Array, " unknown"], errors: Float[Array, "state input"]
@@ -168,58 +172,44 @@ class _Refit(eqx.Module):
 
         def lagrangian(point: Array, errors: Array) -> tuple[Array, Array]:
             left = self.balances(point, errors)
-            expected = prior_residuals(self.unravel(self.entries(point)), self.problem.prior)
-            squares = jnp.sum(expected**2) + jnp.sum(errors**2)
+            squares = jnp.sum(self.expected(point) ** 2) + jnp.sum(errors**2)
             return 0.5 * squares + jnp.sum(multipliers * left), left
 
         by, left = jax.grad(lagrangian, argnums=(0, 1), has_aux=True)(point, errors)
         return *by, left
 
 
-@eqx.filter_custom_jvp
-def _optimum(problem: _Refit) -> Float[Array, " unknown"]:
-    """The unknowns at the optimum, in 1σ from where they begin."""
-    point, good = problem.solved(jnp.zeros(len(problem.own)))
-    return jnp.where(good, point, jnp.nan)
-
-
-@_optimum.def_jvp
-def _implicit(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    """By the implicit function theorem, errors and multipliers eliminated state by state."""
-    (problem,), (moved,) = primals, tangents
-    point = _optimum(problem)
-    errors = nearest_errors(problem.unravel(problem.entries(point)), problem.problem)[0]
-    std, weight = problem.problem.data.std, problem.problem.data.weight
-    errors = errors * jnp.sqrt(jnp.maximum(weight, _NO_WEIGHT))[:, None]
-    errors = jnp.where(std > 0, errors / jnp.where(std > 0, std, 1.0), 0.0)
+def _state_by_state(
+    function: Callable[[Array], Array], errors: Float[Array, "state input"]
+) -> Float[Array, "state row input"]:
+    """Derivatives of what every state has by its own errors: a push forward for each kind."""
     kinds = jnp.broadcast_to(jnp.eye(errors.shape[1])[:, None], (errors.shape[1], *errors.shape))
-    # Balances by errors: (state, part, input).
-    by_error = jax.vmap(lambda d: jax.jvp(lambda e: problem.balances(point, e), (errors,), (d,))[1])
-    slopes = jnp.moveaxis(by_error(kinds), 0, 2)
+    along = jax.vmap(lambda direction: jax.jvp(function, (errors,), (direction,))[1])
+    return jnp.moveaxis(along(kinds), 0, 2)
+
+
+def _optimum(problem: _Refit) -> Float[Array, " unknown"]:
+    """The unknowns at the optimum, in 1σ from where they begin; NaN where it is not reached.
+
+    A last Newton step from there, errors and multipliers eliminated state by state, carries the
+    derivatives by all that the problem holds.
+    """
+    fixed = jax.lax.stop_gradient(problem)
+    point, errors, good = fixed.solved(jnp.zeros(len(problem.own)))
+    slopes = fixed.by_error(point, errors)
     square = slopes @ slopes.mT
     multipliers = -jnp.linalg.solve(square, (slopes @ errors[:, :, None]))[:, :, 0]
-
-    def by_errors(direction: Array) -> Array:
-        def given(errors: Array) -> Array:
-            return problem.stationary(point, errors, multipliers)[1]
-
-        return jax.jvp(given, (errors,), (direction,))[1]
-
-    inner = jnp.moveaxis(jax.vmap(by_errors)(kinds), 0, 2)
+    inner = _state_by_state(lambda e: fixed.stationary(point, e, multipliers)[1], errors)
     none = jnp.zeros((len(errors), 2, 2))
     blocks = jnp.block([[inner, slopes.mT], [slopes, none]])
-    hessian, *sensitivities = jax.jacfwd(lambda p: problem.stationary(p, errors, multipliers))(
-        point
-    )
+    by_point = jax.jacfwd(lambda p: fixed.stationary(p, errors, multipliers))
+    hessian, *sensitivities = by_point(point)
     by_unknown = jnp.concatenate(sensitivities, axis=1)  # (state, input and part, unknown)
     solved = jnp.linalg.solve(blocks, by_unknown)
     whole = hessian - jnp.einsum("sie,sif->ef", by_unknown, solved)
-    right = eqx.filter_jvp(
-        lambda given: given.stationary(point, errors, multipliers), (problem,), (moved,)
-    )[1]
-    of_states = jnp.concatenate(right[1:], axis=1)
-    change = right[0] - jnp.einsum("sie,si->e", solved, of_states)
-    return point, -jnp.linalg.solve(whole, change)
+    of_point, *of_states = problem.stationary(point, errors, multipliers)
+    left = of_point - jnp.einsum("sie,si->e", solved, jnp.concatenate(of_states, axis=1))
+    return jnp.where(good, point - jnp.linalg.solve(whole, left), jnp.nan)
 
 
 def refit(fit: JointFit, changes: FitInputs) -> Unknowns:
@@ -277,12 +267,11 @@ def _slopes(refit: _Refit, none: FitInputs) -> FitInputs:
 
 @on_numbers("Differentiate `sj.identify.refit`.")
 def bootstrap(
-    fit: JointFit, n_samples: int = 200, *, seed: int = 0, levels: bool = False
+    fit: JointFit, n_samples: int = 200, *, seed: int = 0
 ) -> Float[np.ndarray, "sample unknown"]:
     """Unknowns of refits to states drawn with replacement, within every level.
 
-    With `levels` whole levels are drawn instead, which needs more of them than a curve has
-    parameters. A refit that does not converge is a row of NaN.
+    A refit that does not converge is a row of NaN. What levels share is not seen by it.
 
     Not differentiable: differentiate `sj.identify.refit`.
     """
@@ -290,13 +279,9 @@ def bootstrap(
     level = np.asarray(fit.data.level)
     weights = np.zeros((n_samples, len(level)))
     for row in weights:
-        if levels:
-            drawn = rng.integers(fit.data.n_levels, size=fit.data.n_levels)
-            row += np.bincount(drawn, minlength=fit.data.n_levels)[level]
-        else:
-            for number in range(fit.data.n_levels):
-                mine = np.flatnonzero(level == number)
-                np.add.at(row, rng.choice(mine, size=mine.size), 1.0)
+        for number in range(fit.data.n_levels):
+            mine = np.flatnonzero(level == number)
+            np.add.at(row, rng.choice(mine, size=mine.size), 1.0)
     refit = _Refit.of(fit)
     room, weights = len(refit.problem.data.level), weights * np.asarray(fit.data.weight)
     rows = jax.device_put(np.stack([filled(row, room, 0.0) for row in weights]))
@@ -308,7 +293,7 @@ def bootstrap(
 def _resampled(refit: _Refit, weights: Array) -> Float[Array, "sample unknown"]:
     def again(weight: Array) -> Array:
         weighted = dataclasses.replace(refit, problem=refit.problem.with_data(weight=weight))
-        point, good = weighted.solved(jnp.zeros(len(refit.own)))
+        point, _, good = weighted.solved(jnp.zeros(len(refit.own)))
         return jnp.where(good, point, jnp.nan)
 
     return jax.lax.map(again, weights)

@@ -7,7 +7,7 @@ curve, however the response folds.
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -23,7 +23,6 @@ from snrmjax.identify.test_model.states import LEVEL_ERRORS
 from snrmjax.measure.states import SteadyStates, check_phases, relative_errors
 from snrmjax.model.modes import UNSTATED_MODAL_MASS_STD, LinearModes, residual_velocity
 from snrmjax.model.structures import Structure
-from snrmjax.numerics.blocks import mapped
 from snrmjax.numerics.compiled import as_numpy, compiled
 
 STATE_ERRORS = ("force", "velocity", "phase", "stiffness")
@@ -33,8 +32,6 @@ EXPONENTS = slice(-3, -1)
 """Where in `Unknowns.linear` the exponents of the forcing frequency stand."""
 
 _FEWEST_STATES = 48  # that programs have room for
-_STEPS = 4  # towards every state's most likely errors
-_FARTHEST = 0.3  # relative or rad, of a state's correction: no measurement is as bad
 
 
 class BalanceData(eqx.Module):
@@ -243,11 +240,7 @@ class Motion(eqx.Module):
 
 @compiled
 def _velocity_of_others(
-    modes: LinearModes,
-    change: tuple[Array, Array],
-    frequency: Array,
-    load: Array,
-    share: Array,
+    modes: LinearModes, change: tuple[Array, Array], frequency: Array, load: Array, share: Array
 ) -> Array:
     modes = with_deviations(modes, *change)
     return jnp.sum(share * residual_velocity(modes, frequency, load), axis=1)
@@ -268,55 +261,45 @@ def velocity_of_others(
     return np.asarray(_velocity_of_others(problem.modes, change, *rows))[:n]
 
 
-def recorded_motion(unknowns: Unknowns, problem: BalanceProblem) -> Motion:
-    """`motion_of` the states as they were recorded, by the host."""
-    data, prior = problem.data, problem.prior
-    level = (np.asarray(unknowns.level) * np.asarray(prior.level))[np.asarray(data.level)]
-    of_force = float(prior.gain_of_force) * level[:, 0]
-    force = np.asarray(data.force) * np.exp(float(unknowns.log_force_gain) + of_force)
-    force = force + float(unknowns.force_offset) * np.min(np.asarray(data.force))
-    turned = of_force - level[:, 0] - 1j * (level[:, 1] + float(unknowns.instrument_phase))
-    others = velocity_of_others(problem, unknowns.linear, force)
-    of_mode = np.asarray(data.velocity) * np.exp(turned) - others
-    return Motion(of_mode, np.abs(of_mode) / np.asarray(data.frequency), force)
+def _freed(unknowns: Unknowns, problem: BalanceProblem, error: Any, xp: Any) -> tuple[Any, Any]:
+    """Force in N and velocity in m/s of every state, without what levels and instruments err by.
 
-
-@compiled
-def motion_of(
-    unknowns: Unknowns,
-    problem: BalanceProblem,
-    error: Float[Array, "state input"],
-) -> Motion:
-    """The mode's motion by the record, corrected for its errors.
-
-    `error` adds to the logarithms of force and velocity and to the phase: for derivatives.
+    By NumPy or JAX, as `xp` says. `error` adds to the logarithms of force and velocity and to the
+    phase.
     """
     data, prior = problem.data, problem.prior
     level = (unknowns.level * prior.level)[data.level]
     of_force = prior.gain_of_force * level[:, 0]
-    gain = jnp.exp(unknowns.log_force_gain + of_force + error[:, 0])
-    force = data.force * gain + unknowns.force_offset * jnp.min(data.force)
+    force = data.force * xp.exp(unknowns.log_force_gain + of_force + error[:, 0])
+    force = force + unknowns.force_offset * xp.min(data.force)
     phase = error[:, 2] - level[:, 1] - unknowns.instrument_phase
-    velocity = data.velocity * jnp.exp(error[:, 1] - level[:, 0] + of_force + 1j * phase)
-    linear = with_deviations(problem.modes, unknowns.linear, prior.linear)
-    residual = residual_velocity(linear, jnp.asarray(data.frequency), force)
-    of_mode = velocity - jnp.sum(data.share * residual, axis=1)
-    return Motion(of_mode, jnp.abs(of_mode) / data.frequency, force)
+    turned = error[:, 1] - level[:, 0] + of_force + 1j * phase
+    return force, data.velocity * xp.exp(turned)
+
+
+def recorded_motion(unknowns: Unknowns, problem: BalanceProblem) -> Motion:
+    """The mode's motion in the states as they were recorded, by the host."""
+    found, given = jax.tree.map(np.asarray, (unknowns, problem))
+    force, velocity = _freed(found, given, no_errors(len(given.data.level)), np)
+    of_mode = velocity - velocity_of_others(problem, unknowns.linear, force)
+    return Motion(of_mode, np.abs(of_mode) / given.data.frequency, force)
 
 
 @compiled
 def force_balance(
-    unknowns: Unknowns,
-    problem: BalanceProblem,
-    error: Float[Array, "state input"],
+    unknowns: Unknowns, problem: BalanceProblem, error: Float[Array, "state input"]
 ) -> Float[Array, "state part"]:
     """Force needed for the measured motion minus the force, over the force: real and imaginary."""
-    motion = motion_of(unknowns, problem, error)
-    data = problem.data
-    level = (unknowns.level * problem.prior.level)[data.level]
+    data, prior = problem.data, problem.prior
+    force, velocity = _freed(unknowns, problem, error, jnp)
+    linear = with_deviations(problem.modes, unknowns.linear, prior.linear)
+    others = residual_velocity(linear, jnp.asarray(data.frequency), force)
+    of_mode = velocity - jnp.sum(data.share * others, axis=1)
+    motion = Motion(of_mode, jnp.abs(of_mode) / data.frequency, force)
+    level = (unknowns.level * prior.level)[data.level]
     squared = unknowns.squared_frequency(motion.amplitude(unknowns.squared_frequency))
     damping = unknowns.modal_damping(motion.amplitude(unknowns.modal_damping))
-    softer, faster = (unknowns.linear * problem.prior.linear)[EXPONENTS]
+    softer, faster = (unknowns.linear * prior.linear)[EXPONENTS]
     at_rest = unknowns.squared_frequency(jnp.zeros(()))
     added = jnp.where(jnp.isfinite(at_rest), squared - at_rest, squared)
     squared = squared * (1 + level[:, 2] + error[:, 3]) + softer * data.away * added
@@ -347,93 +330,3 @@ def filled(rows: Array | np.ndarray, size: int, spare: float | None) -> np.ndarr
 def no_errors(n_states: int) -> Float[np.ndarray, "state input"]:
     """States as they were recorded."""
     return np.zeros((n_states, len(STATE_ERRORS)))
-
-
-class Weighting(NamedTuple):
-    """What turns a balance into independent residuals of unit variance, state by state."""
-
-    whiten: Float[Array, "state part part"]
-    offset: Float[Array, "state part"]  # of the balance, from the corrected state to the record
-
-
-def weighting_at(unknowns: Unknowns, problem: BalanceProblem) -> Weighting:
-    """How much every balance weighs, by its slopes at the corrected states.
-
-    The balance is straight between a record and its corrected state, which lies on the curves:
-    there its slopes do not go up and down with the noise, as they do at the record, where they
-    pull every curve to one side. With `nearest_errors` as corrections the whitened balance is as
-    long as these are in units of their 1σ.
-    Reference: orthogonal distance regression; Boggs, Byrd & Schnabel, SIAM J. Sci. Stat. Comput.
-    8 (1987) 1052, doi:10.1137/0908085.
-    """
-    return _weighting(slopes_by_error(unknowns, problem), problem.data)
-
-
-def _weighting(slopes: Float[Array, "state part input"], data: BalanceData) -> Weighting:
-    offset = -jnp.einsum("sie,se->si", slopes, data.correction)
-    return Weighting(whitener(slopes, data.std), offset)
-
-
-def nearest_errors(
-    unknowns: Unknowns, problem: BalanceProblem
-) -> tuple[Float[Array, "state input"], Weighting]:
-    """The most likely errors with which every state balances, from its present correction on.
-
-    Each step solves the balance made straight at the last one's end: what is left of the balance
-    falls by the ratio of a state's error to the curves' length.
-    Returns the errors, and the weighting there.
-    """
-
-    def step(_: Array, state: tuple[Array, Array, Weighting]) -> tuple[Array, Array, Weighting]:
-        # One more evaluation than steps, for the weighting at the end: a second copy of it outside
-        # the loop would compile as long as the loop.
-        errors = state[0]
-        at = problem.with_data(correction=errors)
-        slopes = slopes_by_error(unknowns, at)
-        own = _weighting(slopes, at.data)
-        whitened = jnp.einsum(
-            "sij,sj->si", own.whiten, force_balance(unknowns, problem, errors) + own.offset
-        )
-        nearest = -jnp.einsum("sje,sij,si->se", slopes, own.whiten, whitened) * problem.data.std**2
-        return jnp.clip(nearest, -_FARTHEST, _FARTHEST), errors, own
-
-    start = problem.data.correction
-    n = len(start)
-    none = Weighting(jnp.zeros((n, 2, 2)), jnp.zeros((n, 2)))
-    _, errors, weighting = jax.lax.fori_loop(0, _STEPS + 1, step, (start, start, none))
-    return errors, weighting
-
-
-def slopes_by_error(
-    unknowns: Unknowns, problem: BalanceProblem
-) -> Float[Array, "state part input"]:
-    """Derivatives of the balance by the states' errors (`STATE_ERRORS`), at the corrected states.
-
-    Every state has its own: one push forward for each kind of error gives them all.
-    """
-    at = problem.data.correction
-    n_states, kinds = at.shape
-    directions = jnp.broadcast_to(jnp.eye(kinds)[:, None, :], (kinds, n_states, kinds))
-    along = jax.linearize(lambda error: force_balance(unknowns, problem, error), at)[1]
-    return jnp.moveaxis(mapped(along, directions), 0, 2)
-
-
-def whitener(
-    slopes: Float[Array, "state part input"], std: Float[Array, "state input"]
-) -> Float[Array, "state part part"]:
-    """The matrices that turn a balance into independent residuals of unit variance."""
-    scaled = slopes * std[:, None, :]
-    covariance = scaled @ scaled.transpose(0, 2, 1)
-    a, b, c = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
-    # The inverse of Cholesky's factor of a 2×2 matrix; rounding must not make it singular.
-    floor = 1e-14 * (a + c)
-    first = jnp.sqrt(a + floor)
-    second = jnp.sqrt(jnp.maximum(c - b**2 / (a + floor), floor))
-    zero = jnp.zeros_like(a)
-    return jnp.stack(
-        [
-            jnp.stack([1 / first, zero], axis=1),
-            jnp.stack([-b / (first**2 * second), 1 / second], axis=1),
-        ],
-        axis=1,
-    )

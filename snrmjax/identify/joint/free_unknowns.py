@@ -17,12 +17,14 @@ from snrmjax.identify.joint.force_balance import (
     BalanceProblem,
     PriorStd,
     Unknowns,
-    Weighting,
     filled,
     force_balance,
     with_room,
 )
+from snrmjax.identify.test_model.balance import whitening
 from snrmjax.identify.test_model.states import LEVEL_ERRORS
+from snrmjax.numerics.blocks import mapped
+from snrmjax.numerics.compiled import compiled
 
 _LEVELS = 8  # come in so many
 
@@ -98,22 +100,18 @@ def packed_unknowns(
     return PackedUnknowns(vector, Unravel(whole, free), np.array(places))
 
 
-def padded_data(data: BalanceData) -> BalanceData:
-    """The data with padding states of no weight and padding levels: few sizes compile."""
-    size, levels = with_room(len(data.level)), data.n_levels
-    roomy = jax.tree.map(lambda a: filled(a, size, None), data)
-    weight = filled(data.weight, size, 0.0)
-    return dataclasses.replace(roomy, weight=weight, n_levels=padded_levels(levels))
-
-
 def padded_levels(n_levels: int) -> int:
     """So many levels have room for these: levels come in eights, so that few sizes compile."""
     return _LEVELS * -(-n_levels // _LEVELS)
 
 
 def padded_problem(problem: BalanceProblem) -> BalanceProblem:
-    """The problem with `padded_data`."""
-    return dataclasses.replace(problem, data=padded_data(problem.data))
+    """The problem with padding states of no weight and padding levels: few sizes compile."""
+    data, size = problem.data, with_room(len(problem.data.level))
+    roomy = jax.tree.map(lambda a: filled(a, size, None), data)
+    weight, levels = filled(data.weight, size, 0.0), padded_levels(data.n_levels)
+    roomy = dataclasses.replace(roomy, weight=weight, n_levels=levels)
+    return dataclasses.replace(problem, data=roomy)
 
 
 def free_unknowns(unknowns: Unknowns, free: tuple[str, ...]) -> Unknowns:
@@ -163,28 +161,35 @@ def named_unknowns(
     )
 
 
-def whitened(
-    unknowns: Unknowns,
-    problem: BalanceProblem,
-    weighting: Weighting,
-) -> Float[Array, "state part"]:
-    """Residuals of the states, of unit variance where the noise is as stated."""
-    balance = force_balance(unknowns, problem, problem.data.correction) + weighting.offset
-    return jnp.sqrt(problem.data.weight)[:, None] * jnp.einsum(
-        "sij,sj->si", weighting.whiten, balance
-    )
+@compiled
+def _slopes(vector: Array, unravel: Unravel, problem: BalanceProblem) -> tuple[Array, Array]:
+    """Derivatives of the balance by the unknowns, and by the states' errors.
 
-
-def all_residuals(
-    vector: Array,
-    unravel: Unravel,
-    problem: BalanceProblem,
-    weighting: Weighting,
-) -> Float[Array, " residual"]:
-    """Whitened residuals of the states, then the priors of levels, linear parameters and curves."""
+    Every state has its own: one push forward for each kind of error gives them all.
+    """
+    at = problem.data.correction
+    n_states, kinds = at.shape
+    directions = jnp.broadcast_to(jnp.eye(kinds)[:, None, :], (kinds, n_states, kinds))
     unknowns = unravel(vector)
-    points = whitened(unknowns, problem, weighting).reshape(-1)
-    return jnp.concatenate([points, prior_residuals(unknowns, problem.prior)])
+    along = jax.linearize(lambda error: force_balance(unknowns, problem, error), at)[1]
+    by_unknown = jax.jacfwd(lambda v: force_balance(unravel(v), problem, at))(vector)
+    return by_unknown, jnp.moveaxis(mapped(along, directions), 0, 2)
+
+
+def whitened_slopes(
+    program: PackedUnknowns, problem: BalanceProblem, n_states: int
+) -> tuple[Float[np.ndarray, "state part unknown"], Float[np.ndarray, "state part input"]]:
+    """Derivatives of the first states' balances, by the fit's own unknowns and by relative errors
+    of the states (`STATE_ERRORS`), in rows of unit variance where errors are as large as stated.
+
+    At the states corrected for their errors, which lie on the curves: there slopes do not go up and
+    down with the noise.
+    """
+    found = _slopes(program.vector, program.unravel, problem)
+    by_unknown, by_error = (np.asarray(part)[:n_states] for part in found)
+    std, weight = (np.asarray(p)[:n_states] for p in (problem.data.std, problem.data.weight))
+    root, _ = whitening(by_error[:, 0] + 1j * by_error[:, 1], std, weight)
+    return root @ by_unknown[:, :, program.own], root @ by_error
 
 
 def prior_residuals(unknowns: Unknowns, prior: PriorStd) -> Float[Array, " residual"]:

@@ -10,8 +10,8 @@ from jaxtyping import Array, Bool, Float
 
 from snrmjax.identify.checks.instruments import notes_on_instruments, require_passive
 from snrmjax.identify.checks.residual_autocorrelation import (
-    along_resonance,
     residual_autocorrelation,
+    states_of_levels,
 )
 from snrmjax.identify.curves.families import parse_family
 from snrmjax.identify.curves.splines import SmoothingSpline
@@ -44,12 +44,7 @@ from snrmjax.identify.joint.notes import (
     notes_on_reach,
     notes_on_stated_errors,
 )
-from snrmjax.identify.joint.posterior_view import (
-    view_of,
-    viewed_covariance,
-    viewed_unknowns,
-)
-from snrmjax.identify.test_model.states import LEVEL_ERRORS
+from snrmjax.identify.joint.posterior_view import view_of, viewed_covariance, viewed_unknowns
 from snrmjax.measure.phase_convention import naming_wrong_phases
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.modes import LinearModes
@@ -58,19 +53,7 @@ from snrmjax.numerics.blocks import on_one_core
 from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
-from snrmjax.numerics.status import Status
 from snrmjax.numerics.units import HERTZ
-
-
-class FitStatus(Status):
-    """How a joint fit ended."""
-
-    CONVERGED = 0, "converged"
-    NOT_SETTLED = (
-        1,
-        "not converged: fit and noise estimate still changed one another in the last round",
-    )
-
 
 _MOVED = 2.0  # standard deviations of a level's error, from which on the fit says so
 
@@ -97,13 +80,14 @@ class JointFit(AbstractResult):
     drive_known_only: bool = eqx.field(static=True)
     free: tuple[str, ...] = eqx.field(static=True)
     notes: tuple[Fact, ...] = setting()
-    status: FitStatus = eqx.field(static=True)
+    converged: bool = eqx.field(static=True)
     level_numbers: tuple[int, ...] = eqx.field(static=True)  # of the file; `data` counts from 0
 
     @property
-    def converged(self) -> bool:
-        """Whether the fit converged."""
-        return self.status == FitStatus.CONVERGED
+    def status(self) -> str:
+        """How the fit ended, in words."""
+        more = "not converged: fit and noise estimate still changed one another in the last round"
+        return "converged" if self.converged else more
 
     @property
     def data(self) -> BalanceData:
@@ -206,7 +190,7 @@ class JointFit(AbstractResult):
             f"natural frequency {omega.min() / HERTZ:.6g} to {omega.max() / HERTZ:.6g} Hz, "
             f"damping ratio {100 * ratio.min():.3g} to {100 * ratio.max():.3g} %",
             f"residuals: {noise}",
-            f"status: {self.status.message}",
+            f"status: {self.status}",
             *(f"note: {note}" for note in self.notes),
         )
 
@@ -238,14 +222,12 @@ class JointFit(AbstractResult):
             "backbone": self.unknowns.squared_frequency.label,
             "damping": self.unknowns.modal_damping.label,
             "noise_scale": self.noise.scale,
-            "status": self.status.message,
+            "status": self.status,
             **super().attributes(),
         }
 
 
-@on_numbers(
-    "Differentiate `sj.identify.identify_points`, or the fitted curves themselves (`fit.unknowns`)."
-)
+@on_numbers("Differentiate `sj.identify.refit`.")
 @on_one_core
 @naming_wrong_phases
 def fit_jointly(
@@ -287,8 +269,7 @@ def fit_jointly(
     than there are data, a gain, an offset or a phase that the data do not determine, and a fit that
     needs a modal mass or a damping below zero.
     Validity: one nonlinear mode whose ω̃ and 2ζ̃ω̃ are functions of amplitude alone.
-    Not differentiable: differentiate `snrmjax.identify.identify_points`, or the fitted curves
-    themselves (`fit.unknowns`).
+    Not differentiable: differentiate `snrmjax.identify.refit`.
     """
     level_std = stated_level_std(modes)
     for k, std in enumerate((level_gain_std, level_phase_std)):
@@ -323,7 +304,7 @@ def fit_jointly(
     covariance = viewed_covariance(view)
     level, frequency = np.asarray(measured.level), np.asarray(measured.frequency)
     autocorrelation = residual_autocorrelation(
-        posterior.residuals, along_resonance(level, frequency)
+        posterior.residuals, states_of_levels(level, frequency)
     )
     # What levels differ by is said where the data ask for it or the fit made use of it, and stays
     # possible elsewhere.
@@ -338,10 +319,10 @@ def fit_jointly(
         drive_known_only=driven,
         free=released,
         notes=(),
-        status=FitStatus.CONVERGED if posterior.settled else FitStatus.NOT_SETTLED,
+        converged=bool(posterior.settled),
         level_numbers=numbers,
     )
-    notes = notes_on_instruments(fit, LEVEL_ERRORS)
+    notes = notes_on_instruments(fit)
     curve, mass = fit.unknowns.modal_damping, fit.problem.constant_of(fit.unknowns)
     require_passive(
         released,
@@ -353,16 +334,13 @@ def fit_jointly(
     return dataclasses.replace(fit, notes=tuple(notes))
 
 
-@on_numbers(
-    "Differentiate `sj.identify.identify_points`, or the fitted curves themselves (`fit.unknowns`)."
-)
+@on_numbers("Differentiate `sj.identify.refit`.")
 def corrected_states(data: SteadyStates, fit: JointFit) -> SteadyStates:
     """The states with the force and the phase that a joint fit found for their instruments.
 
     Where only a drive voltage is known, the force in N is that voltage times the fitted gain.
 
-    Not differentiable: differentiate `snrmjax.identify.identify_points`, or the fitted curves
-    themselves (`fit.unknowns`).
+    Not differentiable: differentiate `snrmjax.identify.refit`.
     """
     unknowns = fit.unknowns
     nominal = np.asarray(data.drive if fit.drive_known_only else data.force)
@@ -385,7 +363,7 @@ def _notes(
     notes = []
     if not fit.converged:
         is_stated = {"noise_stated": fit.noise.stated, "levels_stated": bool(np.all(stated > 0))}
-        reason = fit.status.message
+        reason = fit.status
         notes.append(Fact("fit_not_converged", reason=reason, named=named, **is_stated))
     level, n_levels = np.asarray(fit.data.level), fit.data.n_levels
     notes += notes_on_noise(

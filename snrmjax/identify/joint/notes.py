@@ -1,16 +1,19 @@
 """What a joint fit has to tell of its data: noise, levels, modal mass, and where the states lie."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 from scipy.special import chdtri, ndtri
 
-from snrmjax.identify.curves.remainder import WithRemainder
+from snrmjax.identify.checks.residual_autocorrelation import states_of_levels
+from snrmjax.identify.curves.splines import WithRemainder
 from snrmjax.identify.joint.force_balance import BalanceProblem, Motion, Unknowns
 from snrmjax.identify.test_model.states import LEVEL_ERRORS
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.units import HERTZ
 
 _BESIDE = np.radians(5.0)  # from resonance, with every state farther on the same side
 _ONE_AMPLITUDE = 1.1  # ratio of levels' amplitudes below which they are one
@@ -91,9 +94,7 @@ def notes_on_stated_errors(
 
 
 def notes_on_modal_mass(
-    unknowns: Unknowns,
-    problem: BalanceProblem,
-    covariance: Float[np.ndarray, "unknown unknown"],
+    unknowns: Unknowns, problem: BalanceProblem, covariance: Float[np.ndarray, "unknown unknown"]
 ) -> list[Fact]:
     """Which modal mass the damping is relative to: the model's, or one that the data ask for."""
     prior = problem.prior.linear.item(-1)
@@ -110,10 +111,7 @@ def notes_on_modal_mass(
 
 def notes_on_families(unknowns: Unknowns) -> list[Fact]:
     """Which families leave more of a curve than noise explains."""
-    curves = {
-        "natural frequency": unknowns.squared_frequency,
-        "damping": unknowns.modal_damping,
-    }
+    curves = {"natural frequency": unknowns.squared_frequency, "damping": unknowns.modal_damping}
     return [
         Fact(
             "family_leaves",
@@ -196,3 +194,45 @@ def notes_on_reach(motion: Motion, level: np.ndarray) -> list[Fact]:
     if len(peaks) > 1 and peaks.max() < _ONE_AMPLITUDE * peaks.min():
         notes.append(Fact("levels_of_one_amplitude", apart=float(peaks.max() / peaks.min() - 1)))
     return notes
+
+
+_ONE_TEST_IN = 100  # has a state by chance that is called so
+_NEIGHBOURS = 2  # states on each side, in the order of frequency within a level
+_MEDIAN_OF_FOUR = 1.2  # variance of that median, times that of the mean
+
+
+def outlying_states(fit: Any) -> np.ndarray:
+    """Numbers of the states that lie farther from the curves than noise puts any of a test's.
+
+    The two residuals of n states are those of a normal distribution: the largest of all is beyond
+    √(−2 ln(p/n)) in the share p of tests, here one in a hundred (Bonferroni). So must be what a
+    state differs by from its neighbours' median: curves that miss a stretch of states alike miss
+    no single one.
+    """
+    residuals = np.nan_to_num(np.asarray(fit.residuals)[:, :2])
+    level, frequency = np.asarray(fit.data.level), np.asarray(fit.data.frequency)
+    beyond = np.sqrt(2 * np.log(_ONE_TEST_IN * max(1, len(residuals))))
+    alone = np.zeros_like(residuals)
+    for rows in states_of_levels(level, frequency):
+        for k, row in enumerate(rows):
+            near = np.r_[rows[max(0, k - _NEIGHBOURS) : k], rows[k + 1 : k + 1 + _NEIGHBOURS]]
+            if near.size > 1:
+                spread = np.sqrt(1 + _MEDIAN_OF_FOUR / near.size)
+                alone[row] = (residuals[row] - np.median(residuals[near], axis=0)) / spread
+    far = (np.hypot(*residuals.T) > beyond) & (np.hypot(*alone.T) > beyond)
+    return np.flatnonzero(far)
+
+
+def note_on_outlying(fit: Any, *, robust: bool) -> tuple[Fact, ...]:
+    """A note that names these states, the farthest first."""
+    rows = outlying_states(fit)
+    if not rows.size:
+        return ()
+    size = np.hypot(*np.asarray(fit.residuals)[rows, :2].T)
+    rows = rows[np.argsort(-size)]
+    data = fit.data
+    states = tuple(
+        (fit.level_numbers[int(data.level[k])], float(data.frequency[k]) / HERTZ)
+        for k in rows.tolist()
+    )
+    return (Fact("states_outlying", states=states, farthest=float(size.max()), robust=robust),)

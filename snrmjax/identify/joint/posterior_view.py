@@ -11,9 +11,8 @@ from scipy.optimize import nnls
 
 from snrmjax.identify.checks.instruments import require_passive
 from snrmjax.identify.curves.families import ARGUMENTS, FAMILIES, Choice
-from snrmjax.identify.curves.family_base import AbstractFamily
-from snrmjax.identify.curves.remainder import WithRemainder
-from snrmjax.identify.curves.splines import SmoothingSpline
+from snrmjax.identify.curves.family_base import AbstractFamily, Scattered
+from snrmjax.identify.curves.splines import SmoothingSpline, WithRemainder
 from snrmjax.identify.joint.force_balance import (
     EXPONENTS,
     STATE_ERRORS,
@@ -305,7 +304,7 @@ def _nearest(posterior: TestPosterior, choice: Choice, which: int) -> AbstractFa
     for size in sizes:
         for argument in (choice.argument,) if choice.argument else ARGUMENTS:
             at = x if argument == "displacement" else np.abs(posterior.states.velocity)
-            for member in family.starts(size, argument, at, values, 1 / std):
+            for member in family.starts(size, Scattered(argument, at, values, 1 / std)):
                 if member.parameters.shape[0] >= n:
                     raise ValueError(
                         f"{choice.kind}:{size} has {member.parameters.shape[0]} parameters, but "

@@ -16,10 +16,15 @@ from snrmjax.identify.modal.modal_bases import (
     unpacked,
 )
 from snrmjax.identify.modal.modal_fit import LinearModalFit
-from snrmjax.identify.modal.modal_notes import lines_in_half_power
 from snrmjax.identify.modal.response_data import ResponseData
 from snrmjax.identify.modal.separable_fit import SeparableFit
-from snrmjax.identify.modal.weighted_fit import FitSpread, line_weights, modal_result, weighted_fit
+from snrmjax.identify.modal.weighted_fit import (
+    FitSpread,
+    line_weights,
+    lines_in_half_power,
+    modal_result,
+    weighted_fit,
+)
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.states import SteadyStates, relative_errors
 from snrmjax.model.moving_base import SensorMotion
@@ -132,18 +137,7 @@ def rows_of_levels(
     keep = np.flatnonzero(inside & np.isin(level, list(place)))
     places = np.array([place[number] for number in level[keep].tolist()])
     order = keep[np.lexsort((omega[keep], places))]
-    force = np.asarray(data.force)[order]
-    volts = not np.isfinite(force).any()
-    load = np.asarray(data.drive)[order] if volts else force
-    reference = Channel("drive", "voltage", "V") if volts else Channel("force", "force", "N")
-    if data.base is not None:
-        reference = Channel("base", "acceleration", "m/s^2")
-    seen = np.asarray(data.measured)[order]
-    velocity = np.where(seen, np.asarray(data.velocity)[order], np.nan)
-    errors = np.asarray(relative_errors(data))[order]
-    std = np.sqrt(np.nansum(errors**2, axis=2) / 2) * np.abs(velocity)
-    stated = np.isfinite(errors).all(axis=2) & (std > 0)
-    known = bool(np.all(stated[seen]))
+    reference, load, velocity, std, known = over_reference(data, order)
     turn = 1j * omega[order, None] * load[:, None]
     receptance = velocity / turn + (omega[order, None] ** -2.0 if base == "absolute" else 0.0)
     given = ResponseData(
@@ -159,6 +153,26 @@ def rows_of_levels(
         load=load,
     )
     return LevelRows(given, level[order], np.nanmax(np.abs(velocity), axis=1))
+
+
+def over_reference(
+    data: SteadyStates, rows: np.ndarray
+) -> tuple[Channel, np.ndarray, np.ndarray, np.ndarray, bool]:
+    """Some rows: their reference and its load (N, V, m/s²), velocities (NaN where not measured),
+    1σ of real and of imaginary part, and whether all of these are stated.
+    """
+    load = np.asarray(data.force)[rows]
+    reference = Channel("force", "force", "N")
+    if not np.isfinite(load).any():
+        load, reference = np.asarray(data.drive)[rows], Channel("drive", "voltage", "V")
+    if data.base is not None:
+        reference = Channel("base", "acceleration", "m/s^2")
+    seen = np.asarray(data.measured)[rows]
+    velocity = np.where(seen, np.asarray(data.velocity)[rows], np.nan)
+    errors = np.asarray(relative_errors(data))[rows]
+    std = np.sqrt(np.nansum(errors**2, axis=2) / 2) * np.abs(velocity)
+    stated = np.isfinite(errors).all(axis=2) & (std > 0)
+    return reference, load, velocity, std, bool(np.all(stated[seen]))
 
 
 def pole_of_states(rows: LevelRows) -> float | None:
@@ -246,11 +260,7 @@ def _of_kind(
 
 
 def _start(
-    rows: LevelRows,
-    mode: tuple[float, float],
-    start: LinearModalFit,
-    power: int,
-    damping: bool,
+    rows: LevelRows, mode: tuple[float, float], start: LinearModalFit, power: int, damping: bool
 ) -> tuple[AmplitudeDependence, np.ndarray | None]:
     """The dependence with the amplitudes as measured; and ω, ζ, s, t by linear least squares.
 

@@ -18,6 +18,7 @@ from scipy.integrate import cumulative_simpson
 from scipy.interpolate import CubicHermiteSpline
 
 from snrmjax.identify.modal.separable_fit import (
+    SIGNIFICANT,
     ChannelRows,
     SeparableFit,
     TermColumns,
@@ -32,7 +33,6 @@ HARMONICS = ((0, 2), (2, 2), (3, 3), (3, 5), (4, 4), (5, 5), (5, 7), (1, 3))
 
 The last is the shape of a mode that moves with the amplitude, where there are several channels.
 """
-_SIGNIFICANT = 4.0  # standard errors of a mode's largest amplitude, without which it is none
 _MOST_DAMPED = 0.5
 _MOST_GROWTH = 3.0  # of a mode's logarithm over the record
 _MOST_MOVED = 0.5  # of ω_d, by every power of the amplitude
@@ -149,12 +149,10 @@ def _flow(time: np.ndarray, pole: complex, terms: np.ndarray, powers: tuple[int,
         at_samples(-fall, -np.ones_like(fall)),
         at_samples(turn @ over, omega / rate),
         at_samples(
-            np.concatenate([log_by, none]),
-            np.concatenate([-by_power / rate - twice * slope, none]),
+            np.concatenate([log_by, none]), np.concatenate([-by_power / rate - twice * slope, none])
         ),
         at_samples(
-            np.concatenate([phase_by, over]),
-            np.concatenate([turn_slope * twice, by_power / rate]),
+            np.concatenate([phase_by, over]), np.concatenate([turn_slope * twice, by_power / rate])
         ),
     )
 
@@ -283,7 +281,7 @@ def with_modes(
     while left and (now is None or now.form.n_modes < most):
         gains = _gains(values, time, left, now)
         best = int(np.argmax(gains))
-        if gains[best] < _SIGNIFICANT**2:
+        if gains[best] < SIGNIFICANT**2:
             break
         added = left.pop(best)
         now = fit_waves(values, time, *_added(now, added), None if now is None else now.scale)
@@ -293,7 +291,7 @@ def with_modes(
 def significant(found: DecayFit) -> Bool[np.ndarray, " mode"]:
     """Whether a mode's largest amplitude is four times its standard error."""
     sure = np.abs(found.amplitude) / found.amplitude_std
-    return sure.max(axis=0) >= _SIGNIFICANT
+    return sure.max(axis=0) >= SIGNIFICANT
 
 
 def without_mode(
@@ -318,9 +316,7 @@ def _added(now: DecayFit | None, pole: complex) -> tuple[np.ndarray, WaveForm]:
 
 
 def with_harmonics(
-    values: Float[np.ndarray, "channel sample"],
-    time: Float[np.ndarray, " sample"],
-    now: DecayFit,
+    values: Float[np.ndarray, "channel sample"], time: Float[np.ndarray, " sample"], now: DecayFit
 ) -> DecayFit:
     """The fit with those harmonics of the leading mode that stand out of what is left."""
     step = time[1] - time[0]
@@ -347,7 +343,7 @@ def with_harmonics(
             if harmonic not in chosen:
                 gains[k], _ = _gain(columns[:, first + np.flatnonzero(places == k)], space, left)
         best = int(np.argmax(gains)) if gains.size else 0
-        if not gains.size or gains[best] < _SIGNIFICANT**2:
+        if not gains.size or gains[best] < SIGNIFICANT**2:
             break
         chosen.append(whole.harmonics[best])
         _, new = _gain(columns[:, first + np.flatnonzero(places == best)], space, left)

@@ -21,7 +21,8 @@ from snrmjax.identify.modal.decay_fit import (
     without_mode,
 )
 from snrmjax.identify.modal.modal_fit import REAL, AbstractModalFit, phase_collinearity
-from snrmjax.identify.modal.pole_orders import PoleOrders, clusters, gathered
+from snrmjax.identify.modal.pole_orders import LIGHTLY_DAMPED, PoleOrders, clusters, gathered
+from snrmjax.identify.modal.response_data import POWERS
 from snrmjax.identify.modal.small_motion import (
     PartFit,
     envelope,
@@ -39,7 +40,6 @@ from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import quantity
 from snrmjax.numerics.units import HERTZ
 
-_MOTIONS = ("displacement", "velocity", "acceleration")
 _HIGHEST = 30  # half the model order
 _MOST_ROWS, _MOST_COLUMNS = 240, 3000  # of a Hankel matrix
 _MOST_SAMPLES = 40_000  # of a channel, in the fit
@@ -158,7 +158,7 @@ def _channels(recordings: Sequence[TimeRecording], names: Sequence[str] | None) 
                 f"{', '.join(first.channel_names)} at {first.sampling_rate:.6g} Hz."
             )
     if names is None:
-        motions = [channel for channel in first.channels if channel.quantity in _MOTIONS]
+        motions = [channel for channel in first.channels if channel.quantity in POWERS]
         if not motions:
             raise ValueError(
                 "a decay needs a channel that is a displacement, velocity or acceleration, but "
@@ -251,7 +251,7 @@ def _start(
 ) -> Complex[np.ndarray, " mode"]:
     if poles is not None:
         wanted = np.sort(np.asarray(poles, dtype=float))
-        damped = orders.pole[(orders.pole.real < 0) & (orders.damping_ratio < 0.25)]
+        damped = orders.pole[(orders.pole.real < 0) & (orders.damping_ratio < LIGHTLY_DAMPED)]
         if not wanted.size or np.any(wanted <= 0) or np.any(wanted >= top) or not damped.size:
             raise ValueError(
                 f"poles must be from 0 to {top / HERTZ:.6g} Hz, where the decay shows some, but "

@@ -8,9 +8,14 @@ from jaxtyping import Complex, Float
 
 from snrmjax.identify.modal.modal_bases import BasisSettings, unpacked
 from snrmjax.identify.modal.modal_fit import LinearModalFit
-from snrmjax.identify.modal.pole_orders import PoleOrders, clusters, poles_of_responses
+from snrmjax.identify.modal.pole_orders import (
+    LIGHTLY_DAMPED,
+    PoleOrders,
+    clusters,
+    poles_of_responses,
+)
 from snrmjax.identify.modal.response_data import ResponseData, response_data
-from snrmjax.identify.modal.separable_fit import SeparableFit
+from snrmjax.identify.modal.separable_fit import SIGNIFICANT, SeparableFit
 from snrmjax.identify.modal.weighted_fit import (
     MOST_DAMPED,
     FitSpread,
@@ -30,7 +35,6 @@ _LINES_PER_ORDER = 4
 _USUAL = 0.01  # damping ratio where no pole of the orders is near
 _NEAR = 0.02  # of a frequency: how far from one given by hand a pole may lie
 _NARROW = 1.1  # ratio of a band's ends, below which one residual term is enough
-_SIGNIFICANT = 4.0  # standard errors of a mode's largest residue, without which it is none
 _TWINS = 0.1  # of a decay rate: poles nearer than that are one mode, split by the fit
 _CURVED = 12.0  # a sensor, in units of the noise, that a further residual term must explain
 _EVEN = 1e-3  # of the line spacing
@@ -154,10 +158,7 @@ def _orders(data: ResponseData, highest: int | None) -> PoleOrders:
 
 
 def _start(
-    data: ResponseData,
-    orders: PoleOrders,
-    poles: Sequence[float] | None,
-    order: int | None,
+    data: ResponseData, orders: PoleOrders, poles: Sequence[float] | None, order: int | None
 ) -> Complex[np.ndarray, " mode"]:
     """Poles to begin with."""
     band = float(data.omega[0]), float(data.omega[-1])
@@ -171,7 +172,7 @@ def _start(
             )
         mine = orders.pole[orders.order == order]
         inside = (np.abs(mine) >= band[0]) & (np.abs(mine) <= band[1])
-        mine = mine[inside & (mine.real < 0) & (-mine.real < 0.25 * np.abs(mine))]
+        mine = mine[inside & (mine.real < 0) & (-mine.real < LIGHTLY_DAMPED * np.abs(mine))]
         if not mine.size:
             raise ValueError(f"model order {order} has no lightly damped pole in the band.")
         return mine[np.argsort(np.abs(mine))]
@@ -203,7 +204,7 @@ def _by_hand(
                 f"a pole must lie in the band, {band[0] / HERTZ:.6g} to {band[1] / HERTZ:.6g} "
                 f"Hz, but {omega / HERTZ:.6g} Hz was given."
             )
-        damped = orders.pole[(orders.pole.real < 0) & (orders.damping_ratio < 0.25)]
+        damped = orders.pole[(orders.pole.real < 0) & (orders.damping_ratio < LIGHTLY_DAMPED)]
         away = np.abs(np.abs(damped) - omega)
         near = damped[away < _NEAR * omega]
         ratio = _USUAL
@@ -272,7 +273,7 @@ def _least_certain(fit: SeparableFit, settings: BasisSettings, data: ResponseDat
     if odd.any() and not odd.all():
         return int(np.flatnonzero(odd)[np.argmin(certain[odd])])
     worst = int(np.argmin(certain))
-    return worst if certain[worst] < _SIGNIFICANT else None
+    return worst if certain[worst] < SIGNIFICANT else None
 
 
 def _check_found(fit: SeparableFit, settings: BasisSettings) -> None:

@@ -131,10 +131,7 @@ def _plain(
 
 
 def _dependent(
-    omega: np.ndarray,
-    mode: tuple[float, float],
-    added: np.ndarray,
-    of: AmplitudeDependence,
+    omega: np.ndarray, mode: tuple[float, float], added: np.ndarray, of: AmplitudeDependence
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """The column q/F of a mode that depends on its amplitude, and its derivatives.
 

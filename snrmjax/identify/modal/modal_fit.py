@@ -15,7 +15,8 @@ from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
 from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
 from snrmjax.numerics.units import HERTZ
 
-_WIDE = 1.96  # standard deviations of a 95 % band
+WIDE = 1.96
+"""Standard deviations of a 95 % band."""
 REAL = 0.9
 """Phase collinearity below which a mode is called complex."""
 
@@ -77,9 +78,9 @@ class AbstractModalFit(AbstractResult):
         """See `AbstractResult`; 95 % bands."""
         rows = zip(
             self.natural_frequency / HERTZ,
-            _WIDE * self.natural_frequency_std / HERTZ,
+            WIDE * self.natural_frequency_std / HERTZ,
             100 * self.damping_ratio,
-            _WIDE * 100 * self.damping_ratio_std,
+            WIDE * 100 * self.damping_ratio_std,
             strict=True,
         )
         return (
@@ -102,10 +103,6 @@ class AbstractModalFit(AbstractResult):
             "natural_frequency_std_hz": Variable(mode, hertz, "Hz", "its 1σ"),
             "damping_ratio_std": Variable(mode, self.damping_ratio_std, "1", "its 1σ"),
         }
-
-    def attributes(self) -> dict[str, str | float | int]:
-        """How the fit ended, and what it has to tell."""
-        return {**super().attributes(), "status": self.status.value}
 
 
 def phase_collinearity(

@@ -9,24 +9,24 @@ from jaxtyping import Float
 
 from snrmjax.identify.modal.amplitude_fit import (
     amplitude_dependent_modes,
+    over_reference,
     pole_of_states,
     rows_of_levels,
 )
 from snrmjax.identify.modal.free_decay import DecayModes, fit_free_decay
 from snrmjax.identify.modal.linear_fit import fit_linear_modes
 from snrmjax.identify.modal.modal_fit import LinearModalFit
-from snrmjax.identify.modal.response_data import coherence_std
+from snrmjax.identify.modal.response_data import POWERS, coherence_std
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses, frequency_responses
 from snrmjax.measure.recordings.time_recording import TimeRecording
-from snrmjax.measure.states import SteadyStates, relative_errors
+from snrmjax.measure.states import SteadyStates
 from snrmjax.model.moving_base import SensorMotion
 from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.units import HERTZ
 
 _CHANGE_STDS = 2.0  # standard errors of a difference between levels
-_POWERS = {"displacement": 0, "velocity": 1, "acceleration": 2}
 _OF_DECAYS = ("to_frequency", "poles", "highest_order")
 
 
@@ -116,7 +116,6 @@ class StateResponses(NamedTuple):
 
     responses: FrequencyResponses
     std: Float[np.ndarray, "response frequency"] | None  # of real and of imaginary part
-    level: int
     velocity: float  # m/s, the largest
 
 
@@ -139,20 +138,12 @@ def responses_of_states(data: SteadyStates, level: int) -> StateResponses:
         raise ValueError(f"there is no level {level}; there are {listed}.")
     if np.any(np.asarray(data.phase_unknown)[rows]):
         raise ValueError("modes need phases, but velocities of amplitude alone were measured.")
-    force = np.asarray(data.force)[rows]
-    volts = not np.isfinite(force).any()
-    if volts:
-        force = np.asarray(data.drive)[rows]
-    reference = Channel("drive", "voltage", "V") if volts else Channel("force", "force", "N")
-    if data.base is not None:
-        reference = Channel("base", "acceleration", "m/s^2")
-    seen = np.asarray(data.measured)[rows]
-    velocity = np.where(seen, np.asarray(data.velocity)[rows], np.nan)
-    mobility = velocity / force[:, None]
-    errors = np.asarray(relative_errors(data))[rows]
-    stated = np.isfinite(errors).all(axis=2)
-    parts = np.sqrt(np.nansum(errors**2, axis=2) / 2) * np.abs(mobility)
-    known = bool(np.all(stated[seen]) and np.all(parts[seen] > 0))
+    reference, load, velocity, std, known = over_reference(data, rows)
+    seen, mobility, parts = (
+        np.isfinite(velocity),
+        velocity / load[:, None],
+        std / np.abs(load[:, None]),
+    )
     omega, place = np.unique(np.asarray(data.frequency)[rows], return_inverse=True)
     shape = (velocity.shape[1], len(omega))
     total, count, variance = np.zeros(shape, dtype=complex), np.zeros(shape), np.zeros(shape)
@@ -170,13 +161,11 @@ def responses_of_states(data: SteadyStates, level: int) -> StateResponses:
         name=f"level {level}",
     )
     largest = float(np.nanmax(np.abs(velocity)))
-    return StateResponses(responses, std if known else None, level, largest)
+    return StateResponses(responses, std if known else None, largest)
 
 
 def amplitude_dependence(
-    lowest: LinearModalFit,
-    next_level: LinearModalFit,
-    velocities: tuple[float, float],
+    lowest: LinearModalFit, next_level: LinearModalFit, velocities: tuple[float, float]
 ) -> tuple[LinearModalFit, tuple[Fact, ...]]:
     """Whether modes differ between the two lowest levels by more than their errors.
 
@@ -222,10 +211,7 @@ class BaseResponses(NamedTuple):
 
 
 def relative_to_base(
-    responses: FrequencyResponses,
-    motion: SensorMotion,
-    *,
-    along: Mapping[str, float] | None = None,
+    responses: FrequencyResponses, motion: SensorMotion, *, along: Mapping[str, float] | None = None
 ) -> BaseResponses:
     """Acceleration relative to a moving base over the base's acceleration.
 
@@ -240,7 +226,7 @@ def relative_to_base(
     """
     if motion not in get_args(SensorMotion):
         raise ValueError(f"the motion must be 'absolute' or 'relative', but is {motion!r}.")
-    if len(responses.references) != 1 or responses.references[0].quantity not in _POWERS:
+    if len(responses.references) != 1 or responses.references[0].quantity not in POWERS:
         listed = ", ".join(str(channel) for channel in responses.references)
         raise ValueError(
             "motion over a base needs one reference that is a displacement, velocity or "
@@ -257,9 +243,9 @@ def relative_to_base(
     for channel, row, known in zip(
         responses.responses, responses.values[:, 0], responses.coherence[:, 0], strict=True
     ):
-        if channel.quantity not in _POWERS:
+        if channel.quantity not in POWERS:
             raise ValueError(f"{channel.name} must be a motion, but is {channel.quantity}.")
-        over = row[keep] * s ** (_POWERS[reference.quantity] - _POWERS[channel.quantity])
+        over = row[keep] * s ** (POWERS[reference.quantity] - POWERS[channel.quantity])
         spread.append(coherence_std(np.abs(over), known[keep], responses.averages))
         of_base = (along or {}).get(channel.name, 1.0) if motion == "absolute" else 0.0
         turned.append(over - of_base)

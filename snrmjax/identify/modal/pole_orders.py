@@ -18,7 +18,8 @@ _NEAR = 0.5  # of the decay rate: how far poles of one cluster lie apart
 _FLOOR = 2e-5  # of a frequency, below which poles are one
 _SHARE = 0.3  # of the orders from its first on, that a cluster has
 _FEWEST_ORDERS = 3
-_MOST_DAMPED = 0.25
+LIGHTLY_DAMPED = 0.25
+"""Damping ratio, below which a pole of an order may be a mode."""
 
 
 class PoleOrders(NamedTuple):
@@ -99,7 +100,7 @@ def clusters(
     Means of their clusters by frequency, rad/s; the real part says which decay.
     """
     ratio = np.abs(orders.damping_ratio)
-    use = orders.stable & (ratio < _MOST_DAMPED) & (ratio > 0)
+    use = orders.stable & (ratio < LIGHTLY_DAMPED) & (ratio > 0)
     use &= (orders.natural_frequency >= band[0]) & (orders.natural_frequency <= band[1])
     place, pole = orders.order[use], orders.pole[use]
     means: list[complex] = []

@@ -17,7 +17,9 @@ ErrorSource = Literal["stated", "coherence", "residuals"]
 """Where the weights come from: stated 1σ, coherence, or the residuals themselves."""
 
 _FEWEST_LINES = 6
-_POWERS = {"displacement": 0, "velocity": 1, "acceleration": 2}
+POWERS = {"displacement": 0, "velocity": 1, "acceleration": 2}
+"""Of iΩ, by which a motion exceeds its displacement."""
+
 _LEAST_MISSING_COHERENCE = 1e-7  # 1 − γ² that a file's rounding leaves
 _FEWEST_NUMBERS = 12  # of a channel, below which its errors are one size
 _SPREAD = 1e-4  # of the largest response: where the search for the errors' sizes begins
@@ -100,7 +102,7 @@ def response_data(
             f"a coherence must be from 0 to 1, but that of {responses.responses[k].name} at "
             f"{omega[keep][line] / HERTZ:.6g} Hz is {coherence[k, line]:.6g}."
         )
-    powers = tuple(_POWERS[channel.quantity] for channel in responses.responses)
+    powers = tuple(POWERS[channel.quantity] for channel in responses.responses)
     size = omega[keep] ** np.array(powers)[:, None]
     turned = raw / (1j * omega[keep]) ** np.array(powers)[:, None]
     spread, source, notes = _errors(responses, raw, coherence, std, keep)
@@ -170,7 +172,7 @@ def _reference(responses: FrequencyResponses, name: str | None) -> int:
 
 def _check_quantities(responses: FrequencyResponses) -> None:
     for channel in responses.responses:
-        if channel.quantity not in _POWERS:
+        if channel.quantity not in POWERS:
             named = channel.quantity if channel.quantity != "unknown" else "of no stated quantity"
             raise ValueError(
                 "a response must be a displacement, velocity or acceleration, but "

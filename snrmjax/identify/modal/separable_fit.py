@@ -18,6 +18,8 @@ from snrmjax.numerics.levenberg_marquardt import MinimisationStatus, StepRule, m
 _RULE = StepRule(steps=80, settled=1e-7, damping=1e-4, largest_damping=1e9)
 _LAGS = 30  # rows, over which neighbours' residuals are looked at
 _WHITE = 2.5  # standard errors of a correlation that white noise may well have
+SIGNIFICANT = 4.0
+"""Standard errors of a mode's largest amplitude or residue, without which it is none."""
 _TINY = 1e-150  # of a column's length, below which it is none
 
 
@@ -85,13 +87,12 @@ def fit_separable(
     bounds: tuple[Float[np.ndarray, " unknown"], Float[np.ndarray, " unknown"]],
     *,
     settled: float = _RULE.settled,
-    steps: int = _RULE.steps,
 ) -> SeparableFit:
     """The weighted least-squares fit and its covariance for errors of unit variance.
 
     Residuals of neighbouring rows may be correlated (windows, smooth misfits): their correlation,
     as long as it is significant, widens the covariance. The fit ends when a step lowers the sum of
-    squares by less than `settled`, or after `steps`.
+    squares by less than `settled`.
     """
 
     def linearised(points: np.ndarray) -> list["_Compressed"]:
@@ -99,7 +100,7 @@ def fit_separable(
 
     begin, rule = (
         np.clip(start, *bounds)[None],
-        dataclasses.replace(_RULE, settled=settled, steps=steps),
+        dataclasses.replace(_RULE, settled=settled),
     )
     end = minimise(linearised, begin, linearised(begin), bounds, rule)[0]
     return _with_covariance(basis_at(end.point), measured, end.point, end.status)

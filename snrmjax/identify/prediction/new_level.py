@@ -1,6 +1,5 @@
 """Errors of a level that was not measured: as levels differ, with their trend, on another day."""
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -58,9 +57,7 @@ ON_THE_CURVES = NewLevel(np.zeros(len(LEVEL_ERRORS)))
 """No level at all: the force in newtons moves the fitted mode itself."""
 
 
-@on_numbers(
-    "Differentiate `sj.identify.identify_points`, or the fitted curves themselves (`fit.unknowns`)."
-)
+@on_numbers("Differentiate `sj.identify.refit`.")
 def new_level(
     fit: JointFit,
     force: float,
@@ -78,8 +75,7 @@ def new_level(
     it, whose gain then errs too; `day` what another day's test differs by; `at` the sensor or point
     where the force acts, if not where it did in the test.
     Raises what `LinearModes.forced_at` raises.
-    Not differentiable: differentiate `snrmjax.identify.identify_points`, or the fitted curves
-    themselves (`fit.unknowns`).
+    Not differentiable: differentiate `snrmjax.identify.refit`.
     """
     std = np.array(fit.prior.new_level, dtype=float)
     forced = None if at is None else fit.modes.forced_at(at)
@@ -89,17 +85,10 @@ def new_level(
     for trend in trends:
         place = LEVEL_ERRORS.index(trend.kind)
         std[place] = np.hypot(std[place], trend.there)
+    if day is not None:
+        std = np.hypot(std, [day.gain, 0.0, 2 * day.frequency, day.damping])
     record = float(fit.recorded_force(np.array(force))) if as_recorded else None
-    return new._replace(std=further_std(std, day), drive=record, trends=trends)
-
-
-def further_std(
-    level: Sequence[float] | np.ndarray, day: DayToDay | None
-) -> Float[np.ndarray, " error"]:
-    """1σ of `LEVEL_ERRORS` of a level of this test, or of another day's."""
-    if day is None:
-        return np.array(level, dtype=float)
-    return np.hypot(level, [day.gain, 0.0, 2 * day.frequency, day.damping])
+    return new._replace(std=std, drive=record, trends=trends)
 
 
 def _trends(fit: JointFit, force: float) -> tuple[LevelTrend, ...]:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from snrmjax.identify.modal.modal_fit import LinearModalFit
+from snrmjax.identify.modal.modal_fit import WIDE, LinearModalFit
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.units import HERTZ
 
@@ -47,7 +47,7 @@ def squared_shapes(
             raise ValueError(
                 f"the added mass of {mass:.4g} kg must lower the frequency of mode {k + 1}, but "
                 f"it goes from {before[k] / HERTZ:.7g} to {after[k] / HERTZ:.7g} Hz, "
-                f"{shift[k] / HERTZ:.2g} ± {1.96 * spread[k] / HERTZ:.2g} Hz (95 %) lower: take "
+                f"{shift[k] / HERTZ:.2g} ± {WIDE * spread[k] / HERTZ:.2g} Hz (95 %) lower: take "
                 "a larger mass, or a place that moves more."
             )
     squared = _solved(before, after, mass)

@@ -9,8 +9,7 @@ from jaxtyping import Bool, Float
 from snrmjax.identify.modal.free_decay import DecayModes
 from snrmjax.identify.modal.modal_fit import LinearModalFit
 from snrmjax.identify.scaling.added_mass import squared_shapes
-from snrmjax.identify.scaling.rigid_body import rigid_body_mode
-from snrmjax.identify.scaling.scaled_modes import ScaledModes
+from snrmjax.identify.scaling.scaled_modes import ScaledModes, rigid_body_mode
 from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.facts import Fact
 
@@ -278,8 +277,7 @@ def scale_modes(
     of_participation = np.einsum("ki,kij,kj->k", slopes, covariance, slopes)
     relative = of_participation + scaled.relative_std**2 + (chain * (1 - scaled.exponent)) ** 2
     rigid = rigid_body_mode(
-        *(fit, gain, None if free is None else free.mass or 0.0),
-        *(_drive_point_of(fit), scaled.by),
+        *(fit, gain, None if free is None else free.mass or 0.0), *(_drive_point_of(fit), scaled.by)
     )
     volts = (Fact("participations_per_volt"),) if per == "V" else ()
     return ScaledModes(

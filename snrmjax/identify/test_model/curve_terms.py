@@ -115,9 +115,7 @@ class CurveTerms(NamedTuple):
             return 0.0, columns
         return float(value[0]), self.columns(np.zeros(1), coefficients)[0]
 
-    def log_variances(
-        self,
-    ) -> tuple[Float[np.ndarray, " term"], Float[np.ndarray, "term hyper"]]:
+    def log_variances(self) -> tuple[Float[np.ndarray, " term"], Float[np.ndarray, "term hyper"]]:
         """ln of the prior variances for smooth functions of size one (`CurveBasis`), and what they
         gain by ln of the size, and by how it changes.
         """

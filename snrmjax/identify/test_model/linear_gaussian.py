@@ -109,9 +109,7 @@ Objective = Callable[[Float[np.ndarray, " hyper"]], tuple[float, Float[np.ndarra
 
 
 def laplace_evidence(
-    objective: Objective,
-    point: Float[np.ndarray, " hyper"],
-    bounds: list[tuple[float, float]],
+    objective: Objective, point: Float[np.ndarray, " hyper"], bounds: list[tuple[float, float]]
 ) -> float:
     """ln p integrated about its maximum, by Laplace's approximation, over what is not held."""
     free = np.array([high > low for low, high in bounds])

@@ -49,9 +49,7 @@ from snrmjax.identify.test_model.hyper import (
     remainders,
     sizes_of_bends,
 )
-from snrmjax.identify.test_model.linear_gaussian import (
-    laplace_evidence,
-)
+from snrmjax.identify.test_model.linear_gaussian import laplace_evidence
 from snrmjax.identify.test_model.state_noise import StateNoise, noise_of_states
 from snrmjax.identify.test_model.states import RECORDED, TestStates
 from snrmjax.identify.test_model.walk import Reached, Rounds, likeliest_walk

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from snrmjax import __version__
-from snrmjax.identify.prediction.notes import where_in_words
+from snrmjax.identify.prediction.resonance_distribution import where_in_words
 from snrmjax.io import joint_results, results
 from snrmjax.io.files import write_summary
 from snrmjax.io.results import load_named

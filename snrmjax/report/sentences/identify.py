@@ -88,17 +88,6 @@ def _not_passive(what: str, free: Sequence[str]) -> str:
     )
 
 
-def _at_limit(errors: Sequence[str], limit: float, gain: bool) -> str:
-    said = (
-        f"the error in {enumerated(errors)} that the states of a level share is as large as a fit "
-        f"allows ({100 * limit:.0f} %, 1σ): no levels of one test differ by so much, and the "
-        "curves are not to be believed."
-    )
-    if not gain:
-        return said
-    return f"{said} The force gain cannot be determined beside it. {_MEASURE_GAIN}."
-
-
 def _wanders(std: float, noise_stated: bool) -> str:
     more = "which the stated noise does not explain"
     if not noise_stated:
@@ -376,7 +365,6 @@ SENTENCES: dict[str, Wording] = {
     "force_gain_undetermined": _undetermined_gain,
     "fit_not_passive": _not_passive,
     "instrument_undetermined": _undetermined,
-    "level_errors_at_limit": _at_limit,
     # Points.
     "states_without_point": _without_point,
     "second_solutions": lambda n_states: (

@@ -4,7 +4,7 @@ At a given frequency a force may have several motions or, beyond a fold, none; a
 force. So a measured motion is put into the harmonic balance, and the force is solved for.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -57,6 +57,35 @@ def batched_zero(point: Float[Array, " unknown"]) -> Float[Array, ""]:
     again until it is known what is.
     """
     return jnp.where(point[0] == 0, 0.0, 0.0)
+
+
+def newton_solved(
+    problem: Any, start: Float[Array, " unknown"]
+) -> tuple[Float[Array, " unknown"], Float[Array, "unknown unknown"]]:
+    """The solution of a problem's `equations` near `start`, and the Jacobian of its last step.
+
+    By Newton's method with the problem's `linearised`; NaN where it did not converge. The last step
+    is taken with what the equations depend on: it carries the derivatives.
+    """
+    fixed = jax.lax.stop_gradient(problem)
+
+    def step(state: tuple) -> tuple:
+        point, left, jacobian, count, _ = state
+        move = jnp.linalg.solve(jacobian, left)
+        left, jacobian = fixed.linearised(point - move)
+        return point - move, left, jacobian, count + 1, jnp.max(jnp.abs(move))
+
+    def going(state: tuple) -> Array:
+        *_, count, size = state
+        return (count < 2) | ((count < 20) & (size > _NEAR))  # false for NaN
+
+    # The first step goes nowhere: the equations are then compiled once.
+    nothing, eye = jnp.zeros_like(start), jnp.eye(start.shape[0])
+    first = (jax.lax.stop_gradient(start), nothing, eye, jnp.array(0), jnp.array(0.0))
+    point, _, jacobian, _, size = jax.lax.while_loop(going, step, first)
+    last = jnp.linalg.solve(jacobian, problem.equations(point))
+    left = jnp.max(jnp.abs(jax.lax.stop_gradient(last)))
+    return jnp.where((size <= _NEAR) & (left <= _NEAR), point - last, jnp.nan), jacobian
 
 
 class PrescribedMotion(eqx.Module):
@@ -113,29 +142,7 @@ class PrescribedMotion(eqx.Module):
 
         The last step is taken with what the equations depend on: it carries the derivatives.
         """
-        return self._solved(start)[0]
-
-    def _solved(self, start: Float[Array, " unknown"]) -> tuple[Array, Array]:
-        """The solution as `solved` finds it, and the Jacobian of its last step."""
-        fixed = jax.lax.stop_gradient(self)
-
-        def step(state: tuple) -> tuple:
-            point, left, jacobian, count, _ = state
-            move = jnp.linalg.solve(jacobian, left)
-            left, jacobian = fixed.linearised(point - move)
-            return point - move, left, jacobian, count + 1, jnp.max(jnp.abs(move))
-
-        def going(state: tuple) -> Array:
-            *_, count, size = state
-            return (count < 2) | ((count < 20) & (size > _NEAR))  # false for NaN
-
-        # The first step goes nowhere: the equations are then compiled once.
-        nothing, eye = jnp.zeros_like(start), jnp.eye(start.shape[0])
-        first = (jax.lax.stop_gradient(start), nothing, eye, jnp.array(0), jnp.array(0.0))
-        point, _, jacobian, _, size = jax.lax.while_loop(going, step, first)
-        last = jnp.linalg.solve(jacobian, self.equations(point))
-        left = jnp.max(jnp.abs(jax.lax.stop_gradient(last)))
-        return jnp.where((size <= _NEAR) & (left <= _NEAR), point - last, jnp.nan), jacobian
+        return newton_solved(self, start)[0]
 
     def solved_by_secants(
         self,
@@ -190,7 +197,7 @@ class PrescribedMotion(eqx.Module):
             before, share, step = state
             aim = jnp.minimum(share + step, 1.0)
             smaller = eqx.tree_at(lambda h: h.velocity, fixed, fixed.velocity * aim)
-            after = smaller._solved(before[0] * (aim / share))
+            after = newton_solved(smaller, before[0] * (aim / share))
             good = jnp.all(jnp.isfinite(after[0]))
             now, share = jax.tree.map(
                 lambda a, b: jnp.where(good, a, b), (after, aim), (before, share)

@@ -7,7 +7,6 @@ from truths.exact_states import GAIN, driven, modes
 import snrmjax as sj
 from snrmjax.identify.checks.instruments import notes_on_instruments
 from snrmjax.identify.inference.fitted_curves import as_backbone, values_to_the_largest
-from snrmjax.identify.test_model.states import LEVEL_ERRORS
 
 
 def on_the_gain(fit):
@@ -110,9 +109,8 @@ class _Fit:
     free = ("instrument_phase", "force_offset")
     notes = ()
 
-    def __init__(self, *std, level=(0.0, 0.0, 0.0, 0.0)):
+    def __init__(self, *std):
         self.covariance = np.diag(np.square(std))
-        self.noise = type("", (), {"level_std": np.array(level)})
 
     def names(self):
         return self.free
@@ -130,20 +128,10 @@ class _Fit:
     ],
 )
 def test_offset_and_phase_have_bounds_too(std, doubted):
-    notes = notes_on_instruments(_Fit(*std), LEVEL_ERRORS)
+    notes = notes_on_instruments(_Fit(*std))
     assert [note["name"] for note in notes] == doubted
 
 
 def test_an_offset_of_any_size_is_refused():
     with pytest.raises(ValueError, match="cannot determine `force_offset`"):
-        notes_on_instruments(_Fit(0.01, 1.5), LEVEL_ERRORS)
-
-
-def test_levels_at_the_limit_are_told_and_refused_beside_a_free_gain():
-    capped = _Fit(0.01, 0.01, level=(0.3, 0.0, 0.0, 0.0))
-    (note,) = notes_on_instruments(capped, LEVEL_ERRORS)
-    assert (note.kind, note["errors"]) == ("level_errors_at_limit", ("gain",))
-    capped.free = ("force_gain", "force_offset")
-    capped.motion = lambda: type("", (), {"velocity": np.exp(1j * np.array([-1.0, 1.0]))})
-    with pytest.raises(ValueError, match=r"cannot be determined beside it\. Measure the force"):
-        notes_on_instruments(capped, LEVEL_ERRORS)
+        notes_on_instruments(_Fit(0.01, 1.5))

@@ -8,8 +8,8 @@ from truths.sizes import repeats
 
 import snrmjax as sj
 from snrmjax.identify.checks.residual_autocorrelation import (
-    along_resonance,
     residual_autocorrelation,
+    states_of_levels,
 )
 from snrmjax.identify.joint.joint_fit import fit_jointly
 
@@ -23,7 +23,7 @@ def drawn(rng, rho, *shape):
 
 def test_states_of_a_level_are_taken_by_frequency():
     level, frequency = np.array([1, 0, 1, 0, 1]), np.array([3.0, 2.0, 1.0, 1.0, 2.0])
-    found = along_resonance(level, frequency)
+    found = states_of_levels(level, frequency)
     assert [some.tolist() for some in found] == [[3, 1], [2, 4, 0]]
 
 
@@ -43,7 +43,7 @@ def test_a_slow_misfit_under_noise_counts_by_all_that_it_correlates():
 
 
 def test_white_noise_is_seldom_correlated():
-    rng, levels = np.random.default_rng(3), along_resonance(np.arange(80) % 4, np.arange(80.0))
+    rng, levels = np.random.default_rng(3), states_of_levels(np.arange(80) % 4, np.arange(80.0))
     parts = residual_autocorrelation(rng.normal(size=(80, 2000)), levels)
     # 4 standard deviations: one in 30 000 of a long series.
     assert np.sum(parts > 0) <= 2

@@ -7,9 +7,8 @@ import pytest
 from truths.two_modes import OMEGA, steady_states, structure
 
 import snrmjax as sj
-from snrmjax.identify.coupled.coupled_modes import other_mode_moves
-from snrmjax.identify.coupled.coupling_terms import chosen_terms, coupling_terms
-from snrmjax.identify.coupled.single_mode_bias import single_mode_bias
+from snrmjax.identify.coupled.coupled_modes import chosen_terms, coupling_terms, other_mode_moves
+from snrmjax.identify.coupled.coupled_test import single_mode_bias
 from snrmjax.pipelines.identify import identify_test
 
 THREE = {(4, 0): 2e4, (3, 1): 1.5e4, (2, 2): 3e4}

@@ -12,7 +12,7 @@ from snrmjax.identify.curves.families import (
     PowerLaw,
     Spline,
 )
-from snrmjax.identify.curves.family_base import packed
+from snrmjax.identify.curves.family_base import Scattered, packed
 
 AMPLITUDE = np.linspace(0.05, 1.3, 40)
 
@@ -22,7 +22,7 @@ def member(kind, size=None, argument="displacement"):
     family = FAMILIES[kind]
     values = 3.0 + 0.7 * AMPLITUDE**2 + 0.1 * np.sin(2 * AMPLITUDE)
     size = family.orders[-1] if size is None else size
-    return family.starts(size, argument, AMPLITUDE, values, np.ones(40))[0]
+    return family.starts(size, Scattered(argument, AMPLITUDE, values, np.ones(40)))[0]
 
 
 @pytest.mark.parametrize(
@@ -81,7 +81,7 @@ def test_every_parameter_has_a_name_and_the_limit_at_zero_is_exact(kind):
 def test_the_spline_is_the_natural_cubic_spline_of_the_square():
     knots = np.array([0.0, 0.1, 0.35, 0.7, 1.0])
     values = np.array([2.0, 2.4, 1.7, 3.1, 2.2])
-    start = Spline.starts(5, "velocity", AMPLITUDE, np.ones(40), np.ones(40))[0]
+    start = Spline.starts(5, Scattered("velocity", AMPLITUDE, np.ones(40), np.ones(40)))[0]
     at, unit = 1.3 * np.sqrt(knots), jnp.asarray(1.3)
     curve = Spline.through(knots, values, unit, "velocity")
     np.testing.assert_allclose(curve(jnp.asarray(at)), values, rtol=1e-12)
@@ -104,12 +104,14 @@ def test_the_spline_is_the_natural_cubic_spline_of_the_square():
     ],
 )
 def test_a_start_reproduces_its_own_family(kind, size, truth):
-    curve = FAMILIES[kind].starts(size, "velocity", AMPLITUDE, truth(AMPLITUDE), np.ones(40))[0]
+    curve = FAMILIES[kind].starts(
+        size, Scattered("velocity", AMPLITUDE, truth(AMPLITUDE), np.ones(40))
+    )[0]
     np.testing.assert_allclose(curve(AMPLITUDE), truth(AMPLITUDE), rtol=1e-11)
 
 
 def test_one_of_the_power_laws_starts_at_each_exponent_tried():
-    starts = PowerLaw.starts(1, "velocity", AMPLITUDE, 1 + AMPLITUDE**2, np.ones(40))
+    starts = PowerLaw.starts(1, Scattered("velocity", AMPLITUDE, 1 + AMPLITUDE**2, np.ones(40)))
     np.testing.assert_allclose([float(s.exponent) for s in starts], PowerLaw.tried, rtol=1e-12)
     best = starts[PowerLaw.tried.index(2.0)]
     np.testing.assert_allclose(best(AMPLITUDE), 1 + AMPLITUDE**2, rtol=1e-12)
@@ -120,6 +122,8 @@ def test_scaling_amplitude_and_value_scales_the_curve():
         family = FAMILIES[kind]
         values = 3.0 + 0.7 * AMPLITUDE
         size = family.orders[0]
-        one = family.starts(size, "velocity", AMPLITUDE, values, np.ones(40))[0]
-        other = family.starts(size, "velocity", 1e-3 * AMPLITUDE, 50 * values, np.ones(40))[0]
+        one = family.starts(size, Scattered("velocity", AMPLITUDE, values, np.ones(40)))[0]
+        other = family.starts(
+            size, Scattered("velocity", 1e-3 * AMPLITUDE, 50 * values, np.ones(40))
+        )[0]
         np.testing.assert_allclose(other(1e-3 * AMPLITUDE), 50 * one(AMPLITUDE), rtol=1e-10)

@@ -12,9 +12,8 @@ from truths.joint_fits import noisy_fit
 
 import snrmjax as sj
 from snrmjax.identify.inference.fitted_curves import as_backbone
-from snrmjax.identify.inference.located_points import Place, solved_point
+from snrmjax.identify.inference.forced_motion import Place, solved_point
 from snrmjax.identify.inference.optimal_design import AdviceStatus
-from snrmjax.identify.joint.joint_fit import FitStatus
 from snrmjax.identify.prediction.new_level import ON_THE_CURVES
 from snrmjax.io.joint_results import write_next
 
@@ -271,5 +270,5 @@ def test_advice_is_a_table(fit):
     assert repr(advice).startswith("NextMeasurements: 3 states")
     assert advice.plot().axes
     assert advice.notes == ()
-    ended = dataclasses.replace(fit, status=FitStatus.STEP_LIMIT)
+    ended = dataclasses.replace(fit, converged=False)
     assert "has not converged" in repr(sj.next_measurements(ended, 1))

@@ -91,14 +91,3 @@ def test_the_bootstrap_knows_the_states_but_not_what_levels_share():
     # give the least spread, their errors' stated and estimated sizes the most.
     assert np.all(ratio > 0.8)
     assert np.all(np.std(drawn[:, :n], axis=0) < np.sqrt(np.diag(covariance))[:n])
-
-
-@pytest.mark.long
-def test_a_bootstrap_of_levels_sees_their_scatter():
-    # Gains of 5 % outweigh 1 % of nine states near resonance, where the states do not tell them.
-    scattered = sj.fit_jointly(noisy(1, gain=0.05, widest=4), modes(), level_gain_std=0.05, **TRUE)
-    found = bootstrap(scattered, 60, levels=True)
-    inside = bootstrap(scattered, 60)
-    good = np.all(np.isfinite(found), axis=1)
-    assert np.mean(good) > 0.5
-    assert np.std(found[good, 3]) > np.std(inside[:, 3])

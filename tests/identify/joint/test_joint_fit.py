@@ -1,6 +1,5 @@
 """The joint fit against states that obey known curves, and its words where data do not suffice."""
 
-import dataclasses
 import json
 
 import jax
@@ -29,8 +28,11 @@ from truths.sizes import repeats
 
 import snrmjax as sj
 from snrmjax.identify.curves.families import parse_family
-from snrmjax.identify.joint.force_balance import nearest_errors
-from snrmjax.identify.joint.free_unknowns import all_residuals, packed_unknowns, padded_data
+from snrmjax.identify.joint.free_unknowns import (
+    packed_unknowns,
+    padded_problem,
+    whitened_slopes,
+)
 from snrmjax.identify.joint.joint_fit import fit_jointly
 from snrmjax.identify.test_model import priors
 from snrmjax.io.joint_results import (
@@ -196,38 +198,18 @@ def test_without_the_levels_error_bands_are_too_narrow():
 
 
 def test_spare_states_and_levels_tell_nothing(fit):
-    def normal(data):
-        """The fit's own unknowns: JᵀJ, Jᵀr of the states, and the cost."""
-        program = packed_unknowns(fit.unknowns, fit.free, data.n_levels)
-        problem = dataclasses.replace(fit.problem, data=data)
-        n = len(data.level)
-
-        @jax.jit
-        def of(vector):
-            stopped = program.unravel(jax.lax.stop_gradient(vector))
-            errors, weighting = nearest_errors(stopped, problem)
-            at = problem.with_data(correction=errors)
-            return all_residuals(vector, program.unravel, at, weighting)
-
-        left, slopes = np.asarray(of(program.vector)), np.asarray(jax.jacfwd(of)(program.vector))
-        pull = slopes[: 2 * n].T @ left[: 2 * n]
-        return slopes.T @ slopes, pull, program.own, float(left @ left)
-
-    room = padded_data(fit.data)
-    assert len(room.level) > len(fit.data.level)
-    assert room.n_levels > fit.data.n_levels
-    gram, pull, own, square = normal(room)
-    known = normal(fit.data)
-    mine = known[2]
-    scale = np.sqrt(np.diag(known[0]))[mine]
-    np.testing.assert_allclose(
-        gram[np.ix_(own, own)] / np.outer(scale, scale),
-        known[0][np.ix_(mine, mine)] / np.outer(scale, scale),
-        atol=1e-12,
-    )
-    np.testing.assert_allclose(pull[own] / scale, known[1][mine] / scale, atol=1e-9)
-    assert square == pytest.approx(known[3], rel=1e-12)
-    assert len(own) == len(fit.names())
+    n, room = len(fit.data.level), padded_problem(fit.problem)
+    assert len(room.data.level) > n
+    assert room.data.n_levels > fit.data.n_levels
+    alone = packed_unknowns(fit.unknowns, fit.free, fit.data.n_levels)
+    found = whitened_slopes(fit.packed(), room, n)
+    for mine, own in zip(found, whitened_slopes(alone, fit.problem, n), strict=True):
+        np.testing.assert_allclose(mine, own, atol=1e-12 * np.abs(own).max())
+    assert found[0].shape == (n, 2, len(fit.names()))
+    # Whitened by the errors that states have.
+    scaled = found[1] * np.asarray(fit.data.std)[:, None, :]
+    unit = np.broadcast_to(np.eye(2), (n, 2, 2))
+    np.testing.assert_allclose(scaled @ np.swapaxes(scaled, 1, 2), unit, atol=1e-9)
 
 
 def test_order_of_rows_and_units_do_not_matter(fit):

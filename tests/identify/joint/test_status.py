@@ -9,9 +9,8 @@ from truths.exact_states import TRUE, modes, noisy
 from truths.joint_fits import noisy_fit
 
 import snrmjax as sj
-from snrmjax.identify.inference import located_points
+from snrmjax.identify.inference import forced_motion
 from snrmjax.identify.joint import posterior_view
-from snrmjax.identify.joint.joint_fit import FitStatus
 from snrmjax.io.joint_results import summarise_fit
 from snrmjax.numerics.facts import Fact
 
@@ -24,8 +23,8 @@ def test_a_fit_that_still_moved_says_so(monkeypatch):
 
     monkeypatch.setattr(posterior_view, "fit_test", moving)
     fit = sj.fit_jointly(noisy(1, gain=0.01), modes(), level_gain_std=0.01, **TRUE)
-    assert fit.status == FitStatus.NOT_SETTLED
     assert not fit.converged
+    assert fit.status.startswith("not converged")
     assert fit.notes[0].kind == "fit_not_converged"
     stated = {"reason": "not converged", "named": False, "noise_stated": True}
     for levels_stated, advice in ((False, "state the errors of the levels"), (True, "name a fami")):
@@ -42,12 +41,12 @@ def test_resonances_and_folds_that_are_not_located_are_counted_and_said(monkeypa
     before = sj.identify.fitted_response(fit, 2.2)[0]
     assert before.not_located == ()
     assert before.notes == ()
-    whole = located_points.solved_point
+    whole = forced_motion.solved_point
 
     def lost(one, force, place, *new):
         return None if place.kind == "fold" else whole(one, force, place)
 
-    monkeypatch.setattr(located_points, "solved_point", lost)
+    monkeypatch.setattr(forced_motion, "solved_point", lost)
     found = sj.identify.fitted_response(fit, 2.2)[0]
     assert found.folds == ()
     assert [one.kind for one in found.not_located] == ["fold"] * len(before.folds)

@@ -10,17 +10,15 @@ from truths.levels_with_errors import Level
 import snrmjax as sj
 from snrmjax.identify.pointwise.backbone import BackboneValues
 from snrmjax.identify.prediction.new_level import ON_THE_CURVES, NewLevel
-from snrmjax.identify.prediction.notes import (
-    notes_on_negative_damping,
-    notes_on_resonance,
-    where_in_words,
-)
 from snrmjax.identify.prediction.resonance_distribution import (
     QUANTILES,
     KnownCurves,
     amplitudes_to,
     covariance_root,
+    notes_on_negative_damping,
+    notes_on_resonance,
     resonance_distribution,
+    where_in_words,
 )
 
 OMEGA, DELTA = 500.0, 12.0
