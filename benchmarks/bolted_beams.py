@@ -70,8 +70,8 @@ def drawn(kind: str, seed: int) -> Test:
     places = random.uniform(0.35, 0.65) + random.uniform(-0.12, 0.12, SLIDERS)
     bending = np.sin(np.pi * places[:, None] * orders) * orders**2
     stiffness = random.lognormal(0, 0.4, SLIDERS)
-    share = random.uniform(0.04, 0.1)  # of the first mode's stiffness, in the sliders
-    stiffness *= share * own[0] ** 2 / (stiffness @ bending[:, 0] ** 2)
+    fraction = random.uniform(0.04, 0.1)  # of the first mode's stiffness, in the sliders
+    stiffness *= fraction * own[0] ** 2 / (stiffness @ bending[:, 0] ** 2)
     limit = SCALE * random.uniform(0.02, 1, SLIDERS) ** random.uniform(1, 2)
     mass = random.uniform(2, 6)
     drive = np.sqrt(2 / mass) * np.sin(np.pi * random.uniform(0.25, 0.4) * orders)
@@ -87,7 +87,7 @@ def drawn(kind: str, seed: int) -> Test:
         *(np.array([one]) for one in (moving, back, uneven)),
     )
     amplitudes = SCALE * np.geomspace(0.06, random.uniform(0.6, 1.1), random.integers(4, 6))
-    rate = 2 * (damping + share * 0.04 * amplitudes / SCALE) * own[0] + back / modal_mass
+    rate = 2 * (damping + fraction * 0.04 * amplitudes / SCALE) * own[0] + back / modal_mass
     drives = rate * own[0] * amplitudes / drive[0]
     cycles = int(random.integers(40, 81)) if kind == "unsettled" else SETTLED
     upward = bool(random.integers(2))

@@ -144,9 +144,9 @@ def case(seed, number):
     count = rng.integers(1, 3) if close else rng.integers(0, 3)
     energy = np.exp(rng.uniform(np.log(0.02), np.log(0.4)))
     low, high = truth[1].min(), truth[1].max()
-    shares = energy * rng.dirichlet(np.ones(count)) if count else []
+    fractions = energy * rng.dirichlet(np.ones(count)) if count else []
     total = motion.copy()
-    for k, share in enumerate(shares):
+    for k, fraction in enumerate(fractions):
         while True:
             times = np.exp(rng.uniform(np.log(0.3), np.log(6.0)))
             if close and k == 0:
@@ -156,10 +156,10 @@ def case(seed, number):
                 break
             if not low * (1 - _AWAY) < times * rest < high * (1 + _AWAY):
                 break
-        size = truth[0, -1] * np.sqrt(share / (1 - energy)) / (times * rest)
+        size = truth[0, -1] * np.sqrt(fraction / (1 - energy)) / (times * rest)
         other, named = oscillator(rng, times * rest, size, plain=rng.random() < 0.5)
         total += other.decay(time)
-        words += f" + {times:.2f} ({100 * share:.2g} %, {named})"
+        words += f" + {times:.2f} ({100 * fraction:.2g} %, {named})"
     largest = np.abs(motion).max()
     noise = np.exp(rng.uniform(np.log(0.001), np.log(0.03)))
     hum = rng.uniform(0, 0.02)
@@ -213,9 +213,10 @@ def main() -> None:
             found = scored(result, one.truth)
             rows[name].append(found)
             if given.show:
-                share = [np.mean(found[k] < 1.96) for k in (0, 2)]
+                fraction = [np.mean(found[k] < 1.96) for k in (0, 2)]
                 print(
-                    f"    {name}: {found.shape[1]} points, inside {share[0]:.2f} {share[1]:.2f}, "
+                    f"    {name}: {found.shape[1]} points, "
+                    f"inside {fraction[0]:.2f} {fraction[1]:.2f}, "
                     f"errors {np.median(found[1]):.1e} {np.median(found[3]):.1e}, worst score "
                     f"{found[0].max():.1f} {found[2].max():.1f}"
                 )

@@ -133,8 +133,8 @@ def _away(points: np.ndarray, line: np.ndarray) -> float:
     length = np.maximum(np.sum(way**2, axis=1), 1e-300)
     worst = 0.0
     for point in points:
-        share = np.clip(np.sum((point - begin) * way, axis=1) / length, 0, 1)
-        apart = point - begin - share[:, None] * way
+        fraction = np.clip(np.sum((point - begin) * way, axis=1) / length, 0, 1)
+        apart = point - begin - fraction[:, None] * way
         worst = max(worst, float(np.sqrt(np.min(np.sum(apart**2, axis=1)))))
     return worst
 

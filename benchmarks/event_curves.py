@@ -116,8 +116,8 @@ def largest_difference(model, kind, curve, responses, ends):
 
 def main(rounds: int) -> None:
     """One line a case."""
-    for kind, (build, force, share, ends, order) in CASES.items():
-        model, to = build(), (share[0] * force, share[1] * force)
+    for kind, (build, force, fraction, ends, order) in CASES.items():
+        model, to = build(), (fraction[0] * force, fraction[1] * force)
         stability = kind in ("neimark_sacker", "period_doubling")
         settings = {"harmonic_order": order, "stability": stability}
         (first, *_) = sj.forced_response(model, [force], *ends, **settings)

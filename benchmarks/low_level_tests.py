@@ -83,8 +83,8 @@ def made(seed):
     level, omega, force, velocity = (np.array(column) for column in zip(*rows, strict=True))
     # Of the lowest level's peak, and of each value.
     floor = 10 ** rng.uniform(-3, -2) * np.abs(velocity[level == 1]).max()
-    share = 10 ** rng.uniform(-3, -2.3)
-    std = np.hypot(floor, share * np.abs(velocity)) / np.sqrt(2)
+    fraction = 10 ** rng.uniform(-3, -2.3)
+    std = np.hypot(floor, fraction * np.abs(velocity)) / np.sqrt(2)
     noise = std * (rng.normal(size=std.shape) + 1j * rng.normal(size=std.shape))
     stated = {}
     if seed % 2:
@@ -136,13 +136,13 @@ def main():
             linear_frequency_error_stds=alone[0],
             linear_damping_error_stds=alone[1],
         )
-    share = 100 * np.mean(inside, axis=0)
+    fraction = 100 * np.mean(inside, axis=0)
     own = 100 * np.mean(linear, axis=0)
     tell(
         case="all",
         tests=len(inside),
         **{"coverage_%": 100 * np.mean(inside)},
-        **{"frequency_coverage_%": share[0], "damping_coverage_%": share[1]},
+        **{"frequency_coverage_%": fraction[0], "damping_coverage_%": fraction[1]},
         **{"linear_frequency_coverage_%": own[0], "linear_damping_coverage_%": own[1]},
         **{"dependence_said_rightly_%": 100 * np.mean(said)},
         seconds_a_test=np.median(seconds),

@@ -231,8 +231,8 @@ def harmonic_force_surface() -> None:
     distance, unstable = [], 0
     for at, one in zip(omega, cut, strict=True):
         k = np.flatnonzero((exact.frequency[:-1] - at) * (exact.frequency[1:] - at) <= 0)
-        share = (at - exact.frequency[k]) / (exact.frequency[k + 1] - exact.frequency[k])
-        each = height[k] + share * (height[k + 1] - height[k])
+        fraction = (at - exact.frequency[k]) / (exact.frequency[k + 1] - exact.frequency[k])
+        each = height[k] + fraction * (height[k + 1] - height[k])
         nearest = int(np.argmin(np.abs(each - one)))
         distance.append(abs(each[nearest] - one) / height.max())
         unstable += bool(exact.is_unstable[k[nearest]])
@@ -265,8 +265,8 @@ def harmonic_force_surface() -> None:
 def _distance(point: np.ndarray, line: np.ndarray) -> float:
     """From a point to a line of straight pieces."""
     start, along = line[:-1], np.diff(line, axis=0)
-    share = np.sum((point - start) * along, axis=1) / np.sum(along**2, axis=1)
-    nearest = start + np.clip(share, 0, 1)[:, None] * along
+    fraction = np.sum((point - start) * along, axis=1) / np.sum(along**2, axis=1)
+    nearest = start + np.clip(fraction, 0, 1)[:, None] * along
     return float(np.hypot(*(nearest - point).T).min())
 
 

@@ -101,12 +101,12 @@ def _where_it_bends(rows):
     """Forces in the middle of the intervals in which the laws differ most from straight lines."""
     square = rows[0] ** 2
     middle = (square[1:] + square[:-1]) / 2
-    bends = np.zeros(len(middle))
+    roughness = np.zeros(len(middle))
     for values, weight in ((rows[1], _FREQUENCY), (rows[2], 1.0)):
         straight = (values[1:] + values[:-1]) / 2
         curved = PchipInterpolator(square, values)(middle)
-        bends = np.maximum(bends, weight * np.abs(curved / straight - 1))
-    chosen = np.argsort(-bends)[:_CURVES]
+        roughness = np.maximum(roughness, weight * np.abs(curved / straight - 1))
+    chosen = np.argsort(-roughness)[:_CURVES]
     return (rows[3, chosen] + rows[3, chosen + 1]) / 2
 
 

@@ -126,11 +126,11 @@ def even(way: str) -> list[Row]:
             (40 + k, f, *at_phase(f, p))
             for k, (f, p) in enumerate(zip(forces, phases, strict=True))
         ]
-    shares = (
+    fractions = (
         np.tile([0.25, 0.75], (5, 1)) if way == "grid" else (np.array(turns)[:, None] + 0.5) / 10
     )
     rows: list[Row] = []
-    for k, (force, mine) in enumerate(zip(forces, shares, strict=True)):
+    for k, (force, mine) in enumerate(zip(forces, fractions, strict=True)):
         low, high = (at_phase(force, np.radians(end))[0] for end in (70, -70))
         tip, velocity = at_phase(force, 0.0)
         for omega in low + mine * (high - low):

@@ -112,8 +112,8 @@ def backbone_errors(points: Any, mode: Any, left_out: tuple[float, float]) -> di
         if kept(natural):
             away = amplitude - size
             at = np.flatnonzero(away[1:] * away[:-1] <= 0)
-            share = away[at] / (away[at] - away[at + 1])
-            there = frequency[at] + share * (frequency[at + 1] - frequency[at])
+            fraction = away[at] / (away[at] - away[at + 1])
+            there = frequency[at] + fraction * (frequency[at + 1] - frequency[at])
             error.append(np.min(np.abs(natural / there - 1)))
     return {"median": np.median(error), "largest": np.max(error), "points": len(error)}
 

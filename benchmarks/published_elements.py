@@ -148,9 +148,9 @@ def _cubic_at_a_tip() -> Rows:
     for frequency, energy in zip((24, 25, 27, 30, 35, 40, 45), published, strict=True):
         beyond = mode.frequency - 2 * np.pi * frequency
         first = int(np.argmax(beyond > 0))  # tongues pass the frequency again
-        share = beyond[first - 1] / (beyond[first - 1] - beyond[first])
+        fraction = beyond[first - 1] / (beyond[first - 1] - beyond[first])
         steps = np.log(mode.energy[first - 1 : first + 1])
-        yield f"energy at {frequency} Hz", float(np.exp(steps @ [1 - share, share])), energy
+        yield f"energy at {frequency} Hz", float(np.exp(steps @ [1 - fraction, fraction])), energy
 
 
 def _timoshenko_beam() -> Rows:
@@ -339,8 +339,8 @@ def _isola_of_negative_damping() -> Rows:
             loop, tip = apart[0], _height(model, apart[0], "w25")
             away = loop.frequency - 7.00426
             passed = np.flatnonzero(away[1:] * away[:-1] < 0)
-            share = away[passed] / (away[passed] - away[passed + 1])
-            crossed = np.sort(tip[passed] + share * (tip[passed + 1] - tip[passed]))
+            fraction = away[passed] / (away[passed] - away[passed + 1])
+            crossed = np.sort(tip[passed] + fraction * (tip[passed + 1] - tip[passed]))
             for found, published in zip(crossed, (0.03926, 0.04355), strict=True):
                 yield "tip of the isola at 7.00426", float(found), published
     joined = sj.forced_response(model, 1.9e-4, 6.95, 7.05, harmonic_order=5, stability=False)

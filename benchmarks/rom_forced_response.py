@@ -143,8 +143,10 @@ def response_of(full: FullModel, motions: list) -> Response:
     along, across = (CubicSpline(-phase, values) for values in (frequency, speed))
     tops = across.derivative().roots(extrapolate=False)
     top = tops[np.argmax(across(tops))]
-    bends = along(along.derivative().roots(extrapolate=False))
-    features = Features(float(along(top)), float(across(top)), furthest(bends, full.frequency[0]))
+    roughness = along(along.derivative().roots(extrapolate=False))
+    features = Features(
+        float(along(top)), float(across(top)), furthest(roughness, full.frequency[0])
+    )
     return Response(phase, frequency, speed, features)
 
 

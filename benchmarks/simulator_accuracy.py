@@ -72,7 +72,7 @@ def closure(n_points: int) -> None:
                     median=float(np.median(misses)),
                     largest=float(misses[worst]),
                     largest_at_hz=float(curve.frequency[rows[worst]] / HERTZ),
-                    share_below_bar=float(np.mean(np.array(misses) < BAR)),
+                    fraction_below_bar=float(np.mean(np.array(misses) < BAR)),
                 )
 
 

@@ -6,7 +6,7 @@ Modes: a generated structure whose first mode stiffens and drives every other on
 (q₁³q_k), with three harmonics. Harmonics: the flat beam (four modes, 55 monomials). Members: a
 batch of curved beams with stability, curves not kept; then a thousand flat beams, each with
 frequencies, damping and force of its own, as in a study. Seconds are the median of warm runs;
-`lu_share` is what as many LU factorisations (LAPACK) take of the time without stability,
+`lu_fraction` is what as many LU factorisations (LAPACK) take of the time without stability,
 `stability` the time with it over the time without. Memory is the largest of the process during a
 warm run, all programs of earlier lines included, and how much that is above what it held before.
 """
@@ -91,7 +91,7 @@ def one_curve(measurement: str, model: sj.model.Structure, force: float, harmoni
         compile_seconds=first - alone,
         milliseconds_a_point=1e3 * alone / points,
         stability=whole / alone,
-        lu_share=lu["some"] * solves / SOME / alone,
+        lu_fraction=lu["some"] * solves / SOME / alone,
         **memory,
     )
 

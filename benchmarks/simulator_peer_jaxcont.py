@@ -40,7 +40,7 @@ def ways(problem: Problem) -> dict[str, Callable]:
     settings = [jnp.asarray(value) for value in (begin, end, *limits, problem.tolerance)]
     start, iterations = jnp.asarray(linear_start(problem).reshape(-1)), jnp.asarray(ITERATIONS)
 
-    def at_share(u: jax.Array, frequency: jax.Array, share: jax.Array | float) -> jax.Array:
+    def at_fraction(u: jax.Array, frequency: jax.Array, fraction: jax.Array | float) -> jax.Array:
         x = u.reshape(size, n)
         q = synthesis @ x
         padded = jnp.concatenate([q, jnp.ones((q.shape[0], 1))], axis=1)
@@ -48,10 +48,10 @@ def ways(problem: Problem) -> dict[str, Callable]:
         for column in range(1, index.shape[1]):
             product = product * padded[:, index[:, column]]
         linear = (squared - h2 * frequency**2) * x + frequency * damping * (derivative @ x)
-        return (linear + analysis @ (product @ coefficient) - share * load).reshape(-1)
+        return (linear + analysis @ (product @ coefficient) - fraction * load).reshape(-1)
 
     def residual(u: jax.Array, frequency: jax.Array) -> jax.Array:
-        return at_share(u, frequency, 1.0)
+        return at_fraction(u, frequency, 1.0)
 
     def curve() -> Curve:
         found = pseudo_arclength_scan(residual, start, *settings, MAX_POINTS, iterations)
@@ -61,22 +61,22 @@ def ways(problem: Problem) -> dict[str, Callable]:
         states = np.asarray(found.states)[:points].reshape(points, size, n)
         return Curve(states, np.asarray(found.params)[:points], n_solves)
 
-    def one(share: jax.Array) -> tuple[jax.Array, ...]:
+    def one(fraction: jax.Array) -> tuple[jax.Array, ...]:
         found = pseudo_arclength_scan(
-            lambda u, frequency: at_share(u, frequency, share),
-            share * start,
+            lambda u, frequency: at_fraction(u, frequency, fraction),
+            fraction * start,
             *settings,
             MAX_POINTS,
             iterations,
         )
         return found.states, found.params, found.n_valid
 
-    shares = jnp.geomspace(0.1, 1.0, MEMBERS)
+    fractions = jnp.geomspace(0.1, 1.0, MEMBERS)
     together, alone = jax.jit(jax.vmap(one)), jax.jit(one)
     return {
         "curve": curve,
-        "vmap": lambda: jax.block_until_ready(together(shares)),
-        "one_by_one": lambda: [jax.block_until_ready(alone(share)) for share in shares],
+        "vmap": lambda: jax.block_until_ready(together(fractions)),
+        "one_by_one": lambda: [jax.block_until_ready(alone(fraction)) for fraction in fractions],
     }
 
 

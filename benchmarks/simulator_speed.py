@@ -120,8 +120,8 @@ def distance(case: Case, curve: tuple, target: tuple, unit: np.ndarray) -> float
     length = np.maximum(np.sum(along**2, axis=1), 1e-300)
     worst = 0.0
     for point in points:
-        share = np.clip(np.sum((point - begin) * along, axis=1) / length, 0, 1)
-        gaps = np.linalg.norm(begin + share[:, None] * along - point, axis=1)
+        fraction = np.clip(np.sum((point - begin) * along, axis=1) / length, 0, 1)
+        gaps = np.linalg.norm(begin + fraction[:, None] * along - point, axis=1)
         worst = max(worst, float(np.min(gaps)))
     return worst
 

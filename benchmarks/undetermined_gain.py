@@ -71,9 +71,9 @@ class Plant(NamedTuple):
 
     def force_at(self, displacement: float) -> float:
         """Force that reaches a displacement at resonance."""
-        share = displacement / self.reach
-        own = self.frequency(share)
-        return 2 * self.damping_ratio(share) * own**2 * displacement / self.constant
+        fraction = displacement / self.reach
+        own = self.frequency(fraction)
+        return 2 * self.damping_ratio(fraction) * own**2 * displacement / self.constant
 
 
 def hertz(value: float, change: float, power: float = 2.0) -> Callable[[float], float]:
@@ -135,8 +135,8 @@ def measured(plant: Plant, plan: Plan, seed: int) -> sj.measure.SteadyStates:
     """A test with its noise, the force in volts."""
     rng = np.random.default_rng(seed)
     rows = []
-    for level, share in enumerate(plan.levels):
-        force = plant.force_at(share * plant.reach)
+    for level, fraction in enumerate(plan.levels):
+        force = plant.force_at(fraction * plant.reach)
         for degrees in plan.degrees:
             omega, velocity = plant.state(force, np.radians(degrees))
             velocity += plant.other_modes(omega, force)
@@ -203,9 +203,9 @@ def identified(plant: Plant, plan: Plan, data: sj.measure.SteadyStates) -> Outco
     place = fit.names().index("force_gain")
     gain = float(np.exp(fit.unknowns.log_force_gain)) / plant.gain
     std = float(np.sqrt(fit.covariance[place, place]))
-    share = np.linspace(min(plan.levels), 1.0, 9)
-    at = sj.identify.fitted_values(fit, displacement=share * plant.reach)
-    true = np.array([plant.frequency(one) for one in share])
+    fraction = np.linspace(min(plan.levels), 1.0, 9)
+    at = sj.identify.fitted_values(fit, displacement=fraction * plant.reach)
+    true = np.array([plant.frequency(one) for one in fraction])
     found, band = np.asarray(at.natural_frequency), np.asarray(at.natural_frequency_std)
     missed = float(np.max(np.abs(found - true) / np.maximum(band, 7e-4 * true)))
     speed = np.asarray(values_to_the_largest(fit, 41).velocity)

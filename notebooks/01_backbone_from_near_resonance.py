@@ -242,8 +242,11 @@ fundamental = 2 * np.pi / (np.sqrt(0.5) * K) * np.sqrt(nome) / (1 + nome) * np.p
 peak = np.sqrt(0.5)  # of sn·dn
 mean_square = 1 / 3  # of sn²dn²: the virial theorem
 linear = 2 * 0.05 * 64.78 * HERTZ
-energy_share = 2 * mean_square / fundamental**2
-limit_fundamental, limit_peak = linear * energy_share, linear * energy_share * fundamental / peak
+energy_fraction = 2 * mean_square / fundamental**2
+limit_fundamental, limit_peak = (
+    linear * energy_fraction,
+    linear * energy_fraction * fundamental / peak,
+)
 print(
     f"linear {linear:.2f} 1/s; far into stiffening {limit_fundamental:.2f} 1/s with the "
     f"fundamental, {limit_peak:.2f} 1/s with the peak"

@@ -140,7 +140,7 @@ held = [
 print(
     f"tongue: harmonic {tongue.harmonic} meets mode {tongue.mode + 1} from "
     f"{tongue.from_frequency / HERTZ:.2f} to {tongue.to_frequency / HERTZ:.2f} Hz, "
-    f"up to {100 * tongue.energy_share:.2f} % of the energy"
+    f"up to {100 * tongue.energy_fraction:.2f} % of the energy"
 )
 print(
     f"damped mode: ratio {100 * damped.damping_ratio[0]:.2f} % at "

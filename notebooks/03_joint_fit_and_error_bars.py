@@ -169,7 +169,7 @@ for exact in sj.forced_response(flat, [2.669e-3, 1.334e-2], *ends):
 # Random noise is not the only error. Let the gain of every level be known to 1 % only:
 
 # %%
-share = {}
+fraction = {}
 for name, fit in fits.items():
     with_gain = sj.fit_jointly(
         tests[name].steady_states,
@@ -178,10 +178,10 @@ for name, fit in fits.items():
         damping=fit.unknowns.modal_damping.label,
         level_gain_std=0.01,
     )
-    share[name] = at_velocities(with_gain, velocity)[1].mean(axis=1) / width[name]
+    fraction[name] = at_velocities(with_gain, velocity)[1].mean(axis=1) / width[name]
     print(
-        f"{name}: with 1 % of gain a level the bands are {share[name][0]:.2f} (frequency) and "
-        f"{share[name][1]:.2f} (damping) times as wide"
+        f"{name}: with 1 % of gain a level the bands are {fraction[name][0]:.2f} (frequency) and "
+        f"{fraction[name][1]:.2f} (damping) times as wide"
     )
     if fit is few:
         with_levels = with_gain
@@ -197,10 +197,13 @@ for name, fit in fits.items():
 
 # %%
 # Bars: the share of every kind of measured number in the variance of both curves.
-shares = sj.identify.contributions(with_levels)
-for row in shares.by_kind():
-    print(f"{row.source:26s} {100 * row.frequency_share:5.1f} % {100 * row.damping_share:5.1f} %")
-shares.plot()
+fractions = sj.identify.contributions(with_levels)
+for row in fractions.by_kind():
+    print(
+        f"{row.source:26s} {100 * row.frequency_fraction:5.1f} % "
+        f"{100 * row.damping_fraction:5.1f} %"
+    )
+fractions.plot()
 
 # %% [markdown]
 # Are these widths right? Refits to states drawn with replacement within their levels (bootstrap)
@@ -237,9 +240,9 @@ headline |= {
     "bands of 32 states near resonance less than a fifth as wide as of 85 along one response": all(
         width["32 near resonance"] < width["85 along one response"] / 5
     ),
-    "the truth inside the bands of both": all(min(share) > 0.9 for share in inside.values()),
-    "shares sum to the whole variance": abs(sum(s.frequency_share for s in shares) - 1) < 1e-9
-    and abs(sum(s.damping_share for s in shares) - 1) < 1e-9,
+    "the truth inside the bands of both": all(min(fraction) > 0.9 for fraction in inside.values()),
+    "shares sum to the whole variance": abs(sum(s.frequency_fraction for s in fractions) - 1) < 1e-9
+    and abs(sum(s.damping_fraction for s in fractions) - 1) < 1e-9,
 }
 
 # %% tags=["hide-input"]

@@ -77,7 +77,7 @@ PRINTED = {  # drive in V and force in N of section 4.1, forces of the validatio
         [1.066e-3, 2.287e-3, 4.169e-3],
     ),
 }
-covariances, intercepts, shares = {}, {}, {}
+covariances, intercepts, fractions = {}, {}, {}
 figure, grid = drawing.panels(drawing.PAGE, 3.4, 1, 2)
 for axes, (name, (volts, tenths, used)) in zip(grid[0], PRINTED.items(), strict=True):
     newtons = 1e-4 * np.array(tenths)
@@ -86,10 +86,10 @@ for axes, (name, (volts, tenths, used)) in zip(grid[0], PRINTED.items(), strict=
     twice = student.ppf(0.975, len(volts) - 2)  # few points: not 2
     half_width = twice * float(np.sqrt(covariance[1, 1]))
     covariances[name], intercepts[name] = covariance, (missing, half_width)
-    shares[name] = missing / used[0]
+    fractions[name] = missing / used[0]
     print(
         f"{name}: intercept −{1e6 * missing:.1f} ± {1e6 * half_width:.1f} µN (95 %), "
-        f"{100 * shares[name]:.1f} % of the lowest force, {1e6 * used[0]:.0f} µN; "
+        f"{100 * fractions[name]:.1f} % of the lowest force, {1e6 * used[0]:.0f} µN; "
         f"calibrated from {1e6 * newtons[0]:.0f} to {1e6 * newtons[-1]:.0f} µN"
     )
     force = np.geomspace(newtons[0], used[-1], 200)
@@ -118,7 +118,7 @@ figure
 
 # %% tags=["hide-input"]
 headline["printed intercepts are 6 % and 15 % of the lowest forces"] = (
-    abs(shares["curved"] - 0.063) < 2e-3 and abs(shares["flat"] - 0.146) < 2e-3
+    abs(fractions["curved"] - 0.063) < 2e-3 and abs(fractions["flat"] - 0.146) < 2e-3
 )
 headline["both beyond 95 % of their own error"] = all(c > half for c, half in intercepts.values())
 
@@ -211,27 +211,30 @@ def recorded(states, nearest, farthest, *, missing=0.0, seed=1, per_level=6, sid
 # points follow the lines of 1/F.
 linear = float(2 * first.damping_ratio[0] * first.natural_frequency[0])
 series, rise = [], {}
-for share in (0.0, 0.06, 0.10, 0.15, -0.15):
-    data = recorded(motions["beam"], 18, 34, missing=share * forces[0])
+for fraction in (0.0, 0.06, 0.10, 0.15, -0.15):
+    data = recorded(motions["beam"], 18, 34, missing=fraction * forces[0])
     points = sj.identify.identify_points(data, first)
     lowest = np.asarray(data.level) == 1
-    rise[share] = float(np.mean(np.asarray(points.modal_damping)[lowest])) / linear
-    label = f"{100 * share:.0f} % left out" if share > 0 else "force as it is"
-    series.append(plot.DampingSeries(label if share >= 0 else "15 % subtracted", points=points))
-    print(f"{label if share >= 0 else '15 % subtracted'}: lowest level {rise[share]:.3f} of linear")
+    rise[fraction] = float(np.mean(np.asarray(points.modal_damping)[lowest])) / linear
+    label = f"{100 * fraction:.0f} % left out" if fraction > 0 else "force as it is"
+    series.append(plot.DampingSeries(label if fraction >= 0 else "15 % subtracted", points=points))
+    print(
+        f"{label if fraction >= 0 else '15 % subtracted'}: "
+        f"lowest level {rise[fraction]:.3f} of linear"
+    )
 figure = plot.modal_damping_figure(series, linear=linear)
 (axes,) = figure.axes
 modal = float(first.mode_shape[0, 0] * first.participation[0])
 speed = np.linspace(0.12, 0.8, 100)
-for number, share in enumerate(rise):
+for number, fraction in enumerate(rise):
     # 2ζω = A F cos φ / v, here of the error of F, in the middle of the phases
-    line = linear + share * forces[0] * modal * np.cos(np.radians(26)) / speed
+    line = linear + fraction * forces[0] * modal * np.cos(np.radians(26)) / speed
     axes.plot(speed, line, color=drawing.SERIES[number], linewidth=0.9)
 figure
 
 # %% tags=["hide-input"]
 headline["damping at the lowest level errs by the share left out, within 2 %"] = all(
-    abs(ratio - (1 + share)) < 0.02 for share, ratio in rise.items()
+    abs(ratio - (1 + fraction)) < 0.02 for fraction, ratio in rise.items()
 )
 
 # %% [markdown]
@@ -249,10 +252,10 @@ WINDOWS = {  # degrees off resonance: from, to
 }
 found = {}
 for window, (nearest, farthest) in WINDOWS.items():
-    for share in (0.06, 0.10, 0.15):
-        data = recorded(motions["beam"], nearest, farthest, missing=share * forces[0])
-        found[window, share] = sj.diagnose_model(model, data)
-        print(f"{window}, {100 * share:.0f} % left out: {verdict(found[window, share])}")
+    for fraction in (0.06, 0.10, 0.15):
+        data = recorded(motions["beam"], nearest, farthest, missing=fraction * forces[0])
+        found[window, fraction] = sj.diagnose_model(model, data)
+        print(f"{window}, {100 * fraction:.0f} % left out: {verdict(found[window, fraction])}")
     data = recorded(motions["beam with friction"], nearest, farthest)
     found[window, "friction"] = sj.diagnose_model(model, data)
     print(f"{window}, friction: {verdict(found[window, 'friction'])}")
@@ -277,12 +280,12 @@ headline["18° to 34° and 30° to 60°: an offset is identified alone, friction
     for (_, what), one in apart.items()
 )
 offsets = {
-    share: one.parameters["force_offset_error.offset"]
-    for (_, share), one in apart.items()
-    if share != "friction"
+    fraction: one.parameters["force_offset_error.offset"]
+    for (_, fraction), one in apart.items()
+    if fraction != "friction"
 }
 headline["the offset within three standard deviations"] = all(
-    abs(value + share * forces[0]) < 3 * std for share, (value, std) in offsets.items()
+    abs(value + fraction * forces[0]) < 3 * std for fraction, (value, std) in offsets.items()
 )
 headline["held-out and top level predicted to within their noise"] = all(
     max(one.gap.interpolated.after, one.gap.extrapolated.after) < 1.4 for one in found.values()

@@ -102,7 +102,7 @@ def beam_of(values):
 
 
 nominal = beam_of(MEAN)
-std = {name: share * MEAN[name] for name, share in STD.items()}
+std = {name: fraction * MEAN[name] for name, fraction in STD.items()}
 print(nominal)
 printed = float(sj.model.curved_beam().modes.natural_frequency[0]) / HERTZ
 own = float(nominal.modes.natural_frequency[0]) / HERTZ
@@ -231,12 +231,12 @@ LABEL = {"thickness_m": "Thickness (mm)", "rise_m": "Rise (mm)", "damping_ratio"
 UNIT = {"thickness_m": 1e3, "rise_m": 1e3, "damping_ratio": 1e2}
 OUTPUTS = (("Peak frequency (Hz)", peak_hz), ("Peak velocity (m/s)", peak))
 figure, panels = drawing.panels(drawing.PAGE, 4.6, 2, 3)
-shares = {}
+fractions = {}
 for row, (text, output) in zip(panels, OUTPUTS, strict=True):
     for column, (axes, name) in enumerate(zip(row, MEAN, strict=True)):
         x = members[name].values
         effect, some = main_effect(x, output), slice(0, 1000)
-        shares[text, name] = effect.share
+        fractions[text, name] = effect.fraction
         axes.plot(UNIT[name] * x[some], output[some], ".", ms=1.5, color="0.75", label="beams")
         at = UNIT[name] * effect.at
         axes.fill_between(
@@ -244,13 +244,13 @@ for row, (text, output) in zip(panels, OUTPUTS, strict=True):
             **{"color": BLUE, "alpha": 0.4, "linewidth": 0},
         )
         axes.plot(at, effect.mean, color=BLUE, label="mean over the others")
-        title = f"{100 * effect.share:.0f} % of the variance"
+        title = f"{100 * effect.fraction:.0f} % of the variance"
         drawing.name_axes(axes, title, LABEL[name], text if column == 0 else "")
 drawing.legend(figure)
 figure
 
 # %%
-print({f"{text}, {name}": f"{share:.3f}" for (text, name), share in shares.items()})
+print({f"{text}, {name}": f"{fraction:.3f}" for (text, name), fraction in fractions.items()})
 
 # %% [markdown]
 # ## 4. Sobol' indices
@@ -341,7 +341,7 @@ rise = list(indices.input_names).index("rise_m")
 first = propagated.first_order_error[:, at]
 print("error of first order for the peak's frequency:", first)
 headline["the rise makes most of the peak frequency's variance"] = (
-    shares["Peak frequency (Hz)", "rise_m"] > 0.5
+    fractions["Peak frequency (Hz)", "rise_m"] > 0.5
     and indices.total[list(indices.names).index("peak_frequency_hz"), rise] > 0.5
 )
 headline["first order errs by 10 % at less than half of the stated scatter"] = (

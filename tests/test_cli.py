@@ -492,8 +492,8 @@ def test_a_joint_fit_writes_what_the_contract_says(fitted):
     assert (out / "fit.json").exists()
     for name in ("joint_fit", "residuals", "contributions", "next"):
         assert (out / f"{name}.png").exists()
-    for share in ("frequency_share", "damping_share"):
-        assert sum(row[share] for row in fit["contributions"]) == pytest.approx(1, rel=1e-9)
+    for fraction in ("frequency_fraction", "damping_fraction"):
+        assert sum(row[fraction] for row in fit["contributions"]) == pytest.approx(1, rel=1e-9)
     html = (out / "report.html").read_text()
     for heading in ("Joint fit", "What the bands are made of", "What to measure next"):
         assert f"<h2>{heading}</h2>" in html

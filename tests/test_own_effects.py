@@ -150,8 +150,8 @@ def test_a_diagnosis_looks_for_an_own_effect_and_a_simulation_has_it(folder):
     assert run("simulate", *words, "--effects", "damping.py", "--out", "simulated") == 0
     curve = pd.read_csv(folder / "simulated" / "response.csv")
     # At resonance the force balances the damping's fundamental, to that of the third harmonic.
-    share, _ = quad(lambda angle: np.sin(angle) ** 1.5, 0.0, np.pi)
-    root = one["value"] * 2 * share / np.pi
+    fraction, _ = quad(lambda angle: np.sin(angle) ** 1.5, 0.0, np.pi)
+    root = one["value"] * 2 * fraction / np.pi
     rate = brentq(lambda v: 0.01 * OMEGA * v + root * np.sqrt(v) - 0.2, 0.0, 1.0)
     speed = np.hypot(curve.velocity_h1_re_m_s, curve.velocity_h1_im_m_s)
     assert speed.max() == pytest.approx(SHAPE * rate, rel=1e-3)

@@ -344,11 +344,11 @@ def _one_record(folder: Path, test: Test, rng, run, k: int, w, dwell: int) -> di
         # A higher mode answers a high harmonic of the drive, above half the recorder's rate.
         keep = 4
         order = int(rng.integers(10, 15))
-        share = float(rng.uniform(0.03, 0.15))
-        velocity = velocity + share * np.abs(velocity).max() * np.cos(
+        fraction = float(rng.uniform(0.03, 0.15))
+        velocity = velocity + fraction * np.abs(velocity).max() * np.cos(
             order * run.angle[k, :end] + rng.uniform(0, 6)
         )
-        hidden |= {"order": order, "share": share}
+        hidden |= {"order": order, "share": fraction}
         force, velocity = force[::keep], velocity[::keep]
     else:
         force, velocity = (decimate(x, keep, ftype="fir") for x in (force, velocity))

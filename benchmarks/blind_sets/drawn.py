@@ -94,7 +94,7 @@ def true_force(key: dict, at: np.ndarray, law: dict) -> np.ndarray:
     return force * unit_force / base["shape"]
 
 
-def share_inside(key: dict, law: dict) -> float:
+def fraction_inside(key: dict, law: dict) -> float:
     """Share of the measured range over which the true force is inside the 95 % band."""
     at = np.array(law.get("velocity_m_s", law.get("displacement_m")))
     force, std = np.array(law["force_n"]), np.array(law["force_std_n"])
@@ -112,6 +112,6 @@ def judged_drawing(key: dict, answer: dict) -> tuple[str, float | None]:
     classes = [class_of(kind) for kind in answer["candidates"][0]]
     if classes[0] not in of:
         return (OPEN if of & set(classes) else WRONG), None
-    share = share_inside(key, answer["law"])
+    fraction = fraction_inside(key, answer["law"])
     alone = "further" not in answer["law"]
-    return (RIGHT if share >= INSIDE and alone else WRONG), share
+    return (RIGHT if fraction >= INSIDE and alone else WRONG), fraction

@@ -97,8 +97,8 @@ def fast_rate(kind: str, y: Array, u: Array, states: Array, p: Parameters) -> Ar
     if kind == "lugre":
         stribeck = jnp.exp(-((u / (0.3 * p["lane.speed"])) ** 2))
         return (u - jnp.abs(u) * z / (slip * (1 + 0.5 * stribeck)))[None]
-    share = jnp.sqrt((z / slip) ** 2 + 1e-12)
-    return (u - share**1.5 * (0.7 * u + 0.3 * jnp.abs(u) * z / (slip * share)))[None]
+    fraction = jnp.sqrt((z / slip) ** 2 + 1e-12)
+    return (u - fraction**1.5 * (0.7 * u + 0.3 * jnp.abs(u) * z / (slip * fraction)))[None]
 
 
 SLIDERS = {"jenkins_slider": 1, "iwan_microslip": 60, **laws.SLIDERS}

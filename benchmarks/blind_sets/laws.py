@@ -131,10 +131,10 @@ OF: dict[str, str] = {
 def fast_rate(kind: str, u: Array, z: Array, p: Parameters) -> Array:
     """Rate of the elastic stretch z of a law with a memory, per unit of ω₀t."""
     own = _own(kind, p)
-    share = jnp.sign(u) * z / own("slip_displacement")
+    fraction = jnp.sign(u) * z / own("slip_displacement")
     if kind == "dahl":
-        return u * (1 - share)
-    return u * (1 - share) / (1 - own("curvature_exponent") * share)
+        return u * (1 - fraction)
+    return u * (1 - fraction) / (1 - own("curvature_exponent") * fraction)
 
 
 def lap_sliders(p: Parameters) -> tuple[Array, Array]:

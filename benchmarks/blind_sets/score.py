@@ -133,7 +133,7 @@ def read_results(sets: Path, keys: Path, diagnoses: Path) -> list[Result]:
     return results
 
 
-def share(results: Iterable[Result], good: Callable[[Result], bool]) -> str:
+def fraction(results: Iterable[Result], good: Callable[[Result], bool]) -> str:
     """Count and percentage."""
     every = list(results)
     n = sum(good(r) for r in every)
@@ -189,7 +189,7 @@ def rows_of(results: list[Result]) -> dict[str, str]:
         ]
 
     def row(title: str, bar: str, some: list[Result], good: Callable[[Result], bool]) -> None:
-        rows[title] = share(some, good) + (f"; bar {bar}" if bar else "")
+        rows[title] = fraction(some, good) + (f"; bar {bar}" if bar else "")
 
     for shared, bar in ((False, "<= 2 %"), (True, "<= 5 %")):
         title = "false alarms, no effect" + (", shared level errors" if shared else "")

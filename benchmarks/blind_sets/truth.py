@@ -137,7 +137,7 @@ def _thinned(phases: list[float], aims: Iterable[float]) -> list[int]:
 def assembled(case: Case, sweeps: list[Sweep], aims: Sequence[float] | None = None) -> Truth:
     """The instruments' readings of points near phases in degrees, or near drawn ones."""
     rng = np.random.default_rng([*case.seed, 5])
-    share = case.n_points / len(case.sequence)
+    fraction = case.n_points / len(case.sequence)
     rows = []
     for place, level in enumerate(case.sequence):
         force = 2 * case.base.damping * case.base.peaks[level]
@@ -152,7 +152,7 @@ def assembled(case: Case, sweeps: list[Sweep], aims: Sequence[float] | None = No
                 phase = float(np.degrees(np.angle(v[1, 0])))
                 if abs(phase) <= WITHIN_DEG:
                     candidates.append((phase, point, f[0], v[:, 0]))
-        wanted = islice(_aims(rng), max(round(share), 5)) if aims is None else aims
+        wanted = islice(_aims(rng), max(round(fraction), 5)) if aims is None else aims
         keep = _thinned([c[0] for c in candidates], wanted)
         rows += [(level + 1, *candidates[k][1:]) for k in keep]
     rows.sort(key=lambda row: row[1].clock)

@@ -108,10 +108,10 @@ def integrated(cases):
     given = [np.array([c[k] for c, _ in lanes]).T for k in ("omega", "zeta", "push")]
     force = np.array([case["force"] * level for case, level in lanes])
     bands = np.array([case["band"] for case, _ in lanes])
-    share = np.concatenate([np.linspace(0, 1, UP), np.linspace(0.93, 0.1, DOWN)])
-    frequencies = bands[:, :1] + (bands[:, 1:] - bands[:, :1]) * share
+    fraction = np.concatenate([np.linspace(0, 1, UP), np.linspace(0.93, 0.1, DOWN)])
+    frequencies = bands[:, :1] + (bands[:, 1:] - bands[:, :1]) * fraction
     state = np.zeros((4, len(lanes)))
-    answers = np.full((len(lanes), len(share), 2, ORDERS + 1), np.nan, dtype=complex)
+    answers = np.full((len(lanes), len(fraction), 2, ORDERS + 1), np.nan, dtype=complex)
     for place, frequency in enumerate(frequencies.T):
         before, change = np.zeros((ORDERS + 1, 2, len(lanes))), np.full(len(lanes), np.inf)
         for _ in range(LONGEST):

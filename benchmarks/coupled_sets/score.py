@@ -146,7 +146,7 @@ def scored(path, key):
     return {
         **{"set": path.stem, "kind": key["kind"], "answer": answer, "noise": key["noise"]},
         "probability": found.interactions[0].probability if found.interactions else None,
-        "share": found.interactions[0].share if found.interactions else None,
+        "share": found.interactions[0].fraction if found.interactions else None,
         **{"scale": fit.noise_scale, "errors_std": held},
         **{"left_out": np.max(off) if off else None, "seconds": seconds},
         "bias": biases(sj.identify_backbone(data, model), found, key),

@@ -63,7 +63,7 @@ class Test(NamedTuple):
     further: States  # resonance of the further level as it would be recorded, and the nominal one
 
 
-def drawn_share(name: str, turn: int, rng) -> float:
+def drawn_fraction(name: str, turn: int, rng) -> float:
     """Signed shift in bandwidths, or added over linear damping, of a law's own decades in turn."""
     if name == "none":
         return 0.0
@@ -78,18 +78,18 @@ def drawn_share(name: str, turn: int, rng) -> float:
     return -size if farthest < 0 else size
 
 
-def _drawn_damping(name: str, share: float, rng) -> float:
+def _drawn_damping(name: str, fraction: float, rng) -> float:
     most = _MOST_DAMPING
     if name in _FARTHEST or name in STIFFNESS:
-        most = min(most, abs(_FARTHEST.get(name, _HARDEST)) / (2 * abs(share)))
+        most = min(most, abs(_FARTHEST.get(name, _HARDEST)) / (2 * abs(fraction)))
     elif name != "none":
-        most = min(most, 0.06 / (1 + share))
+        most = min(most, 0.06 / (1 + fraction))
     return float(np.exp(rng.uniform(*np.log([_LEAST_DAMPING, most]))))
 
 
-def drawn_law(name: str, share: float, damping: float, rng) -> Law:
+def drawn_law(name: str, fraction: float, damping: float, rng) -> Law:
     """The law that shifts the resonance at unit amplitude by as many bandwidths, or damps so."""
-    wanted = share * 2 * damping
+    wanted = fraction * 2 * damping
     if name in ("none", "coulomb", "quadratic_damping"):
         unit = {"none": 0.0, "coulomb": np.pi / 4, "quadratic_damping": 3 * np.pi / 8}
         return Law(name, wanted * unit[name])
@@ -132,9 +132,9 @@ def guessed(curve: States, force, phase, stiffness) -> States:
     lacking = damping * w * a - (force * np.cos(phase))[:, None]
     rows, k = np.arange(len(phase)), np.maximum(np.argmax(lacking > 0, axis=1), 1)
     there = (lacking[:, 0] <= 0) & (lacking[rows, k] > 0)
-    share = np.where(there, lacking[rows, k - 1] / (lacking[rows, k - 1] - lacking[rows, k]), 0)
-    amplitude = a[k - 1] + share * (a[k] - a[k - 1])
-    now = w[rows, k - 1] + share * (w[rows, k] - w[rows, k - 1])
+    fraction = np.where(there, lacking[rows, k - 1] / (lacking[rows, k - 1] - lacking[rows, k]), 0)
+    amplitude = a[k - 1] + fraction * (a[k] - a[k - 1])
+    now = w[rows, k - 1] + fraction * (w[rows, k] - w[rows, k - 1])
     scaled = (curve.coefficients / curve.amplitude[:, None]).T
     x = np.stack([np.interp(np.log(amplitude), grid, row) for row in scaled], axis=1)
     return States(x * amplitude[:, None], now, force, phase, 0 * phase, there)
@@ -180,10 +180,10 @@ def _drawn_forces(law: Law, damping: float, rng) -> np.ndarray:
     return top - 2 * damping * (1 - lowest ** (1 - steps))
 
 
-def drawn_test(rng, name: str, share: float, errors: Errors | None = None) -> Test:
+def drawn_test(rng, name: str, fraction: float, errors: Errors | None = None) -> Test:
     """Law, plan, errors and exact states; ArithmeticError where they do not go together."""
-    damping = _drawn_damping(name, share, rng)
-    law = drawn_law(name, share, damping, rng)
+    damping = _drawn_damping(name, fraction, rng)
+    law = drawn_law(name, fraction, damping, rng)
     forces, errors = _drawn_forces(law, damping, rng), errors or drawn_errors(rng)
     n = len(forces)
     off = {key: rng.normal(size=n + 1) * size for key, size in errors.levels.items()}
@@ -273,19 +273,19 @@ def _effect(law: Law, omega: float, unit: float) -> tuple[list[str], dict[str, f
 
 def written_set(folder: Path, name: str, law: str, turn: int, seed: tuple[int, int]) -> int:
     """Draw and write one set; returns how often it was drawn."""
-    share = drawn_share(law, turn, np.random.default_rng(seed))
+    fraction = drawn_fraction(law, turn, np.random.default_rng(seed))
     for attempt in range(80):
         rng = np.random.default_rng((*seed, attempt))
         try:
-            test = drawn_test(rng, law, share)
+            test = drawn_test(rng, law, fraction)
         except (ArithmeticError, np.linalg.LinAlgError):
             continue
-        _write(folder, name, test, share, rng)
+        _write(folder, name, test, fraction, rng)
         return attempt + 1
-    raise RuntimeError(f"{name}: no {law} with a shift of {share:.3g} could be drawn")
+    raise RuntimeError(f"{name}: no {law} with a shift of {fraction:.3g} could be drawn")
 
 
-def _write(folder: Path, name: str, test: Test, share: float, rng) -> None:
+def _write(folder: Path, name: str, test: Test, fraction: float, rng) -> None:
     e, s, off, level = test.errors, test.states, test.off, test.level
     hz, mass, top = np.exp(rng.uniform(*np.log([(20, 0.05, 3e-3), (400, 20, 1.0)])))
     omega = 2 * np.pi * hz
@@ -331,7 +331,7 @@ def _write(folder: Path, name: str, test: Test, share: float, rng) -> None:
     chi = chi_squared(test)
     key = {
         "name": name, "law": test.law.name, "kinds": kinds, "parameters": parameters,
-        "share": abs(share), "shift_bandwidths": abs(at_top - 1) / (2 * test.damping),
+        "share": abs(fraction), "shift_bandwidths": abs(at_top - 1) / (2 * test.damping),
         "damping_ratio": test.damping, "frequency_hz": hz, "modal_mass_kg": mass,
         "levels": int(level.max()) + 1, "states": len(s.w), **test.plan,
         "errors": e.levels, "errors_stated": e.levels_stated and any(e.levels.values()),

@@ -225,7 +225,7 @@ def backbone(law: Law, damping: float, amplitude, steps: int = 8) -> States:
     x = np.zeros((len(amplitude), 2 * n + 1))
     x[:, 1] = amplitude
     found = States(x, one, 2 * damping * amplitude, 0 * one, 0 * one, one > 0)
-    for share in np.linspace(0, 1, steps + 1)[1:]:
-        now = law._replace(strength=share * law.strength)
+    for fraction in np.linspace(0, 1, steps + 1)[1:]:
+        now = law._replace(strength=fraction * law.strength)
         found = solved(now, damping, one, 0 * one, found, "amplitude")
     return found

@@ -229,15 +229,15 @@ def reliability(pen: Pen) -> Figure:
     for axes, (name, bins), colour in zip(grid.flat, sets.items(), series, strict=False):
         axes.plot([0, 1], [0, 1], "--", color=pen.faint, linewidth=1)
         for one in bins:
-            share = one.right / one.answers
+            fraction = one.right / one.answers
             low, high = of.binomial(one.right, one.answers)
             middle = (one.low + one.high) / 2
-            axes.plot([one.low, one.high], [share, share], color=colour, linewidth=3)
+            axes.plot([one.low, one.high], [fraction, fraction], color=colour, linewidth=3)
             axes.plot([middle, middle], [low, high], color=colour, linewidth=1)
-            x, y, side = middle, (high + 0.03 if share < 0.25 else low - 0.03), "center"
+            x, y, side = middle, (high + 0.03 if fraction < 0.25 else low - 0.03), "center"
             if not 0.1 < y < 0.9:  # beside the line where its end is at the edge
                 x, y, side = middle + 0.03, np.clip(y, 0.1, 0.9), "left"
-            va = "bottom" if share < 0.25 else "top"
+            va = "bottom" if fraction < 0.25 else "top"
             axes.annotate(str(one.answers), (x, y), ha=side, va=va, fontsize=8, color=pen.ink)
         axes.set_title(name.replace(", ", ",\n").replace(" (", "\n("), fontsize=9.5)
         axes.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02), xticks=[0, 0.5, 1], yticks=[0, 0.5, 1])
@@ -267,7 +267,7 @@ def coverage(pen: Pen) -> Figure:
             colour = pen.orange if row.says == "too narrow" else pen.blue
             colour = colour if row.ours else pen.faint
             axes.plot([100 * low, 100 * high], [height] * 2, color=colour)
-            axes.plot(100 * row.share, height, "o", color=colour, markersize=4.5)
+            axes.plot(100 * row.fraction, height, "o", color=colour, markersize=4.5)
         height -= 1
     axes.set_yticks(list(ticks), list(ticks.values()), fontsize=9)
     axes.set_ylim(height + 0.3, 0.7)

@@ -97,7 +97,7 @@ class Coverage(NamedTuple):
     ours: bool = True
 
     @property
-    def share(self) -> float:
+    def fraction(self) -> float:
         """Share of the tests."""
         return self.inside / self.tests
 
@@ -123,8 +123,8 @@ def binomial(right: float, of: int) -> tuple[float, float]:
 def _inside(rows: Sequence[Row], key: str, most: float = BAND) -> Coverage:
     """Of lines with one error or several, in units of `most`; None where there is no band."""
     each = [np.atleast_1d(np.array(r[key], dtype=float)) for r in rows]
-    shares = [np.mean(np.abs(e[np.isfinite(e)]) <= most) for e in each if np.isfinite(e).any()]
-    return Coverage("", "", len(shares), float(np.sum(shares)))
+    fractions = [np.mean(np.abs(e[np.isfinite(e)]) <= most) for e in each if np.isfinite(e).any()]
+    return Coverage("", "", len(fractions), float(np.sum(fractions)))
 
 
 def coverages() -> list[Coverage]:

@@ -268,7 +268,7 @@ def covered() -> str:
     for c in of.coverages():
         low, high = c.interval
         says = f"**{c.says}**" if c.says == "too narrow" and c.ours else c.says
-        row = [c.what, c.about, c.tests, per_cent(c.share, 3)]
+        row = [c.what, c.about, c.tests, per_cent(c.fraction, 3)]
         rows.append([*row, f"{per_cent(low, 3)} to {per_cent(high, 3)}", says])
     return table(head, rows)
 
@@ -288,7 +288,7 @@ def misses() -> str:
         f"({most.problem}: {most.quantity})"
     ]
     found += [
-        f"[Error bars](coverage.md): {c.what.lower()}, {c.about}: {per_cent(c.share, 3)} of "
+        f"[Error bars](coverage.md): {c.what.lower()}, {c.about}: {per_cent(c.fraction, 3)} of "
         f"{c.tests} instead of 95 %"
         for c in narrow()
     ]

@@ -21,9 +21,9 @@ def number(value: float | None, digits: int = 3) -> str:
     return text.replace("-", "−")
 
 
-def per_cent(share: float | None, digits: int = 2) -> str:
+def per_cent(fraction: float | None, digits: int = 2) -> str:
     """A share or a relative error in per cent."""
-    return "–" if share is None else f"{number(100 * share, digits)}\N{NO-BREAK SPACE}%"
+    return "–" if fraction is None else f"{number(100 * fraction, digits)}\N{NO-BREAK SPACE}%"
 
 
 def table(head: Iterable[str], rows: Iterable[Iterable[object]]) -> str:

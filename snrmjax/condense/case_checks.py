@@ -197,8 +197,8 @@ def _sizes(fit: FitView) -> list[Fact]:
     if fit.misfit < _GOOD:
         return []
     n_cases, n_modes = fit.system.target.shape
-    share = rms(fit.system.target)
-    small = [Fact("too_small", misfit=fit.misfit, nonlinear=share)]
+    fraction = rms(fit.system.target)
+    small = [Fact("too_small", misfit=fit.misfit, nonlinear=fraction)]
     if rms(fit.left_out.residual) < _ROUND_OFF:
         return small
     higher = fit_system(fit.basis, fit.cases, monomials_of(n_modes, fit.degree + 2))
@@ -210,8 +210,8 @@ def _sizes(fit: FitView) -> list[Fact]:
         left *= np.sqrt(design.shape[0] / spare)
         longer = bool(left < _EXPLAINED * rms(fit.left_out.residual))
     else:
-        longer = share > _SMALL
-    if share < _SMALL and not longer:
+        longer = fraction > _SMALL
+    if fraction < _SMALL and not longer:
         return small
     return [Fact("too_large", misfit=fit.misfit, degree=fit.degree, longer=longer)]
 

@@ -178,8 +178,10 @@ def require_determined(system: FitSystem, monomials: tuple[Monomial, ...], n_use
         values, directions = np.linalg.svd(rows / np.linalg.norm(rows, axis=0))[1:]
         if values[0] < _SINGULAR * values[-1]:
             return
-        share = np.abs(directions[-1])
-        unseen = [monomial_key(monomials[k]) for k in np.flatnonzero(share > 0.3 * share.max())]
+        fraction = np.abs(directions[-1])
+        unseen = [
+            monomial_key(monomials[k]) for k in np.flatnonzero(fraction > 0.3 * fraction.max())
+        ]
     names = ", ".join(unseen[:6]) + (", …" if len(unseen) > 6 else "")
     raise ValueError(
         f"the load cases do not tell these coefficients apart: {names} (mode numbers of the "

@@ -1,14 +1,14 @@
 from .diagnosis import diagnose_model
 from .diagnosis_result import Diagnosis
-from .location.where import EVERYWHERE, Whereabouts, locate_force
+from .location.where import EVERYWHERE, Localisation, locate_force
 from .response_prediction import predict_levels
 from .verdict import Verdict
 
 __all__ = [
     "EVERYWHERE",
     "Diagnosis",
+    "Localisation",
     "Verdict",
-    "Whereabouts",
     "diagnose_model",
     "locate_force",
     "predict_levels",

@@ -45,7 +45,7 @@ def verdict_of(named: NamedParts, found: FoundEffects) -> tuple[Verdict, tuple[F
     noise = float(posterior.hyper.noise)
     noise = min(noise, max(noise * named.naming.of_fundamentals, 1.0)) if noise > 1 else noise
     # What neighbouring states miss alike is no noise of any standard deviation.
-    stated = chosen.noise_stated and posterior.share > _INDEPENDENT
+    stated = chosen.noise_stated and posterior.fraction > _INDEPENDENT
     stated = stated and not chosen.phase_unknown.any()
     misstated = stated and not low < np.log(noise) < high
     # Noise of another size shows in all levels, a jump or a drift in some; neither makes it less.

@@ -150,7 +150,7 @@ def diagnose_model(
     diagnosis = completed_by_parts(diagnosis, named, misfit.baseline_parameters(fit.rows), model)
     shift = _frequency_shift(model, diagnosis.completed or model)
     if abs(shift) > priors.OTHER_MODE:
-        off = Fact("frequency_off", share=shift)
+        off = Fact("frequency_off", fraction=shift)
         diagnosis = dataclasses.replace(diagnosis, notes=(*diagnosis.notes, off))
     return diagnosis
 
@@ -254,8 +254,8 @@ def excluded_kinds(model: Structure, force_gain_std: float, *, phases: bool) -> 
 
 def _estimates(misfit: WeightedMisfit, fit: EffectFit) -> dict[str, Estimate]:
     """The effects' parameters and their 1σ."""
-    arms, size = unit_columns(misfit.noise.decorrelated(fit.slopes.T).T)
-    inverse = np.linalg.pinv(arms.T @ arms, rcond=1e-12, hermitian=True)
+    sensitivities, size = unit_columns(misfit.noise.decorrelated(fit.slopes.T).T)
+    inverse = np.linalg.pinv(sensitivities.T @ sensitivities, rcond=1e-12, hermitian=True)
     std = np.sqrt(np.diag(inverse)) / size
     return {
         label: Estimate(float(value), float(error))
@@ -286,8 +286,8 @@ def _notes_on_data(checked: _Checked) -> Iterator[Fact | str]:
     for of_data, which in ((True, differing), (False, ~np.array(differing))):
         gain, phase, stiffness, damping = sizes = np.where(which, free, 0.0).tolist()
         if any(sizes):
-            shares = {"gain": gain, "frequency": 0.5 * stiffness, "damping": damping}
-            yield Fact("levels_not_stated", phase=phase, **shares, of_data=of_data)
+            fractions = {"gain": gain, "frequency": 0.5 * stiffness, "damping": damping}
+            yield Fact("levels_not_stated", phase=phase, **fractions, of_data=of_data)
     chosen = checked.misfit.predictions.chosen
     if checked.levels is None:
         yield Fact("no_level_left_out", n_levels=chosen.n_levels)

@@ -215,8 +215,8 @@ def _in_phase(curve: ResponseCurve, sensor: int) -> list[tuple[float, float]]:
     real, imag = velocity.real, velocity.imag
     turns = (imag[:-1] * imag[1:] <= 0) & (imag[:-1] != imag[1:])
     k = np.flatnonzero(turns & (real[:-1] > 0) & (real[1:] > 0))
-    share = imag[k] / (imag[k] - imag[k + 1])
-    columns = ((1 - share) * of[k] + share * of[k + 1] for of in (real, frequency))
+    fraction = imag[k] / (imag[k] - imag[k + 1])
+    columns = ((1 - fraction) * of[k] + fraction * of[k + 1] for of in (real, frequency))
     return list(zip(*(column.tolist() for column in columns), strict=True))
 
 

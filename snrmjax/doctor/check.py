@@ -6,15 +6,15 @@ import numpy as np
 
 from snrmjax.doctor.corrections import TestCorrection, corrections, sweeps_apart
 from snrmjax.doctor.findings import Checkup, Finding, gravest_first
-from snrmjax.doctor.force_checks import deepest_fall, dropout_findings, harmonic_findings
-from snrmjax.doctor.judgement import (
+from snrmjax.doctor.fitted_hypothesis import (
     CheckedStates,
-    Judged,
+    FittedHypothesis,
     checked_states,
     files_of_levels,
     leading_sensor,
     usable_rows,
 )
+from snrmjax.doctor.force_checks import deepest_fall, dropout_findings, harmonic_findings
 from snrmjax.doctor.priors import (
     FEWEST_STATES,
     FITS_WELL,
@@ -111,7 +111,7 @@ def _of_table(
 
 def mode_findings(
     seen: CheckedStates, model: Structure | None, where: str, drive: bool
-) -> tuple[list[Finding], Judged]:
+) -> tuple[list[Finding], FittedHypothesis]:
     """Findings of one sensor's states, and how they fit with those undone.
 
     `drive` says that forces are declared to be volts: then their scale and phase say nothing.
@@ -144,14 +144,14 @@ def mode_findings(
     return found, base
 
 
-def _likeliest(seen: CheckedStates, base: Judged) -> TestCorrection | None:
+def _likeliest(seen: CheckedStates, base: FittedHypothesis) -> TestCorrection | None:
     """The likeliest correction that matters."""
     tried = (one for one in corrections(seen, base.states, base) if one.judged.leaves_less(base))
     best = max(tried, key=lambda one: one.judged.evidence, default=None)
     return best if best is not None and _matters(best, base) else None
 
 
-def _beats(seen: CheckedStates, one: TestCorrection, base: Judged) -> bool:
+def _beats(seen: CheckedStates, one: TestCorrection, base: FittedHypothesis) -> bool:
     """Whether a correction beats the table as it is read."""
     if one.kind == "force_dropout":  # the noise of a cell is no misfit
         return one.judged.noise < FITS_WELL and one.judged.explains(base)
@@ -162,7 +162,7 @@ def _beats(seen: CheckedStates, one: TestCorrection, base: Judged) -> bool:
     return other is None or one.judged.is_likelier(other)
 
 
-def _matters(one: TestCorrection, base: Judged) -> bool:
+def _matters(one: TestCorrection, base: FittedHypothesis) -> bool:
     """Whether a correction is large enough to be spoken of."""
     if one.kind in ("drift", "different_structures"):
         width = float(np.median(one.judged.damping / base.states.frequency))
@@ -176,7 +176,9 @@ def _matters(one: TestCorrection, base: Judged) -> bool:
     return one.kind != "force_dropout" or one.value < base.states.force.min()
 
 
-def _finding(seen: CheckedStates, base: Judged, one: TestCorrection, where: str) -> Finding:
+def _finding(
+    seen: CheckedStates, base: FittedHypothesis, one: TestCorrection, where: str
+) -> Finding:
     """What a correction undoes, as a finding."""
     states = base.states
     misses = {"misfit": one.judged.misfit, "misfit_before": base.misfit}
@@ -202,7 +204,7 @@ def _finding(seen: CheckedStates, base: Judged, one: TestCorrection, where: str)
                 smallest=float(states.force.min()),
             )
         case "unsettled_steps":
-            evidence = Fact("states_unsettled", share=one.value, **misses)
+            evidence = Fact("states_unsettled", fraction=one.value, **misses)
             advice = Fact("advice_unsettled")
         case _:
             size = states.force if one.column == "force" else np.abs(states.velocity)

@@ -4,7 +4,7 @@ import jax
 import numpy as np
 
 from snrmjax.doctor.findings import Finding
-from snrmjax.doctor.judgement import checked_states, leading_sensor, usable_rows
+from snrmjax.doctor.fitted_hypothesis import checked_states, leading_sensor, usable_rows
 from snrmjax.doctor.priors import BAND, FAR_DAMPING, FAR_FREQUENCY, FEWEST_STATES
 from snrmjax.doctor.readings import best_reading, misread
 from snrmjax.doctor.scale_findings import is_other_scale, scale_findings
@@ -18,7 +18,7 @@ from snrmjax.model.structures import Structure
 from snrmjax.numerics.facts import Fact
 
 
-def doubt(
+def caveat(
     data: SteadyStates, model: Structure, points: BackbonePoints | None = None
 ) -> tuple[Fact, ...]:
     """Columns that seem to mean something else, or a lowest level of another mode.
@@ -103,7 +103,7 @@ def linear_damping_note(fit: JointFit, model: Structure) -> tuple[Fact, ...]:
     )
 
 
-def with_doubt(error: ValueError, data: SteadyStates, model: Structure) -> ValueError:
+def with_caveat(error: ValueError, data: SteadyStates, model: Structure) -> ValueError:
     """The error of an identification, with what the columns seem to mean, if that is why."""
-    misread_so = doubt(data, model)
+    misread_so = caveat(data, model)
     return ValueError(" ".join((str(error), *map(str, misread_so)))) if misread_so else error

@@ -7,8 +7,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from snrmjax.doctor.findings import Kind
+from snrmjax.doctor.fitted_hypothesis import (
+    CheckedStates,
+    FittedHypothesis,
+    fit_hypothesis,
+    likelier,
+)
 from snrmjax.doctor.force_checks import deepest_fall
-from snrmjax.doctor.judgement import CheckedStates, Judged, judge, likelier
 from snrmjax.doctor.priors import (
     CLEARLY,
     FORCE_FALLS,
@@ -31,14 +36,16 @@ class TestCorrection(NamedTuple):
     """A table read with one thing undone."""
 
     kind: Kind
-    judged: Judged
+    judged: FittedHypothesis
     value: float = np.nan  # its own parameter
     gains: tuple[float, ...] = ()  # ln of each level's force over what it should be
     file: int = 0  # that is of another structure, from 1
     column: str = ""  # that is cut off: "response" or "force"
 
 
-def corrections(seen: CheckedStates, states: TestStates, base: Judged) -> Iterator[TestCorrection]:
+def corrections(
+    seen: CheckedStates, states: TestStates, base: FittedHypothesis
+) -> Iterator[TestCorrection]:
     """Each correction with its likeliest parameter.
 
     Arguments: `states` as they are read; `base` how they fit.
@@ -63,19 +70,23 @@ def corrections(seen: CheckedStates, states: TestStates, base: Judged) -> Iterat
         yield from _noisy_force(states, base)
 
 
-def _freer(states: TestStates, base: Judged) -> Judged:
+def _freer(states: TestStates, base: FittedHypothesis) -> FittedHypothesis:
     """The fit of states with more that is unknown: anew, and from the fit without it on."""
-    return likelier((judge(states), judge(states, start=base)))
+    return likelier((fit_hypothesis(states), fit_hypothesis(states, start=base)))
 
 
-def _moving(states: TestStates, base: Judged, along: np.ndarray) -> tuple[Judged, float]:
+def _moving(
+    states: TestStates, base: FittedHypothesis, along: np.ndarray
+) -> tuple[FittedHypothesis, float]:
     """A natural frequency that changes in proportion to something, and by how much (relative)."""
     judged = _freer(states._replace(trend=along, trend_std=MOVES), base)
     stiffness = np.maximum(1 + judged.posterior.trend[0] * along, 1e-6)  # over the mean one
     return judged, float(np.sqrt(stiffness[np.argmax(along)] / stiffness[np.argmin(along)])) - 1
 
 
-def sweeps_apart(seen: CheckedStates, states: TestStates, base: Judged) -> Judged | None:
+def sweeps_apart(
+    seen: CheckedStates, states: TestStates, base: FittedHypothesis
+) -> FittedHypothesis | None:
     """The fit where what sweeps of a level differ by does not go with the time of the test.
 
     They differ by their pace, by settling and by warmth that comes and goes: both directions by one
@@ -91,7 +102,7 @@ def sweeps_apart(seen: CheckedStates, states: TestStates, base: Judged) -> Judge
     middle = np.array([seen.order[states.level == k].mean() for k in range(states.n_levels)])
     anew = seen.order - middle[states.level]
     alike = (_moving(states, base, along)[0] for along in (rising, anew))
-    return likelier((*alike, judge(own, start=start)))
+    return likelier((*alike, fit_hypothesis(own, start=start)))
 
 
 def sweeps(
@@ -132,7 +143,7 @@ class Tried(NamedTuple):
     log_jacobian: float = 0.0
 
 
-def likeliest(base: Judged, tried: Sequence[Tried]) -> tuple[float, Judged]:
+def likeliest(base: FittedHypothesis, tried: Sequence[Tried]) -> tuple[float, FittedHypothesis]:
     """The likeliest of several values, alike likely before, from what is nearest to the table as
     it is on.
 
@@ -140,7 +151,7 @@ def likeliest(base: Judged, tried: Sequence[Tried]) -> tuple[float, Judged]:
     """
     value, best, last = np.nan, None, base
     for one in tried:
-        last = judge(one.states, one.log_jacobian - np.log(len(tried)), start=last)
+        last = fit_hypothesis(one.states, one.log_jacobian - np.log(len(tried)), start=last)
         if best is None or last.evidence > best.evidence:
             value, best = one.value, last
         if last.evidence < max(best.evidence, base.evidence) - CLEARLY:
@@ -148,7 +159,7 @@ def likeliest(base: Judged, tried: Sequence[Tried]) -> tuple[float, Judged]:
     return value, best or base
 
 
-def _clipped(states: TestStates, base: Judged) -> Iterator[TestCorrection]:
+def _clipped(states: TestStates, base: FittedHypothesis) -> Iterator[TestCorrection]:
     """The response or the force cut off at a limit."""
     size, force = np.abs(states.velocity), states.force
     limits = (0.96, 0.93, 0.9, 0.87, 0.84, 0.81)  # over the largest recorded fundamental
@@ -195,7 +206,9 @@ def unclipped(
     return true, np.clip(stretch, 1.0, 1e4)
 
 
-def _unsettled(seen: CheckedStates, states: TestStates, base: Judged) -> Iterator[TestCorrection]:
+def _unsettled(
+    seen: CheckedStates, states: TestStates, base: FittedHypothesis
+) -> Iterator[TestCorrection]:
     """What is left of the state before: of the mode's motion, or in the analyser's average.
 
     In a frame that turns with the force, V_n = V + (V_{n−1} − V) r after a dwell T: of a motion,
@@ -211,19 +224,19 @@ def _unsettled(seen: CheckedStates, states: TestStates, base: Judged) -> Iterato
     pace = (-damping / 2 + 1j * (omega - states.frequency)) / typical if typical > 0 else 0.0
     for decay in (pace, -1.0):
         tried = []
-        for share in _LEFT:
-            left = np.where(before < 0, 0.0, np.exp(-np.log(share) * decay))
+        for fraction in _LEFT:
+            left = np.where(before < 0, 0.0, np.exp(-np.log(fraction) * decay))
             true = (states.velocity - left * states.velocity[before]) / (1 - left)
             stretch = np.abs(states.velocity / (true * (1 - left)))
             errors = states.errors.copy()
             errors[:, 1:3] *= stretch[:, None]
             moved = states._replace(velocity=true, errors=errors)
-            tried.append(Tried(share, moved, 2 * float(np.sum(np.log(stretch)))))
+            tried.append(Tried(fraction, moved, 2 * float(np.sum(np.log(stretch)))))
         value, judged = likeliest(base, tried)
         yield TestCorrection("unsettled_steps", judged, value)
 
 
-def _noisy_force(states: TestStates, base: Judged) -> Iterator[TestCorrection]:
+def _noisy_force(states: TestStates, base: FittedHypothesis) -> Iterator[TestCorrection]:
     """A force that falls at resonance into its cell's noise, which is of one size in newtons."""
     if deepest_fall(states) < FORCE_FALLS:
         return

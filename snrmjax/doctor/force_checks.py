@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Int
 
 from snrmjax.doctor.findings import FORCE_HARMONICS, Finding
-from snrmjax.doctor.judgement import CheckedStates, Judged
+from snrmjax.doctor.fitted_hypothesis import CheckedStates, FittedHypothesis
 from snrmjax.doctor.priors import CERTAIN, CLEARLY, FORCE_FALLS, FORCE_HARMONIC, HELD, TOGETHER
 from snrmjax.identify.test_model.states import TestStates
 from snrmjax.measure.states import SteadyStates
@@ -65,7 +65,7 @@ def deepest_fall(states: TestStates) -> float:
 def harmonic_findings(
     data: SteadyStates,
     seen: CheckedStates,
-    fit: Judged,
+    fit: FittedHypothesis,
     model: Structure | None,
     sensor: int,
     where: str,
@@ -95,7 +95,7 @@ def harmonic_findings(
 
 def _of_force(
     seen: CheckedStates,
-    fit: Judged,
+    fit: FittedHypothesis,
     model: Structure | None,
     h: np.ndarray,
     std: np.ndarray,

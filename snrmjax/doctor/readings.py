@@ -7,7 +7,13 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from snrmjax.doctor.findings import Finding, ImportCorrection, Kind
-from snrmjax.doctor.judgement import CheckedStates, Judged, Scale, any_mass, judge
+from snrmjax.doctor.fitted_hypothesis import (
+    CheckedStates,
+    FittedHypothesis,
+    Scale,
+    any_mass,
+    fit_hypothesis,
+)
 from snrmjax.doctor.priors import CLEARLY, MODAL_MASS, OTHER_SCALE, SCATTER
 from snrmjax.identify.test_model.states import TestStates
 from snrmjax.numerics.facts import Fact
@@ -85,7 +91,7 @@ class Reading(NamedTuple):
     """A table as it may be meant."""
 
     meaning: Meaning
-    as_modelled: Judged | None  # with the model's modal mass, where there is a model
+    as_modelled: FittedHypothesis | None  # with the model's modal mass, where there is a model
     scale: Scale | None  # with any, where that was looked at
 
     @property
@@ -101,7 +107,7 @@ class Reading(NamedTuple):
         return self.judged.evidence
 
     @property
-    def judged(self) -> Judged:
+    def judged(self) -> FittedHypothesis:
         """The likelier fit."""
         found = self.scale.judged if self.rescaled and self.scale else self.as_modelled
         if found is None:
@@ -183,7 +189,7 @@ def _judged(
     if not known_mass:
         return Reading(meaning, None, any_mass(states, jacobian))
     begin = None if start is None else start.as_modelled
-    return Reading(meaning, judge(states, jacobian, start=begin), None)
+    return Reading(meaning, fit_hypothesis(states, jacobian, start=begin), None)
 
 
 def _of_sizes(seen: CheckedStates, recorded: Reading) -> Reading | None:
@@ -200,7 +206,7 @@ def _of_sizes(seen: CheckedStates, recorded: Reading) -> Reading | None:
     return None
 
 
-def misread(recorded: Judged, best: Reading, where: str) -> Finding:
+def misread(recorded: FittedHypothesis, best: Reading, where: str) -> Finding:
     """That phasors are something else than what they are taken for."""
     meaning = best.meaning
     if meaning.kind is None:

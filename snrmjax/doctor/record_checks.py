@@ -100,17 +100,17 @@ def _flat_runs(x: Float[np.ndarray, " sample"], where: str) -> Finding | None:
     size = max(abs(top), abs(bottom))
     if size == 0:
         return None
-    share, piled = 0.0, 0
+    fraction, piled = 0.0, 0
     for limit, sign in ((top, 1.0), (bottom, -1.0)):
         at = sign * (limit - x) <= 1e-6 * size
         three = at[2:] & at[1:-1] & at[:-2]
-        share += float(three.mean()) if len(three) else 0.0
+        fraction += float(three.mean()) if len(three) else 0.0
         piled += _piled_up(sign * x, at, 2e-6 * size)
-    if share < PILED_UP and not piled:
+    if fraction < PILED_UP and not piled:
         return None
-    crowd = piled if share < PILED_UP else None
+    crowd = piled if fraction < PILED_UP else None
     return _clipping(
-        where, Fact("channel_full_scale", share=share, n_samples=crowd, low=bottom, high=top)
+        where, Fact("channel_full_scale", fraction=fraction, n_samples=crowd, low=bottom, high=top)
     )
 
 
@@ -133,10 +133,10 @@ def _clipping(where: str, evidence: Fact) -> Finding:
     return Finding("clipped_channel", where, evidence, Fact("advice_range"))
 
 
-def _middle(step: Step, share: float = 0.5) -> slice:
+def _middle(step: Step, fraction: float = 0.5) -> slice:
     """The last part of a step, without its very end."""
     length = step.stop - step.start
-    return slice(int(step.stop - share * length), int(step.stop - 0.02 * length))
+    return slice(int(step.stop - fraction * length), int(step.stop - 0.02 * length))
 
 
 def _demodulated(x: np.ndarray, rows: slice, frequency: float, rate: float) -> np.ndarray:
@@ -170,7 +170,7 @@ def _flat_cycles(x: np.ndarray, steps: list[Step], rate: float, where: str) -> F
             best = flat
     if best is None or best < FLAT_TOP:
         return None
-    return _clipping(where, Fact("cycle_flat", share=best))
+    return _clipping(where, Fact("cycle_flat", fraction=best))
 
 
 def _harmonics(x: np.ndarray, steps: list[Step], rate: float, where: str) -> list[Finding]:

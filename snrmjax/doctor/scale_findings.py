@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from snrmjax.doctor.findings import Finding, ImportCorrection
-from snrmjax.doctor.judgement import Judged, Scale, judge
+from snrmjax.doctor.fitted_hypothesis import FittedHypothesis, Scale, fit_hypothesis
 from snrmjax.doctor.priors import BAND, CERTAIN, MODAL_MASS, MORE_DAMPING, OTHER_SCALE
 from snrmjax.identify.pointwise.snrm import linear_mode
 from snrmjax.identify.test_model.states import TestStates
@@ -16,19 +16,19 @@ from snrmjax.numerics.facts import Fact
 _VOLTS = (ImportCorrection(force_unit="V"),)
 
 
-def is_other_scale(scale: Scale, as_modelled: Judged) -> bool:
+def is_other_scale(scale: Scale, as_modelled: FittedHypothesis) -> bool:
     """Whether states tell a modal mass that is no linear test's, better than the model's own."""
     controlled = as_modelled.posterior.phase_is_controlled
     if controlled or abs(np.log(scale.mass)) < OTHER_SCALE + BAND * scale.std:
         return False
     jacobian = as_modelled.evidence - as_modelled.posterior.log_evidence
-    held = judge(as_modelled.states._replace(mass_std=0.0), jacobian)
+    held = fit_hypothesis(as_modelled.states._replace(mass_std=0.0), jacobian)
     # What a mode leaves off resonance is some per cent of its damping: no other modal mass.
     return scale.judged.beats(held, beside=False)
 
 
 def scale_findings(
-    scale: Scale, as_modelled: Judged, model: Structure, where: str
+    scale: Scale, as_modelled: FittedHypothesis, model: Structure, where: str
 ) -> list[Finding]:
     """What makes the modal mass another one.
 
@@ -105,7 +105,9 @@ def _mixed_units() -> Iterator[_MixedUnit]:
     yield from (_MixedUnit(of, other, unit, 1 / mass) for of, unit, other, mass in pairs)
 
 
-def _signs(fit: Judged, model: Structure, bend: float | None, *, agrees: bool) -> tuple[int, int]:
+def _signs(
+    fit: FittedHypothesis, model: Structure, bend: float | None, *, agrees: bool
+) -> tuple[int, int]:
     """What else speaks for a force that is none, and for a shape of another scale."""
     modes = model.modes
     j = modes.mode_of_interest
@@ -143,7 +145,7 @@ def _bend(states: TestStates, stiffness: np.ndarray, model: Structure) -> float 
     return slope if slope > 0 else None
 
 
-def shaker_damping(fit: Judged, model: Structure, where: str) -> list[Finding]:
+def shaker_damping(fit: FittedHypothesis, model: Structure, where: str) -> list[Finding]:
     """Damping above the linear test's by one amount at all amplitudes, at its own frequency.
 
     That is what a shaker adds between its drive and the structure, (Bl)²/R of a coil on a voltage;

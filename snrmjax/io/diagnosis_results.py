@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from snrmjax.diagnose.design.discriminating_test import DiscriminatingTest
 from snrmjax.diagnose.diagnosis_result import Diagnosis
 from snrmjax.diagnose.drawn_law import DrawnLaw
-from snrmjax.diagnose.location.where import Whereabouts
+from snrmjax.diagnose.location.where import Localisation
 from snrmjax.diagnose.misfit.locating import Located
 from snrmjax.diagnose.naming.parts import PartAnswer
 from snrmjax.diagnose.response_prediction import LevelResponse
@@ -172,7 +172,7 @@ def _part(part: Located) -> dict:
     return entry
 
 
-def summarise_whereabouts(found: Whereabouts) -> dict:
+def summarise_localisation(found: Localisation) -> dict:
     """Where a force acts: places with their probabilities, and the law at the first."""
     law = found.places[0].law
     return {
@@ -184,7 +184,7 @@ def summarise_whereabouts(found: Whereabouts) -> dict:
     }
 
 
-def placed_answer(found: Whereabouts) -> dict:
+def placed_answer(found: Localisation) -> dict:
     """The answer of a diagnosis whose effects act on one mode only, where a placed law explains it.
 
     Parameters are physical (N, m, kg), as those of an effect with `at`.
@@ -193,14 +193,16 @@ def placed_answer(found: Whereabouts) -> dict:
     law = first.law
     if law is None:
         return {}
-    shares = {kind: first.probability * share for kind, share in first.laws.items()}
-    alike = [kind for kind, share in shares.items() if share > _ALIKE * shares[law.kind]]
+    fractions = {kind: first.probability * fraction for kind, fraction in first.laws.items()}
+    alike = [
+        kind for kind, fraction in fractions.items() if fraction > _ALIKE * fractions[law.kind]
+    ]
     return {
         "verdict": Verdict.NAMED.value if len(alike) == 1 else Verdict.AMBIGUOUS.value,
         "effects": [law.kind],
-        "candidates": [sorted(alike, key=lambda kind: -shares[kind])],
-        "probabilities": {**shares, "elsewhere": 1 - first.probability},
-        "probability": sum(shares[kind] for kind in alike),
+        "candidates": [sorted(alike, key=lambda kind: -fractions[kind])],
+        "probabilities": {**fractions, "elsewhere": 1 - first.probability},
+        "probability": sum(fractions[kind] for kind in alike),
         "decide_by": None,
         "parameters": {
             f"{law.kind}.{name}": {"value": value, "std": law.std[name]}

@@ -65,7 +65,7 @@ def write_next(
 
 
 def summarise_fit(
-    fit: JointFit, responses: Sequence[FittedResponse], shares: Sequence[Contribution] = ()
+    fit: JointFit, responses: Sequence[FittedResponse], fractions: Sequence[Contribution] = ()
 ) -> dict:
     """What a joint fit found, by name, in the units of the files."""
     std, unit = np.sqrt(np.diag(fit.covariance)), fit.modes.force_unit
@@ -99,7 +99,7 @@ def summarise_fit(
             "damping_std_relative": level["damping"],
         },
         "modal_mass": _modal_mass(fit),
-        "contributions": [share._asdict() for share in shares],
+        "contributions": [fraction._asdict() for fraction in fractions],
         "resonances": [load_named(_point(p), unit) for r in responses for p in r.resonances],
         "folds": [load_named(_point(p), unit) for r in responses for p in r.folds],
         "not_located": [

@@ -175,9 +175,11 @@ def write_normal_mode(
         ],
         "internal_resonance": list(branch.resonance),
     }
-    n_modes = branch.mode_share.shape[1]
+    n_modes = branch.mode_fraction.shape[1]
     if n_modes > 1:
-        columns |= {f"energy_share_mode_{k + 1}": branch.mode_share[:, k] for k in range(n_modes)}
+        columns |= {
+            f"energy_share_mode_{k + 1}": branch.mode_fraction[:, k] for k in range(n_modes)
+        }
     if len(branch.sensors) > 1:
         shape = branch.shape()
         columns |= {

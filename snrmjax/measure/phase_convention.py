@@ -82,9 +82,9 @@ def wrong_phases(data: SteadyStates, modes: LinearModes | Structure) -> tuple[Fa
     if best > _RIGHT or misfit[0] < max(_WRONG, _BETTER * best):
         return _wrong_size(near, fits[0], abs(constant)) if known else ()
     alike = [_READINGS[k] for k in np.flatnonzero(misfit <= _AS_GOOD * best)]
-    shares = {"as_given": float(misfit[0]), "read_so": best}
+    fractions = {"as_given": float(misfit[0]), "read_so": best}
     if len(alike) > 1:
-        return (Fact("phases_misread_alike", readings=tuple(map(tuple, alike)), **shares),)
+        return (Fact("phases_misread_alike", readings=tuple(map(tuple, alike)), **fractions),)
     size = fits[_READINGS.index(alike[0])].constant / abs(constant) if known else np.nan
     omega, turns = float(near.frequency.mean()), alike[0].quarter_turns
     # Over the model's constant: what displacements or accelerations in place of velocities need.
@@ -96,7 +96,11 @@ def wrong_phases(data: SteadyStates, modes: LinearModes | Structure) -> tuple[Fa
     same_sign = constant > 0
     return (
         Fact(
-            "phases_misread", **alike[0]._asdict(), instead=instead, same_sign=same_sign, **shares
+            "phases_misread",
+            **alike[0]._asdict(),
+            instead=instead,
+            same_sign=same_sign,
+            **fractions,
         ),
     )
 

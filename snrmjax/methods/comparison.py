@@ -177,7 +177,7 @@ def compare_methods(
     if not any(result.found.any() for result in results):
         why = MethodStatus(int(results[0].status[0])).message
         raise ValueError(f"no method found anything; {results[0].method}: {why}.")
-    return Comparison(tuple(results), stopped, read.states, read.facts(), read.company())
+    return Comparison(tuple(results), stopped, read.states, read.facts(), read.interfering())
 
 
 class _Read(NamedTuple):
@@ -198,7 +198,7 @@ class _Read(NamedTuple):
         left_out = (Fact("data_left_out", why=why) for why in self.unknown + self.without_states)
         return (*taken, *left_out)
 
-    def company(self) -> tuple[Fact, ...]:
+    def interfering(self) -> tuple[Fact, ...]:
         """How the mode of each free decay was isolated, and what else lies in the record."""
         return tuple(
             Fact("note_of_decay", name=test.recording.name, note=note)

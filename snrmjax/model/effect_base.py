@@ -20,14 +20,14 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from snrmjax.model.effect_metadata import (
-    Confusion,
+    Confounder,
     MotionScales,
     Parameter,
     Part,
     Shape,
 )
-from snrmjax.model.kinks import Kinks, with_kinks
 from snrmjax.model.modes import LinearModes
+from snrmjax.model.nonsmooth_points import NonsmoothPoints, with_nonsmooth_points
 from snrmjax.model.places import Row, checked_row
 from snrmjax.model.potential import PolynomialPotential
 
@@ -59,7 +59,7 @@ class AbstractEffect(eqx.Module):
     - `description`: what the effect is physically, in one sentence that reports print;
     - `shape`: which part of the force balance it changes, its symmetry and its power of amplitude;
       of a force that states none it is computed (see `shape_of`);
-    - `confusions`: other effects that the same data may show, and the measurement that separates
+    - `confounders`: other effects that the same data may show, and the measurement that separates
       them;
     - `like_force_gain`: a gain of all forces does the same;
     - `follows_force`: it adds a linear motion that the force drives, which beside a force of any
@@ -72,7 +72,7 @@ class AbstractEffect(eqx.Module):
     kind: ClassVar[str]
     description: ClassVar[str] = ""
     shape: ClassVar[Shape | None] = None
-    confusions: ClassVar[tuple[Confusion, ...]] = ()
+    confounders: ClassVar[tuple[Confounder, ...]] = ()
     like_force_gain: ClassVar[bool] = False
     follows_force: ClassVar[bool] = False
     only_phase: ClassVar[bool] = False
@@ -191,23 +191,25 @@ class AbstractMemoryless(AbstractForce):
         return jax.vmap(self.force)(displacement, velocity)
 
 
-class AbstractKinked(AbstractMemoryless):
+class AbstractNonsmooth(AbstractMemoryless):
     """A memoryless force whose slope jumps where a contact opens or closes.
 
     Harmonic balance evaluates a cycle at samples, of which a contact that opens between two of them
-    would make jumps; `cycle_force` therefore finds these times (see `with_kinks`). A class whose
-    force is a straight line between kinks may say so by `is_straight`.
+    would make jumps; `cycle_force` therefore finds these times (see `with_nonsmooth_points`). A
+    class whose force is a straight line between such points may say so by `is_straight`.
     """
 
     is_straight: ClassVar[bool] = False
 
     @abstractmethod
-    def kinks(self) -> Kinks:
+    def nonsmooth_points(self) -> NonsmoothPoints:
         """Where the slope jumps; elsewhere the force is smooth, and everywhere continuous."""
 
     def cycle_force(self, displacement: Samples, velocity: Samples) -> Samples:
         """The force over one period, such that Fourier sums over its samples are integrals."""
-        return with_kinks(super().cycle_force(displacement, velocity), displacement, self.kinks())
+        return with_nonsmooth_points(
+            super().cycle_force(displacement, velocity), displacement, self.nonsmooth_points()
+        )
 
 
 class AbstractHysteresis(AbstractForce):

@@ -159,10 +159,10 @@ class Shape(NamedTuple):
         return self.part is Part.DAMPING and self.power is not None and self.power > 0
 
 
-class Confusion(NamedTuple):
+class Confounder(NamedTuple):
     """Effects that measured states may not tell apart, and the measurement that does.
 
-    The effects are those whose classes name it among their `confusions`. With `by_itself` the
+    The effects are those whose classes name it among their `confounders`. With `by_itself` the
     measurement is asked for where one of them is in question beside any other effect. With
     `by_calibration` they do the same to every test of one mode: only a calibration tells them.
     """

@@ -41,8 +41,8 @@ class BaseMotion(NamedTuple):
         Arguments: `frequency` in rad/s, `acceleration` the amplitude in m/s².
         """
         moved = np.asarray(acceleration) / (1j * np.asarray(frequency))
-        share = self.cosines(points) if self.motion == "absolute" else np.zeros(len(points))
-        return moved[..., None] * share
+        fraction = self.cosines(points) if self.motion == "absolute" else np.zeros(len(points))
+        return moved[..., None] * fraction
 
 
 def base_motion(

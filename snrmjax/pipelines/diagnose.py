@@ -9,7 +9,7 @@ import numpy as np
 
 from snrmjax.diagnose.diagnosis import diagnose_model
 from snrmjax.diagnose.diagnosis_result import Diagnosis, FormerAnswer
-from snrmjax.diagnose.location.where import Whereabouts, few_places, locate_force
+from snrmjax.diagnose.location.where import Localisation, few_places, locate_force
 from snrmjax.diagnose.response_prediction import (
     HeldCurve,
     LevelPredictions,
@@ -51,7 +51,7 @@ class DiagnosedTest(NamedTuple):
     diagnosis: Diagnosis
     model: Structure  # as given
     simulated: SimulatedLevels | None = None  # None: not asked for, or nothing to simulate
-    where: Whereabouts | None = None  # None: nothing is missing, or there is but one place
+    where: Localisation | None = None  # None: nothing is missing, or there is but one place
 
     @property
     def is_placed(self) -> bool:
@@ -101,7 +101,7 @@ def diagnose_test(
     _log.info("compares %d states with the model", len(data.frequency))
     found = diagnose_model(model, data, former=former)
     _log.info("looks for the point where the missing force acts")
-    place = _whereabouts(found, data, model, where)
+    place = _localisation(found, data, model, where)
     if place is not None and DiagnosedTest(found, model, where=place).is_placed:
         found = _completed_at(found, place)
     if not (simulate and found.effects and found.completed is not None):
@@ -123,7 +123,7 @@ def diagnose_test(
     return DiagnosedTest(found, model, simulated, place)
 
 
-def _completed_at(found: Diagnosis, place: Whereabouts) -> Diagnosis:
+def _completed_at(found: Diagnosis, place: Localisation) -> Diagnosis:
     """The diagnosis whose completed model has the law at its place."""
     answer = found.answer._replace(completed=place.model)
     checks = found.checks._replace(completed_without={})  # these have effects on the mode
@@ -140,9 +140,9 @@ def _is_missed(level: LevelResponse) -> bool:
     return bool(off or abs(np.log(after.velocity / there.velocity)) > _FAR_APART)
 
 
-def _whereabouts(
+def _localisation(
     found: Diagnosis, data: SteadyStates, model: Structure, where: Sequence[str]
-) -> Whereabouts | None:
+) -> Localisation | None:
     """Where the force acts that a model lacks, if it lacks one and there is a choice."""
     missing = found.verdict not in (Verdict.NOTHING_MISSING, Verdict.NOISE_REJECTED)
     told = np.isfinite(np.asarray(data.force)).any() and not np.asarray(data.phase_unknown).any()

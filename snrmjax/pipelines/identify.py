@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from snrmjax.doctor.column_misreadings import doubt, linear_damping_note, with_doubt
+from snrmjax.doctor.column_misreadings import caveat, linear_damping_note, with_caveat
 from snrmjax.identify.coupled.coupled_modes import other_mode_moves
 from snrmjax.identify.coupled.coupled_test import CoupledDetails, coupled_details
 from snrmjax.identify.inference.contributions import Contribution, contributions
@@ -56,7 +56,7 @@ class FitDetails(NamedTuple):
     """A joint fit with what its bands are made of, and what to measure next."""
 
     fit: JointFit
-    shares: tuple[Contribution, ...]
+    fractions: tuple[Contribution, ...]
     advice: NextMeasurements | None  # None: no advice was asked for
     responses: tuple[FittedResponse, ...]  # under the advised forces, the main curves
 
@@ -147,12 +147,12 @@ def _by_points(data: SteadyStates, model: Structure, options: IdentifyOptions) -
             n_knots=options.knots,
         )
     except ValueError as error:
-        raise with_doubt(error, data, model) from error
+        raise with_caveat(error, data, model) from error
     backbone = found.backbone
     predictions = predictions_of_points(found, model, options)
     looked_at = backbone.sampled(_LOOKED_AT, reach=reach_of(options) if predictions else 1.0)
     notes = (
-        *doubt(data, model, found.points),
+        *caveat(data, model, found.points),
         *found.notes,
         *notes_on_negative_damping(looked_at),
         *notes_on_predictions(predictions, backbone, data),
@@ -184,10 +184,10 @@ def _by_joint_fit(data: SteadyStates, model: Structure, options: IdentifyOptions
     predictions, trends = predictions_of_fit(fit, options)
     _log.info("compares further measurements")
     advice = next_measurements(fit, options.further) if options.further else None
-    doubts = () if "force_gain" in fit.names() else doubt(data, model, found.points)
+    caveats = () if "force_gain" in fit.names() else caveat(data, model, found.points)
     reach = np.linspace(0.0, reach_of(options) if predictions else 1.0, _LOOKED_AT) * fit.largest[0]
     notes = (
-        *doubts,
+        *caveats,
         *data.notes,
         *outlying,
         *found.notes,

@@ -123,9 +123,9 @@ def simulate_responses(
         why = f": {held[0]}" if held else "; start farther from resonance."
         raise ValueError(f"no response was found in this range{why}")
     estimates = [np.max(c.truncation, initial=0.0) for c in curves if c.truncation is not None]
-    share = float(max(estimates, default=0.0))
-    if share > _TRUNCATED:
-        notes.append(Fact("harmonics_left_out", harmonics=harmonics, share=share))
+    fraction = float(max(estimates, default=0.0))
+    if fraction > _TRUNCATED:
+        notes.append(Fact("harmonics_left_out", harmonics=harmonics, fraction=fraction))
     events: list[EventCurve] = []
     if to is not None:
         for kind in follow:
@@ -210,7 +210,7 @@ def simulate_mode(
                 mode=tongue.mode + 1,
                 from_hz=tongue.from_frequency / HERTZ,
                 to_hz=tongue.to_frequency / HERTZ,
-                share=tongue.energy_share,
+                fraction=tongue.energy_fraction,
             )
             for tongue in branch.tongues
         ),

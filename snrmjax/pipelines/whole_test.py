@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from snrmjax.doctor.check import check_test
-from snrmjax.doctor.column_misreadings import doubt
+from snrmjax.doctor.column_misreadings import caveat
 from snrmjax.doctor.findings import Checkup
 from snrmjax.identify.joint.notes import outlying_states
 from snrmjax.identify.modal.modes_of_tests import find_modes
@@ -170,8 +170,8 @@ def not_diagnosed(data: SteadyStates, model: Structure) -> tuple[Note, ...]:
     The search would explain them by ever larger effects, which harmonic balance follows for many
     minutes. A mode that is merely far from the linear one is diagnosed: effects may be why.
     """
-    doubts = (*wrong_phases(data, model), *doubt(data, model))
-    return (Fact("diagnosis_left_out", why=str(doubts[0])),) if doubts else ()
+    caveats = (*wrong_phases(data, model), *caveat(data, model))
+    return (Fact("diagnosis_left_out", why=str(caveats[0])),) if caveats else ()
 
 
 def _note_on_steps(record: SteppedRecord) -> Note:

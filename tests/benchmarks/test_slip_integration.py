@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-SHARE, RATIO, LIMIT = 0.06, 0.02, 1e-4  # of the stiffness in the slider, damping, m
+FRACTION, RATIO, LIMIT = 0.06, 0.02, 1e-4  # of the stiffness in the slider, damping, m
 OWN = 2 * np.pi * np.array([1.0, 4.0, 9.0])
 
 
@@ -15,7 +15,7 @@ def integration(of_benchmark):
 def beams(integration, *, limit, moving=0.0, back=0.0, drive=(1.0, 0.0, 0.0)):
     """Beams of 1 Hz and 1 kg that differ in their one slider's limit; it sees the first mode."""
     n = len(limit)
-    one = [OWN, np.array(RATIO), np.array([[1.0, 0.0, 0.0]]), np.array([SHARE * OWN[0] ** 2])]
+    one = [OWN, np.array(RATIO), np.array([[1.0, 0.0, 0.0]]), np.array([FRACTION * OWN[0] ** 2])]
     own, damping, bending, stiffness = (np.repeat(part[None], n, axis=0) for part in one)
     shaker = (np.full(n, moving), np.full(n, back), np.zeros(n))
     limit = np.array(limit)[:, None]
@@ -35,11 +35,11 @@ def test_one_slider_has_jenkins_describing_function(integration):
     loss = 4 * limits * np.maximum(amplitude - limits, 0) / (np.pi * amplitude**2)
     assert amplitude[0] < limits[0]
     assert np.all(amplitude[1:] > 1.3 * limits[1:])
-    slider = SHARE * own**2 * (in_phase + 1j * loss)
+    slider = FRACTION * own**2 * (in_phase + 1j * loss)
     wanted = own**2 - omega**2 + 2j * RATIO * own * omega + slider
     found = 1j * omega * read.force / read.velocity
     # The slider's third harmonic and steps of a 96th of a cycle, of its part of the stiffness.
-    np.testing.assert_allclose(found, wanted, atol=3e-3 * SHARE * own**2)
+    np.testing.assert_allclose(found, wanted, atol=3e-3 * FRACTION * own**2)
     power = 0.5 * np.real(read.force * np.conj(read.velocity))
     np.testing.assert_allclose(read.dissipated, power, rtol=1e-3)
 
@@ -48,7 +48,7 @@ def test_what_is_recorded_is_the_beams_whatever_the_shaker_does(integration):
     drive = np.array([0.8, 0.5, -0.3])
     rows = beams(integration, limit=[1.0, 1.0], moving=0.3, back=0.5, drive=drive)
     frequency, ratio, shape = integration.linear_modes(rows)
-    np.testing.assert_allclose(frequency[0, 0], OWN[0] * np.sqrt(1 + SHARE), rtol=1e-12)
+    np.testing.assert_allclose(frequency[0, 0], OWN[0] * np.sqrt(1 + FRACTION), rtol=1e-12)
     omega = np.array([0.98, 1.03]) * OWN[0]
     _, read = integration.held(rows, np.ones(2), omega, integration.at_rest(rows), 120)
     each = omega[:, None]

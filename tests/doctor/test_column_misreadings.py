@@ -11,7 +11,7 @@ from truths.one_mode import OMEGA, SHAPE, ZETA, model, noisy, states, table
 
 import snrmjax as sj
 from snrmjax.doctor import column_misreadings
-from snrmjax.doctor.column_misreadings import doubt, linear_damping_note, with_doubt
+from snrmjax.doctor.column_misreadings import caveat, linear_damping_note, with_caveat
 from snrmjax.measure.phase_convention import wrong_phases
 from snrmjax.pipelines.identify import identify_test
 
@@ -40,7 +40,7 @@ def said(data, structure):
     natural = np.sqrt(np.abs(w**2 + balance.real))
     ratio = balance.imag / w / (2 * natural)
     level, every = np.asarray(data.level), np.ones(len(w), dtype=bool)
-    return doubt(data, structure, Points(level, np.abs(v) / w, natural, ratio, every))
+    return caveat(data, structure, Points(level, np.abs(v) / w, natural, ratio, every))
 
 
 @pytest.mark.parametrize(
@@ -80,7 +80,7 @@ def test_what_identification_says_of_phases_is_not_said_twice():
     level, w, f, v = states()
     data = table(level, w, f, noisy(v).conj())
     assert wrong_phases(data, model())[0]["conjugated"]
-    assert doubt(data, model()) == ()
+    assert caveat(data, model()) == ()
 
 
 def test_another_assembly_is_doubted():
@@ -100,17 +100,17 @@ def test_another_assembly_is_doubted():
 
 def test_few_states_and_voltages_are_left_alone():
     data = few(lambda w, f, v: (f, 1e3 * v))
-    assert doubt(data.select(np.arange(7)), model()) == ()
+    assert caveat(data.select(np.arange(7)), model()) == ()
     level, w, f, v = (column[FEW] for column in states())
     driven = sj.measure.steady_states(level, w, np.full(9, np.nan), v, drive=f, sensors=("tip",))
-    assert doubt(driven, model()) == ()
+    assert caveat(driven, model()) == ()
 
 
 def test_an_error_of_identification_says_why():
     data = few(lambda w, f, v: (f, v / (1j * w)))
-    told = str(with_doubt(ValueError("no points."), data, model()))
+    told = str(with_caveat(ValueError("no points."), data, model()))
     assert told.startswith("no points. the responses are displacements")
-    assert str(with_doubt(ValueError("no points."), few(), model())) == "no points."
+    assert str(with_caveat(ValueError("no points."), few(), model())) == "no points."
 
 
 def test_damping_at_rest_is_compared_with_the_linear_tests(monkeypatch):

@@ -7,7 +7,7 @@ from truths.one_mode import CUBIC, OMEGA, SHAPE, ZETA, model, noisy, states, tab
 
 import snrmjax as sj
 from snrmjax.doctor.findings import KINDS, SEVERITIES, Finding
-from snrmjax.doctor.judgement import Scale, checked_states, judge, with_mass
+from snrmjax.doctor.fitted_hypothesis import Scale, checked_states, fit_hypothesis, with_mass
 from snrmjax.doctor.scale_findings import is_other_scale
 from snrmjax.measure import Channel, time_recording
 
@@ -55,7 +55,7 @@ def test_errors_that_were_stated_too_small_hide_no_wrong_scale():
 def test_an_unsure_modal_mass_is_no_wrong_scale():
     level, w, force, v = states()
     seen = checked_states(table(level, w, force, v), model(), 0, np.ones(len(v), dtype=bool))
-    right, wrong = judge(seen.test), judge(with_mass(seen.test, 1.5))
+    right, wrong = fit_hypothesis(seen.test), fit_hypothesis(with_mass(seen.test, 1.5))
     assert is_other_scale(Scale(right, 1.5, 0.01), wrong)
     assert not is_other_scale(Scale(right, 1.5, 0.2), wrong)  # its 95 % band has 1.01 in it
     # Volts of 4.5 V/N need not be known to 5 % for it.

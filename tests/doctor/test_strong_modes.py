@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import snrmjax as sj
-from snrmjax.doctor.column_misreadings import doubt
+from snrmjax.doctor.column_misreadings import caveat
 from snrmjax.measure import steady_states
 
 OMEGA, ZETA, SHAPE = 2 * np.pi * 137.0, 6e-4, 3.0
@@ -49,7 +49,7 @@ def test_hardening_by_tens_and_hundreds_of_bandwidths_is_no_error(shift, apart):
     """A bandwidth is 0.12 %: resonances move by 16 to 290 of them, levels by up to 7."""
     data = table(*upsweep(shift, apart))
     assert sj.doctor.check_test(data, model()).kinds == ()
-    assert doubt(data, model()) == ()
+    assert caveat(data, model()) == ()
 
 
 @pytest.mark.parametrize(

@@ -53,10 +53,12 @@ def test_all_methods_follow_the_mode(compared):
 
 def test_the_company_is_told(compared):
     kinds = [note["note"].kind for note in compared.decays]
-    assert kinds[:3] == ["mode_isolated", "company_of_decay", "bias_of_mode_filter"]
-    (company,) = [n["note"] for n in compared.decays if n["note"].kind == "company_of_decay"]
-    assert company["frequency_hz"] == pytest.approx(140, abs=1.5)
-    assert "other motion" in str(company)
+    assert kinds[:3] == ["mode_isolated", "interfering_modes_of_decay", "bias_of_mode_filter"]
+    (interfering,) = [
+        n["note"] for n in compared.decays if n["note"].kind == "interfering_modes_of_decay"
+    ]
+    assert interfering["frequency_hz"] == pytest.approx(140, abs=1.5)
+    assert "other motion" in str(interfering)
 
 
 def run(tmp_path, monkeypatch, capsys, data):

@@ -87,15 +87,17 @@ def test_the_record_of_a_form_and_its_derivatives():
 @pytest.mark.parametrize(("noise", "seeds"), [(1e-3, 20), (1e-2, 60), (5e-2, 20)])
 def test_bands_cover(decay, noise, seeds):
     time, velocity = decay
-    shares = []
+    fractions = []
     for seed in range(seeds):
         rng = np.random.default_rng([seed, round(1e4 * noise)])
         added = noise * velocity.max() * rng.standard_normal(len(time))
-        shares.append(np.abs(scores(sj.methods.ssm(time, velocity + added))[0]))
-    within, independent = np.array(shares), 5 * seeds  # five coefficients a curve
-    for size, share in ((1.0, 0.683), (1.96, 0.95)):
+        fractions.append(np.abs(scores(sj.methods.ssm(time, velocity + added))[0]))
+    within, independent = np.array(fractions), 5 * seeds  # five coefficients a curve
+    for size, fraction in ((1.0, 0.683), (1.96, 0.95)):
         found = np.mean(within < size, axis=(0, 2))
-        assert np.all(np.abs(found - share) < 3 * np.sqrt(share * (1 - share) / independent))
+        assert np.all(
+            np.abs(found - fraction) < 3 * np.sqrt(fraction * (1 - fraction) / independent)
+        )
 
 
 def test_bad_records_are_refused(decay):

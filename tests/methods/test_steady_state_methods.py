@@ -40,13 +40,13 @@ def table(level, frequency, stiffness, displacement):
     )
 
 
-def constant_force(forces=(0.05, 0.1, 0.2), shares=(0.3, 0.5, 0.7, 0.9, 0.98), sides=(-1, 1)):
+def constant_force(forces=(0.05, 0.1, 0.2), fractions=(0.3, 0.5, 0.7, 0.9, 0.98), sides=(-1, 1)):
     """Levels of constant force, states of equal displacement on both sides."""
     rows = []
     for level, force in enumerate(forces, 1):
         grid = np.linspace(1e-9, 1e-2, 200_001)
         peak = grid[np.argmax(grid * loss_of(grid) * square_of(grid) > force)]
-        for size in peak * np.array(shares):
+        for size in peak * np.array(fractions):
             half = np.sqrt((force / size) ** 2 - (loss_of(size) * square_of(size)) ** 2)
             for side in sides:
                 rows.append((level, np.sqrt(square_of(size) + side * half), size))
@@ -108,7 +108,7 @@ def test_held_displacements_are_no_pairs():
 
 
 def test_levels_of_constant_force_are_cut_at_equal_displacement():
-    data = constant_force(forces=(0.05, 0.07, 0.1, 0.14), shares=np.linspace(0.3, 0.999, 60))
+    data = constant_force(forces=(0.05, 0.07, 0.1, 0.14), fractions=np.linspace(0.3, 0.999, 60))
     result = sj.methods.rct(data, modes_of())
     assert result.found.sum() > 5
     assert [note.kind for note in result.notes] == ["sections_between_levels"]
@@ -170,7 +170,7 @@ def test_describing_function_of_a_spring_in_a_chain():
 @pytest.mark.parametrize("method", [sj.methods.concerto, sj.methods.arslan_ozguven])
 def test_stated_errors_are_carried_to_the_answers(method):
     """1σ against the scatter of noisy repeats, at the level's own amplitudes."""
-    clean = constant_force(forces=(0.1,), shares=(0.45, 0.55, 0.65, 0.75))
+    clean = constant_force(forces=(0.1,), fractions=(0.45, 0.55, 0.65, 0.75))
     rng = np.random.default_rng(4)
     velocity = np.asarray(clean.velocity)
     own = {"velocity_std": 0.003 * np.abs(velocity), "phase_std": np.full(velocity.shape, 0.006)}

@@ -18,7 +18,7 @@ SAMPLES = 1024
 # The trapezoidal rule is exact for polynomials; a kink costs about h²/12 times the jump of the
 # slope over the average itself, a jump (which lies midway between samples) h²/24.
 EXACT = 1e-12
-KINK = (2 * np.pi / SAMPLES) ** 2
+NONSMOOTH_POINT = (2 * np.pi / SAMPLES) ** 2
 
 
 def engaged(amplitude, gap=0.4):
@@ -74,7 +74,7 @@ FORMULAS = {
         of_kind("quadratic_damping", coefficient=1.3),
         lambda Q, W: 0.0,
         lambda Q, W: 8 * 1.3 * W * Q / (3 * np.pi),
-        KINK,
+        NONSMOOTH_POINT,
     ),
     "cubic damping": (
         of_kind("cubic_damping", coefficient=1.3),
@@ -120,12 +120,12 @@ def test_amplitudes_and_frequencies_broadcast():
 
 
 @pytest.mark.parametrize(("kind", "kinks"), [("gap_stiffness", 2), ("one_sided_stop", 1)])
-def test_contacts_are_sharp_and_exact_between_samples(kind, kinks):
+def test_contacts_are_sharp_and_exact_between_samples(kind, nonsmooth_points):
     stiffness, gap = 1.3, 0.4
     effect = make_effect(kind, {"stiffness": stiffness, "gap": gap})
     amplitude = np.array([0.3, 0.4001, 0.5, 0.9, 4.0])
     average = averaged_effect(effect, jnp.asarray(amplitude), jnp.array(2.0), n_samples=256)
-    wanted = 0.5 * kinks * stiffness * engaged(amplitude)
+    wanted = 0.5 * nonsmooth_points * stiffness * engaged(amplitude)
     np.testing.assert_allclose(average.stiffness, wanted, rtol=0, atol=1e-7)
     np.testing.assert_allclose(average.damping, 0.0, atol=1e-8)
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxtyping import Array
+from snrmjax.model.library.confounders import CONFOUNDERS
 
 from snrmjax.model.averaging import averaged_effect
 from snrmjax.model.effect_base import AbstractForce, AbstractMemoryless
@@ -22,7 +23,6 @@ from snrmjax.model.effect_metadata import (
 )
 from snrmjax.model.effect_shape import computed_shape, shape_of, starts_of
 from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
-from snrmjax.model.library.confusions import CONFUSIONS
 from snrmjax.numerics.rules import POSITIVE
 
 FORCES = [kind for kind, effect in EFFECTS.items() if issubclass(effect, AbstractForce)]
@@ -90,12 +90,12 @@ def test_an_effect_is_described(kind):
 
 
 def test_every_confusion_has_those_whom_it_confuses():
-    assert len(set(CONFUSIONS)) == len(CONFUSIONS)
-    for one in CONFUSIONS:
-        members = [kind for kind, effect in EFFECTS.items() if one in effect.confusions]
+    assert len(set(CONFOUNDERS)) == len(CONFOUNDERS)
+    for one in CONFOUNDERS:
+        members = [kind for kind, effect in EFFECTS.items() if one in effect.confounders]
         assert len(members) > 1 or one.by_itself
-    stated = {one for effect in EFFECTS.values() for one in effect.confusions}
-    assert stated == set(CONFUSIONS)
+    stated = {one for effect in EFFECTS.values() for one in effect.confounders}
+    assert stated == set(CONFOUNDERS)
 
 
 UNITS = {"kg": (1, 0, 0), "m": (0, 1, 0), "s": (0, 0, 1), "1": (0, 0, 0)}

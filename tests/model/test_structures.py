@@ -96,12 +96,12 @@ def test_potential_energy_is_the_work_of_the_forces():
     q = np.array([0.9, -0.8])
     # Work along the straight line from rest by the trapezoidal rule with 20001 samples, whose
     # error at the kinks is below 1e-8; Gauss's 64 points leave about 1e-4 of a kinked force.
-    share = np.linspace(0, 1, 20001)[:, None]
-    path = share * q
+    fraction = np.linspace(0, 1, 20001)[:, None]
+    path = fraction * q
     forces = eqx.filter_jit(type(model).nonlinear_force)
     force = np.asarray(forces(model, jnp.asarray(path), jnp.zeros(path.shape)))
     force = force + np.asarray(model.modes.natural_frequency) ** 2 * path
-    work = np.trapezoid(force @ q, share[:, 0])
+    work = np.trapezoid(force @ q, fraction[:, 0])
     energy = eqx.filter_jit(type(model).potential_energy)(model, jnp.asarray([q, 0 * q]))
     assert float(energy[0]) == pytest.approx(work, rel=1e-4)
     assert float(energy[1]) == 0.0

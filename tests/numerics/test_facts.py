@@ -58,7 +58,7 @@ def test_no_sentence_without_a_fact():
 def test_templates_count_share_and_list(monkeypatch):
     table = {"example": "{n:#state} of levels {levels}, {share:%.2g}"}
     monkeypatch.setattr("snrmjax.report.sentences.wordings", lambda: table)
-    fact = Fact("example", n=1, levels=(1, 2, 5), share=0.0512)
+    fact = Fact("example", n=1, levels=(1, 2, 5), fraction=0.0512)
     assert sentence(fact) == str(fact) == "1 state of levels 1, 2 and 5, 5.1 %"
 
 

@@ -12,7 +12,7 @@ from truths.printed_page import unreadable
 
 import snrmjax as sj
 from snrmjax.diagnose.location.laws_at_places import PlacedLaw
-from snrmjax.diagnose.location.where import PlacedForce, Whereabouts
+from snrmjax.diagnose.location.where import Localisation, PlacedForce
 from snrmjax.diagnose.misfit.locating import Located
 from snrmjax.diagnose.verdict import Verdict
 from snrmjax.io.units import HERTZ
@@ -289,7 +289,7 @@ def test_a_law_at_a_place_has_physical_units_in_the_terminal(drag):
     law = PlacedLaw("cubic_stiffness", 1.0, 10, {"coefficient": 2e4}, {"coefficient": 300.0})
     place = PlacedForce("tip", (("tip", 1.0),), 0.9, law, {"cubic_stiffness": 1.0})
     other = place._replace(name="everywhere", row=None, probability=0.1)
-    where = Whereabouts(
+    where = Localisation(
         *((place, other), given, None, ("tip", "everywhere"), np.array([0.9, 0.1])), misfit=1.0
     )
     poor = dataclasses.replace(found, verdict=Verdict.UNKNOWN)

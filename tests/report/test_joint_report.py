@@ -122,7 +122,7 @@ def test_bars_of_one_colour_are_the_whole_variance(told, figures):
     assert sum(bars["damping"]) == pytest.approx(100, abs=1e-6)
     names = [text.get_text() for text in axes.get_yticklabels()]
     # Five levels' gains are one bar.
-    gains = sum(s.damping_share for s in told.shares if s.source.startswith("gain of level"))
+    gains = sum(s.damping_fraction for s in told.fractions if s.source.startswith("gain of level"))
     assert bars["damping"][names.index("gain of levels")] == pytest.approx(100 * gains)
     assert axes.yaxis_inverted()
 

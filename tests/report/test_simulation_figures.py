@@ -83,13 +83,13 @@ def test_normal_mode_of_a_pair_shows_shares_shape_and_instability():
     model = sj.model.from_matrices(*matrices, force="x1", effects=spring)
     branch = sj.nonlinear_normal_mode(model, 1.3, harmonic_order=5)
     figure = branch.plot()
-    _, energies, shares, shapes = figure.axes
+    _, energies, fractions, shapes = figure.axes
     assert {"mode 1", "mode 2", "at x1", "at x2", "unstable"} <= legend_names(figure)
     dashed = [line for line in energies.lines if line.get_linestyle() == "--"]
     drawn = np.concatenate([line.get_ydata() for line in dashed])
     assert drawn.min() == pytest.approx(branch.frequency[branch.stability == 0].min() / HERTZ)
-    ends = {named(shares, f"mode {k}").get_color(): [] for k in (1, 2)}
-    for line in shares.lines:
+    ends = {named(fractions, f"mode {k}").get_color(): [] for k in (1, 2)}
+    for line in fractions.lines:
         if len(line.get_xdata()):
             ends[line.get_color()].append(line.get_ydata()[-1])
     np.testing.assert_allclose(sum(np.array(v) for v in ends.values()), 100.0, rtol=1e-12)

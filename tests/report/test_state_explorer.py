@@ -111,7 +111,7 @@ def test_a_browser_shows_the_record_of_the_state_that_is_tapped(page, tmp_path):
     # At first the state that moves most: level 2 at resonance.
     assert "Velocity: level 2, 10.0000 Hz" in answer["before"]
     assert "Velocity: level 2, 9.9000 Hz" in answer["after"]
-    assert answer["shares"][1:] == pytest.approx([10.0, 0.0], abs=1e-4)
+    assert answer["fractions"][1:] == pytest.approx([10.0, 0.0], abs=1e-4)
     assert "Velocity of no record: level 1, 10.0000 Hz" in answer["none"]
     # Level 1 is hidden in all three panels, level 2 in none.
     assert (answer["hidden"], answer["drawn"]) == (3, 6)

@@ -38,16 +38,19 @@ def curve():
 
 def changed(shifts):
     """The force and the oscillator, every number times one plus its shift."""
-    model, share = oscillator(), 1 + shifts
-    return FORCE * share[0], eqx.tree_at(
+    model, fraction = oscillator(), 1 + shifts
+    return FORCE * fraction[0], eqx.tree_at(
         lambda m: (
             *(m.potential.coefficient, m.modes.natural_frequency),
             *(m.modes.damping_ratio, m.effects[0].coefficient),
         ),
         model,
         (
-            *(model.potential.coefficient * share[1:3], model.modes.natural_frequency * share[3]),
-            *(model.modes.damping_ratio * share[4], model.effects[0].coefficient * share[5]),
+            *(
+                model.potential.coefficient * fraction[1:3],
+                model.modes.natural_frequency * fraction[3],
+            ),
+            *(model.modes.damping_ratio * fraction[4], model.effects[0].coefficient * fraction[5]),
         ),
     )
 

@@ -107,8 +107,8 @@ def accelerations(structure, force, rate, driven=0):
 
 def held_linear(force):
     """A force as it is between samples when it is linear there: its spectrum times sinc²."""
-    share = np.fft.rfftfreq(len(force))
-    return np.fft.irfft(np.fft.rfft(force) * np.sinc(share) ** 2, len(force))
+    fraction = np.fft.rfftfreq(len(force))
+    return np.fft.irfft(np.fft.rfft(force) * np.sinc(fraction) ** 2, len(force))
 
 
 def random_force(rng, samples, rate, top):

@@ -103,8 +103,10 @@ def _refitted(
     """
     scaled, size = unit_columns(fit.slopes)
     both = misfit.noise.decorrelated(np.column_stack([scaled, fit.rows]).T, kept)
-    arms, left = both[:-1].T, both[-1]
-    change = -np.linalg.pinv(arms.T @ arms, rcond=1e-12) @ (arms.T @ left)
+    sensitivities, left = both[:-1].T, both[-1]
+    change = -np.linalg.pinv(sensitivities.T @ sensitivities, rcond=1e-12) @ (
+        sensitivities.T @ left
+    )
     return change / size, fit.rows + scaled @ change
 
 

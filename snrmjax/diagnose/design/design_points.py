@@ -195,9 +195,9 @@ def shared_by_both(
 
 def refitted_chi_square(rows: Rows, covariance: SharedCovariance) -> float:
     """χ² when a fit's parameters have moved to where all rows put them, to first order."""
-    arms, left = unit_columns(rows.slopes)[0], covariance.decorrelated(rows.left)
-    arms = covariance.decorrelated(arms.T).T
-    along, values, _ = np.linalg.svd(arms, full_matrices=False)
+    sensitivities, left = unit_columns(rows.slopes)[0], covariance.decorrelated(rows.left)
+    sensitivities = covariance.decorrelated(sensitivities.T).T
+    along, values, _ = np.linalg.svd(sensitivities, full_matrices=False)
     # Directions that no state determines stay open.
     along = along[:, values > 1e-12 * max(values.max(initial=0.0), 1.0)]
     return float(np.sum((left - along @ (along.T @ left)) ** 2))

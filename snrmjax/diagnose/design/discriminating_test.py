@@ -117,18 +117,18 @@ def discriminating_test(found: FoundEffects, places: tuple[int, ...]) -> Discrim
         worst: DiscriminatingTest | None = None
         for hypothesis in hypotheses if all_rivals else []:
             test = hypothesis.expected(option)
-            if test is not None and (worst is None or _share(test) < _share(worst)):
+            if test is not None and (worst is None or _fraction(test) < _fraction(worst)):
                 worst = test
             if worst is None or not worst.settles:
                 break
         if worst is not None and worst.settles:
             return worst
-        if worst is not None and (best is None or _share(worst) > _share(best)):
+        if worst is not None and (best is None or _fraction(worst) > _fraction(best)):
             best = worst
     return best
 
 
-def _share(test: DiscriminatingTest) -> float:
+def _fraction(test: DiscriminatingTest) -> float:
     return (test.expected_gain or 0.0) / (test.needed_gain or 1.0)
 
 
@@ -334,13 +334,13 @@ def _difference(
         sizes = np.abs([first[most], second[most]])
         turned = abs(np.degrees(np.angle(second[most] / first[most]))) if sizes.min() > 0 else 0.0
         seen = sizes.min() > 0.1 * sizes.max() and turned > 1.0
-        harmonic = {"harmonic": option.orders[most], "shares": tuple(sizes.tolist())}
+        harmonic = {"harmonic": option.orders[most], "fractions": tuple(sizes.tolist())}
         turn = {"turned_deg": float(turned) if seen else None}
         difference = Fact("harmonics_apart", models=models, **harmonic, **turn)
         return f"harmonic {option.orders[most]}", difference
     if option.kind == "off_resonance":
-        share = float(np.abs(apart[rows, 0]).max())
-        return "velocity", Fact("velocities_apart", models=models, share=share)
+        fraction = float(np.abs(apart[rows, 0]).max())
+        return "velocity", Fact("velocities_apart", models=models, fraction=fraction)
     # The force goes with iΩδ + Δω̃² there: more of it is less velocity, or a higher frequency.
     modes, j = test.misfit.model.modes, test.misfit.model.modes.mode_of_interest
     slower = float(apart[at, 0].real)

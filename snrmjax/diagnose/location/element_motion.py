@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
-from snrmjax.model.effect_base import AbstractForce, AbstractKinked, AbstractMemoryless
+from snrmjax.model.effect_base import AbstractForce, AbstractMemoryless, AbstractNonsmooth
 from snrmjax.model.library.friction import CoulombFriction
 from snrmjax.numerics.blocks import by_blocks
 from snrmjax.numerics.compiled import compiled
@@ -124,7 +124,7 @@ def element_forces(
             nearby = _solved_motion(_Formula(_with_width(effect, width)), values, element)
             element = element._replace(motion=nearby.motion)
         effect = _with_width(effect, last)
-    formula = _Formula(effect, at_samples=rough and isinstance(effect, AbstractKinked))
+    formula = _Formula(effect, at_samples=rough and isinstance(effect, AbstractNonsmooth))
     return _solved_motion(formula, values, element, exact=exact)
 
 
@@ -156,11 +156,11 @@ def _solved_motion(
 
     force, slopes, missed = along(motion)
     steep, fresh = element.slopes, False
-    step, share = np.zeros_like(missed), np.ones(len(motion))
+    step, fraction = np.zeros_like(missed), np.ones(len(motion))
     for turn in range(_ROUNDS):
         if turn:
             trial = motion.copy()
-            trial[:, free] += share[:, None] * step
+            trial[:, free] += fraction[:, None] * step
             found = along(trial)
             ratio = np.linalg.norm(found[2], axis=1) / np.linalg.norm(missed, axis=1).clip(1e-300)
             going = _misses(missed) > _SETTLED
@@ -171,11 +171,11 @@ def _solved_motion(
                 steep = None
             elif fresh:
                 # As much less as the step promises: the next one may be twice as long.
-                longer = np.minimum(2 * share, 1.0)
-                share = np.where(ratio < 1 - 0.5 * share, longer, share)
-                share = np.where(taken | ~going, share, 0.25 * share)
+                longer = np.minimum(2 * fraction, 1.0)
+                fraction = np.where(ratio < 1 - 0.5 * fraction, longer, fraction)
+                fraction = np.where(taken | ~going, fraction, 0.25 * fraction)
                 steep = None if np.any(ratio[taken] > _QUICK) else steep
-        going = (_misses(missed) > _SETTLED) & (share >= _LEAST_STEP)
+        going = (_misses(missed) > _SETTLED) & (fraction >= _LEAST_STEP)
         if not going.any():
             break
         fresh = steep is None
@@ -199,7 +199,7 @@ def force_along(
 ) -> Complex[np.ndarray, "state order"]:
     """Harmonics of a law's force along the motions as they are given."""
     motion = _real_parts(element.motion)
-    formula = _Formula(effect, at_samples=isinstance(effect, AbstractKinked))
+    formula = _Formula(effect, at_samples=isinstance(effect, AbstractNonsmooth))
     return _complex(_force_and_slopes(formula, values, motion, element.frequency)[0])
 
 
@@ -270,7 +270,7 @@ def _some_slopes(
     frequency: Float[Array, " state"],
 ) -> tuple[Float[Array, "state part"], Float[Array, "state part argument"]]:
     # Slopes need no exact times of contact.
-    by_samples = formula._replace(at_samples=isinstance(formula.effect, AbstractKinked))
+    by_samples = formula._replace(at_samples=isinstance(formula.effect, AbstractNonsmooth))
 
     def one(motion: Array, omega: Array) -> tuple[Array, Array]:
         def force(given: Array) -> tuple[Array, Array]:

@@ -194,8 +194,8 @@ class LawAtPlace:
         asked = -np.sum(self.free.weights * (self.records.seen - self.place.driven), axis=2)
         given = force_along(self.effect, values, self.first)[:, list(self.records.orders)]
         size = np.sum(np.abs(given) ** 2)
-        share = np.sum((asked * given.conj()).real) / size if size > 0 else 1.0
-        return np.append(values[0] * (share if share > 0 else 1.0), values[1:])
+        fraction = np.sum((asked * given.conj()).real) / size if size > 0 else 1.0
+        return np.append(values[0] * (fraction if fraction > 0 else 1.0), values[1:])
 
 
 def law_fit(

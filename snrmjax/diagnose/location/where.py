@@ -54,7 +54,7 @@ class PlacedForce(NamedTuple):
     laws: dict[str, float]  # probabilities of laws there, if the force is of one of them
 
 
-class Whereabouts(AbstractResult):
+class Localisation(AbstractResult):
     """Places of a nonlinear force, the most probable first; see `locate_force`.
 
     `misfit` is the root of what the best place leaves, in units of the noise: well above one, the
@@ -137,7 +137,7 @@ def locate_force(
     candidates: Mapping[str, object] | Sequence[str] = (),
     *,
     laws: Sequence[str] = (),
-) -> Whereabouts:
+) -> Localisation:
     """Say at which of some places a force acts that the model lacks.
 
     A force along a row moves all sensors at every harmonic by the linear structure's response to
@@ -151,7 +151,7 @@ def locate_force(
     pairs ("a-b": between a and b), or rows by name; by default all points and neighbouring pairs in
     their order. `EVERYWHERE`, a force on the mode of interest, is always among them. `laws` are
     kinds of effects, by default all forces of the library.
-    Returns `Whereabouts`. Raises `ValueError` for unknown points, no candidate, unknown phases.
+    Returns `Localisation`. Raises `ValueError` for unknown points, no candidate, unknown phases.
     Validity: one force at one place beside a linear structure that is right.
     Not differentiable: differentiate the force that a motion needs:
     `snrmjax.identify.inverse_force`.
@@ -181,7 +181,7 @@ def locate_force(
         PlacedForce(name, rows[name][0], float(p), *best.get(name, (None, {})))
         for name, p in zip(names, probability[order], strict=True)
     )
-    return Whereabouts(
+    return Localisation(
         places=places,
         model=_completed(model, places[0]),
         settled_by=_settling_point(chosen, modes, [rows[name][1] for name in names[:2]]),
@@ -262,9 +262,9 @@ def _by_laws(
         # A parameter more costs what it explains of noise alone.
         terms = -0.5 * counts * np.log(worse) - np.array([len(fit.std) for fit in there])
         evidence[name] = float(np.logaddexp.reduce(terms))
-        shares = np.exp(terms - evidence[name])
-        kinds = {fit.kind: float(share) for fit, share in zip(there, shares, strict=True)}
-        best[name] = there[int(np.argmax(shares))], kinds
+        fractions = np.exp(terms - evidence[name])
+        kinds = {fit.kind: float(fraction) for fit, fraction in zip(there, fractions, strict=True)}
+        best[name] = there[int(np.argmax(fractions))], kinds
     return best, evidence, least.chi_square / least.freedom
 
 

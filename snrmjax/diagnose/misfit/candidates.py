@@ -7,10 +7,10 @@ import numpy as np
 from jaxtyping import Float
 
 from snrmjax.identify.calibrate.calibration_states import ComparedColumns
-from snrmjax.model.effect_metadata import Confusion, MotionScales
+from snrmjax.model.effect_metadata import Confounder, MotionScales
 from snrmjax.model.effect_shape import starts_of
 from snrmjax.model.effects import EFFECTS, effect_parameters
-from snrmjax.model.library.confusions import CONFUSIONS
+from snrmjax.model.library.confounders import CONFOUNDERS
 from snrmjax.model.modes import LinearModes
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.facts import Fact
@@ -43,7 +43,9 @@ def parameter_labels(kind: str) -> tuple[str, ...]:
 def only_by_calibration(kinds: Iterable[str]) -> set[str]:
     """Those of some kinds of which another one does the same to every test of one mode."""
     found = (
-        _confused(confusion, kinds) for confusion in _confusions(kinds) if confusion.by_calibration
+        _confused(confounder, kinds)
+        for confounder in _confounders(kinds)
+        if confounder.by_calibration
     )
     return set().union(*(group for group in found if len(group) > 1))
 
@@ -51,25 +53,25 @@ def only_by_calibration(kinds: Iterable[str]) -> set[str]:
 def decide_by(kinds: set[str], *, harmonics: bool) -> list[Fact | str]:
     """The measurements that would settle which of several kinds it is, two at most."""
     fitting: list[Fact | str] = [
-        confusion.separated_by
-        for confusion in _confusions(kinds)
-        if len(_confused(confusion, kinds)) > 1 or confusion.by_itself
+        confounder.separated_by
+        for confounder in _confounders(kinds)
+        if len(_confused(confounder, kinds)) > 1 or confounder.by_itself
     ]
     if fitting:
         return list(dict.fromkeys(fitting))[:2]
     return [Fact("widen_range") if harmonics else Fact("record_harmonics")]
 
 
-def _confusions(kinds: Iterable[str]) -> list[Confusion]:
+def _confounders(kinds: Iterable[str]) -> list[Confounder]:
     """What some kinds may be confused with: of the library in its order, then of a user."""
-    found = [confusion for kind in kinds for confusion in EFFECTS[kind].confusions]
-    library = [one for one in CONFUSIONS if one in found]
-    return library + [one for one in dict.fromkeys(found) if one not in CONFUSIONS]
+    found = [confounder for kind in kinds for confounder in EFFECTS[kind].confounders]
+    library = [one for one in CONFOUNDERS if one in found]
+    return library + [one for one in dict.fromkeys(found) if one not in CONFOUNDERS]
 
 
-def _confused(confusion: Confusion, kinds: Iterable[str]) -> set[str]:
+def _confused(confounder: Confounder, kinds: Iterable[str]) -> set[str]:
     """Those of some kinds that a confusion names."""
-    return {kind for kind in kinds if confusion in EFFECTS[kind].confusions}
+    return {kind for kind in kinds if confounder in EFFECTS[kind].confounders}
 
 
 class Coordinates(NamedTuple):

@@ -107,8 +107,8 @@ def fit_effect(
         together = misfit.evaluated(labels, values)
         for parameters, rows, slopes in zip(values, *together, strict=True):
             by = law.slopes(parameters, slopes) * unit
-            left, arms = misfit.noise.decorrelated(rows), misfit.noise.decorrelated(by.T).T
-            found.append(_Evaluated(parameters, rows, slopes, by, left, arms))
+            left, sensitivities = misfit.noise.decorrelated(rows), misfit.noise.decorrelated(by.T).T
+            found.append(_Evaluated(parameters, rows, slopes, by, left, sensitivities))
         return found
 
     def linearised(points: np.ndarray) -> list[_Evaluated]:

@@ -41,7 +41,7 @@ def locate_misfit(misfit: WeightedMisfit, base: EffectFit) -> tuple[Located, ...
         covariance.decorrelated((misfit.by_linear[:, [k]] * hats[noise.state])[of_force].T).T
         for k in range(2)
     ]
-    alone = [_fitted(left, arms)[0] for arms in curves]
+    alone = [_fitted(left, sensitivities)[0] for sensitivities in curves]
     free, values, spread = _fitted(left, np.concatenate(curves, axis=1))
     n_force = int(of_force.sum())
     if misfit.predictions.sizes.alone.any():  # they are not linear in a curve
@@ -79,10 +79,10 @@ def _range(speed: np.ndarray, seen: np.ndarray | None = None) -> tuple[float, fl
 
 
 def _fitted(
-    left: Float[np.ndarray, " row"], arms: Float[np.ndarray, "row column"]
+    left: Float[np.ndarray, " row"], sensitivities: Float[np.ndarray, "row column"]
 ) -> tuple[float, np.ndarray, np.ndarray]:
     """χ², the most likely values of some columns, and their covariance."""
-    scaled, size = unit_columns(arms)
+    scaled, size = unit_columns(sensitivities)
     inverse = np.linalg.pinv(scaled.T @ scaled, rcond=1e-10, hermitian=True)
     values = -inverse @ (scaled.T @ left)
     left = left + scaled @ values
@@ -101,8 +101,8 @@ def power_of_amplitude(
     powers = np.arange(-4.0, 8.0, step)
     # Straight pieces miss a power by a fiftieth of the change.
     straight = (0.02 * values) ** 2 + 1e-12 * np.trace(covariance)
-    doubt = covariance + np.diag(straight)
-    root = np.linalg.inv(np.linalg.cholesky(doubt))
+    caveat = covariance + np.diag(straight)
+    root = np.linalg.inv(np.linalg.cholesky(caveat))
     curve, shapes = root @ values, root @ np.exp(np.outer(logarithm, powers))
     explained = (curve @ shapes) ** 2 / np.sum(shapes**2, axis=0)
     best = int(np.argmax(explained))

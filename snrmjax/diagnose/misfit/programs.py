@@ -21,8 +21,8 @@ from snrmjax.identify.calibrate.inverse_force import StateWithErrors, residual_c
 from snrmjax.model.effect_base import (
     AbstractEffect,
     AbstractForce,
-    AbstractKinked,
     AbstractMemoryless,
+    AbstractNonsmooth,
 )
 from snrmjax.model.library.internal_resonances import AbstractInternalResonance
 from snrmjax.model.parameters import with_parameters
@@ -135,8 +135,8 @@ def missed(
             parts = {f.name: getattr(motion.balance, f.name) for f in fields(motion.balance)}
             balance = _ForcedBalance(**parts, forces=tuple(forces), active=asked.active)
             motion = dataclasses.replace(motion, balance=balance)
-            share = jnp.where(number > 0, 1e-2, 0.0)  # of a slope's first step: the last one
-            end = motion.solved_by_secants(inverse, start, close, share)
+            fraction = jnp.where(number > 0, 1e-2, 0.0)  # of a slope's first step: the last one
+            end = motion.solved_by_secants(inverse, start, close, fraction)
             # Where the second motion is not found, the first step towards it is its slope.
             lost = (number > 0) & ~jnp.all(jnp.isfinite(end.point))
             point = jnp.where(lost, start.point + end.moves[0], end.point)
@@ -207,7 +207,7 @@ def _where(
 
 
 def _samples(force: AbstractForce) -> int:
-    plain = isinstance(force, AbstractMemoryless) and not isinstance(force, AbstractKinked)
+    plain = isinstance(force, AbstractMemoryless) and not isinstance(force, AbstractNonsmooth)
     return 128 if plain else 256
 
 

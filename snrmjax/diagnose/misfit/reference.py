@@ -183,7 +183,7 @@ def with_first_gain(
     gains = np.abs(needed if unknown.any() else part)
     if not np.any(np.isfinite(gains)):
         raise ValueError("the model has no motion of the measured amplitude for any state.")
-    gain, doubt, from_curves = float(np.median(gains[np.isfinite(gains)])), None, False
+    gain, caveat, from_curves = float(np.median(gains[np.isfinite(gains)])), None, False
     # Twice: the first curves' prior lies about what the model as given needs.
     for _ in range(0 if unknown.any() else 2):
         reference = reference_of(
@@ -193,9 +193,9 @@ def with_first_gain(
             break
         mass, std = reference.posterior.modal_mass
         if not mass > 0:  # no passive structure's: the first value stays
-            doubt = force_gain_undetermined(np.inf, 0.0)
+            caveat = force_gain_undetermined(np.inf, 0.0)
             break
         gain, from_curves = gain / mass, True
-        doubt = force_gain_undetermined(std / mass, float(np.max(np.abs(phase))))
+        caveat = force_gain_undetermined(std / mass, float(np.max(np.abs(phase))))
     note = Fact("gain_of_drive", gain=gain, from_curves=from_curves)
-    return driven(gain), gain, (note, doubt) if doubt else (note,)
+    return driven(gain), gain, (note, caveat) if caveat else (note,)

@@ -156,8 +156,8 @@ def by_baseline(predictions: Predictions, values: Float[np.ndarray, " parameter"
     j = modes.mode_of_interest
     two = (f"mode_{j + 1}.natural_frequency", f"mode_{j + 1}.damping_ratio")
     found = predictions.of(values[None], (*stated, *two))
-    share = modes.damping_ratio.item(j) / modes.natural_frequency.item(j)
-    found.slopes[..., -2] -= share * found.slopes[..., -1]
+    fraction = modes.damping_ratio.item(j) / modes.natural_frequency.item(j)
+    found.slopes[..., -2] -= fraction * found.slopes[..., -1]
     std = np.array([*(std for _, std in stated.values()), 1.0, 1.0])
     return found._replace(slopes=found.slopes * std)
 

@@ -30,8 +30,8 @@ def sizes_of_remainders(every: int) -> list[float]:
 def _log_prior(sizes: Sizes) -> float:
     of_harmonic = len(sizes) == 1
     some = len(priors.HARMONIC_REMAINDERS) - 1 if of_harmonic else len(priors.REMAINDERS)
-    share = (1 - priors.NO_REMAINDER) / some
-    return float(sum(np.log(priors.NO_REMAINDER if s == 0 else share) for s in sizes))
+    fraction = (1 - priors.NO_REMAINDER) / some
+    return float(sum(np.log(priors.NO_REMAINDER if s == 0 else fraction) for s in sizes))
 
 
 class LawSums(NamedTuple):

@@ -152,7 +152,7 @@ def readings_of(
     # Curves may go with the forcing frequency too.
     states = states._replace(off_resonance_std=OFF_RESONANCE)
     found = fit_test(
-        states, compare_levels=False, tempered=phases_known, parts_of_noise=phases_known
+        states, compare_levels=False, power_likelihood=phases_known, parts_of_noise=phases_known
     )
     states = found.states
     balance = Balance(
@@ -163,7 +163,7 @@ def readings_of(
     slopes = now.by_error
     std = found.hyper.noise * states.errors
     std[:, 1:3] = np.hypot(std[:, 1:3], priors.FLOOR)
-    std = std / np.sqrt(found.share)
+    std = std / np.sqrt(found.fraction)
     root, _ = whitening(slopes, std, found.weight)
     # Records less the model's, by their straight line about the corrected motion.
     motion = model(now.velocity, omega)

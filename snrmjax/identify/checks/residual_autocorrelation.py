@@ -51,7 +51,7 @@ def residual_autocorrelation(
     return np.array(correlations)
 
 
-def share_told_by(
+def fraction_told_by(
     residuals: Float[np.ndarray, "state part"],
     level: Int[np.ndarray, " state"],
     frequency: Float[np.ndarray, " state"],

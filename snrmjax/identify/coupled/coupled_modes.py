@@ -113,7 +113,7 @@ class Interaction(NamedTuple):
     other: int
     ratio: int  # harmonic of the motion at which the other mode is excited
     detuning: float  # of the other mode from that harmonic, relative, the smallest measured
-    share: float  # of the energy that the other mode has at that harmonic, the largest measured
+    fraction: float  # of the energy that the other mode has at that harmonic, the largest measured
     probability: float  # that a term which couples them at this ratio is there
 
 
@@ -130,7 +130,7 @@ class CoupledModes(AbstractResult):
     probability: Float[np.ndarray, " interaction"] = quantity(
         "interaction", "1", "probability that the modes are coupled"
     )
-    share: Float[np.ndarray, " interaction"] = quantity(
+    fraction: Float[np.ndarray, " interaction"] = quantity(
         "interaction", "1", "largest share of the energy in the other mode"
     )
     coupled: bool = setting()
@@ -150,7 +150,8 @@ class CoupledModes(AbstractResult):
         """See `AbstractResult`."""
         lines = [
             f"mode {i.mode + 1} and mode {i.other + 1}, 1:{i.ratio}: probability "
-            f"{i.probability:.3g}, up to {100 * i.share:.2g} % of the energy in mode {i.other + 1}"
+            f"{i.probability:.3g}, up to {100 * i.fraction:.2g} % of the energy in mode "
+            f"{i.other + 1}"
             for i in self.interactions
         ]
         found = "coupled" if self.coupled else "not coupled"
@@ -232,7 +233,7 @@ def coupled_modes(
         calibration=final,
         interactions=interactions,
         probability=np.array([one.probability for one in interactions]),
-        share=np.array([one.share for one in interactions]),
+        fraction=np.array([one.fraction for one in interactions]),
         coupled=coupled,
         notes=(),
     )
@@ -252,7 +253,7 @@ def _candidates(data: SteadyStates, model: Structure) -> list[Interaction]:
         if away[ratio] > _NEAR or (ratio == _EVEN and not _even_recorded(data)):
             continue
         pair = Interaction(j, k, ratio, away[ratio], np.nan, np.nan)
-        found.append(pair._replace(share=_share(data, model, pair)))
+        found.append(pair._replace(fraction=_fraction(data, model, pair)))
     return found
 
 
@@ -293,7 +294,7 @@ def _even_recorded(data: SteadyStates) -> bool:
     return _EVEN in data.harmonic_order and bool(np.any(np.asarray(data.harmonic_std) > 0))
 
 
-def _share(data: SteadyStates, model: Structure, pair: Interaction) -> float:
+def _fraction(data: SteadyStates, model: Structure, pair: Interaction) -> float:
     """The largest share of both modes' energy that the other has at its harmonic; NaN unseen."""
     motion = modal_motions(data, model, (pair.mode, pair.other))
     energy = np.nansum(np.abs(motion) ** 2, axis=(1, 2))

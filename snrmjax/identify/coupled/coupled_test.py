@@ -125,7 +125,7 @@ class CoupledDetails(NamedTuple):
                 other=found.other + 1,
                 ratio=found.ratio,
                 probability=found.probability,
-                share=found.share,
+                fraction=found.fraction,
             )
         )
         velocity, frequency, damping, std = self.bias.at_largest

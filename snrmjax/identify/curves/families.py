@@ -134,8 +134,8 @@ class PowerLaw(AbstractFamily):
         relative, scale = near.amplitude / near.largest, jnp.asarray(near.largest)
         for power in cls.tried:
             columns = np.stack([np.ones(len(relative)), relative**power], axis=1)
-            share = power / cls.largest_exponent
-            start = [*near.fitted(columns), np.log(share / (1 - share))]
+            fraction = power / cls.largest_exponent
+            start = [*near.fitted(columns), np.log(fraction / (1 - fraction))]
             members.append(cls(jnp.asarray(start), scale, near.argument))
         return members
 

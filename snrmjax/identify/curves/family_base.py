@@ -79,8 +79,8 @@ def _drawn(x: Any, parameters: Any, terms: Terms, xp: Any) -> _Drawn:
     x = x[..., None]
     known = x > 0
     inside = xp.where(known, x, 1.0)
-    share = (expit if xp is np else jax.nn.sigmoid)(parameters[2]) if has_third else 0.0
-    exponents = xp.where(terms.is_free, terms.largest_exponent * share, terms.exponents)
+    fraction = (expit if xp is np else jax.nn.sigmoid)(parameters[2]) if has_third else 0.0
+    exponents = xp.where(terms.is_free, terms.largest_exponent * fraction, terms.exponents)
     powers = inside**exponents
     at_rest = xp.where(exponents == 0, 1.0, 0.0)
     rising = xp.where(known, exponents * powers / inside, xp.where(exponents == 1, 1.0, 0.0))
@@ -88,7 +88,7 @@ def _drawn(x: Any, parameters: Any, terms: Terms, xp: Any) -> _Drawn:
     slopes = xp.concatenate([rising, 2 * x * by_u], axis=-1)
     coefficients = terms.mix @ parameters + terms.offset
     by_exponent = xp.where(known & terms.is_free, powers * xp.log(inside), 0.0) @ coefficients[:n]
-    by_third = terms.largest_exponent * share * (1 - share) * by_exponent
+    by_third = terms.largest_exponent * fraction * (1 - fraction) * by_exponent
     # Dry friction: its equivalent damping grows without bound towards rest.
     dry = xp.sum(xp.where(terms.exponents < 0, coefficients[:n], 0.0))
     endless = (dry != 0) & (x[..., 0] <= 0)

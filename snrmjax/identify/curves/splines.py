@@ -53,9 +53,9 @@ class Spline(AbstractFamily):
     def starts(cls, order: int, near: Scattered) -> list[AbstractFamily]:
         """See `AbstractFamily`; knots at zero and where the amplitudes divide into equal parts."""
         scale = near.largest
-        shares = np.quantile(near.amplitude / scale, np.linspace(0, 1, order)[1:])
+        fractions = np.quantile(near.amplitude / scale, np.linspace(0, 1, order)[1:])
         # Knots that coincide, of levels at one amplitude, are drawn apart evenly instead.
-        knots = np.concatenate([[0.0], shares**2])
+        knots = np.concatenate([[0.0], fractions**2])
         if np.min(np.diff(knots)) < 0.02 / order:
             knots = np.linspace(0.0, 1.0, order) ** 2
         unit = jax.device_put(scale)
@@ -89,13 +89,13 @@ class SmoothingSpline(Spline):
 
     kind: ClassVar[str] = "smoothing_spline"
     orders: ClassVar[tuple[int, ...]] = (12,)
-    bends: Float[Array, "bend knot"]  # from values at the knots
-    bend_std: Float[Array, "*bend"]  # 1σ of the bends, one for all or each its own
+    roughness: Float[Array, "bend knot"]  # from values at the knots
+    roughness_std: Float[Array, "*bend"]  # 1σ of the bends, one for all or each its own
 
     def terms(self) -> Terms:
         """See `AbstractFamily`."""
         # One 1σ for all bends, or one each.
-        return super().terms()._replace(prior=self.bends / self.bend_std[..., None])
+        return super().terms()._replace(prior=self.roughness / self.roughness_std[..., None])
 
     @classmethod
     def through(
@@ -104,11 +104,11 @@ class SmoothingSpline(Spline):
         values: Float[np.ndarray, " knot"],
         scale: Float[Array, ""],
         argument: Argument,
-        bend_std: Float[np.ndarray, " bend"] | float = np.inf,
+        roughness_std: Float[np.ndarray, " bend"] | float = np.inf,
     ) -> "SmoothingSpline":
-        """See `Spline`; bends of all sizes are alike likely unless `bend_std` says otherwise."""
+        """See `Spline`; without `roughness_std` any roughness is equally likely."""
         mix = np.linalg.inv(spline_terms(knots, knots))
-        arrays = jax.device_put((values, knots, mix, bends_of(knots), bend_std))
+        arrays = jax.device_put((values, knots, mix, roughness_of(knots), roughness_std))
         return cls(arrays[0], scale, argument, *arrays[1:])
 
 
@@ -132,7 +132,7 @@ def amplitudes_apart(
     return np.array(apart)[np.round(pick).astype(int)][::-1]
 
 
-def bends_of(knots: Float[np.ndarray, " knot"]) -> Float[np.ndarray, "bend knot"]:
+def roughness_of(knots: Float[np.ndarray, " knot"]) -> Float[np.ndarray, "bend knot"]:
     """Change of slope at every inner knot, times the mean distance to its neighbours.
 
     A bend's variance is expected to grow with that distance, counted in logarithms of amplitude:

@@ -59,8 +59,8 @@ class Contribution(NamedTuple):
     """What one source of error contributes to the band of a curve."""
 
     source: str
-    frequency_share: float  # of the variance of ω̃, mean over amplitudes
-    damping_share: float  # of the variance of 2ζ̃ω̃
+    frequency_fraction: float  # of the variance of ω̃, mean over amplitudes
+    damping_fraction: float  # of the variance of 2ζ̃ω̃
     kind: str  # of source: what all levels, or all linear parameters, have in common
 
 
@@ -71,18 +71,18 @@ class Contributions(AbstractTable[Contribution]):
     columns: ClassVar = {
         "source": (lambda row: row.source, "", "source of error"),
         "kind": (lambda row: row.kind, "", "kind of source"),
-        "frequency_share": (
-            lambda row: row.frequency_share,
+        "frequency_fraction": (
+            lambda row: row.frequency_fraction,
             *("1", "share of the natural frequency's variance"),
         ),
-        "damping_share": (lambda row: row.damping_share, "1", "share of the variance of 2ζω"),
+        "damping_fraction": (lambda row: row.damping_fraction, "1", "share of the variance of 2ζω"),
     }
 
     def summary(self) -> tuple[str, ...]:
         """See `AbstractResult`."""
         listed = [
-            f"{row.source}: {100 * row.frequency_share:.1f} % of the variance of the natural "
-            f"frequency, {100 * row.damping_share:.1f} % of the damping's"
+            f"{row.source}: {100 * row.frequency_fraction:.1f} % of the variance of the natural "
+            f"frequency, {100 * row.damping_fraction:.1f} % of the damping's"
             for row in self.rows[:_LISTED]
         ]
         more = len(self.rows) - len(listed)
@@ -103,13 +103,13 @@ class Contributions(AbstractTable[Contribution]):
         together = [
             Contribution(
                 kind,
-                sum(row.frequency_share for row in self.rows if row.kind == kind),
-                sum(row.damping_share for row in self.rows if row.kind == kind),
+                sum(row.frequency_fraction for row in self.rows if row.kind == kind),
+                sum(row.damping_fraction for row in self.rows if row.kind == kind),
                 kind,
             )
             for kind in dict.fromkeys(row.kind for row in self.rows)
         ]
-        together.sort(key=lambda row: -row.frequency_share - row.damping_share)
+        together.sort(key=lambda row: -row.frequency_fraction - row.damping_fraction)
         return Contributions(tuple(together))
 
 
@@ -170,10 +170,10 @@ def contributions(fit: JointFit) -> Contributions:
     rows.append((name, name, inverse @ _bend_slopes(fit).T))
     summed = [np.sum((slopes @ columns) ** 2, axis=2) for *_, columns in rows]
     parts = np.stack(summed)
-    shares = np.mean(parts / np.sum(parts, axis=0), axis=1).tolist()
+    fractions = np.mean(parts / np.sum(parts, axis=0), axis=1).tolist()
     listed = [
-        Contribution(source, share[0], share[1], kind)
-        for (source, kind, _), share in zip(rows, shares, strict=True)
+        Contribution(source, fraction[0], fraction[1], kind)
+        for (source, kind, _), fraction in zip(rows, fractions, strict=True)
     ]
-    ranked = sorted(listed, key=lambda row: -row.frequency_share - row.damping_share)
+    ranked = sorted(listed, key=lambda row: -row.frequency_fraction - row.damping_fraction)
     return Contributions(tuple(ranked))

@@ -186,9 +186,9 @@ def _on_backbone(
             squared, by_own, steep = curves[0].linearised(other)
             root = np.sqrt(squared)
             gap = other * root - at if given_velocity else at * root - other
-            arm = (other if given_velocity else at) / (2 * root)
-            slope = (root if given_velocity else -1.0) + arm * steep
-            moves = -(arm / slope)[:, None] * by_own
+            sensitivity = (other if given_velocity else at) / (2 * root)
+            slope = (root if given_velocity else -1.0) + sensitivity * steep
+            moves = -(sensitivity / slope)[:, None] * by_own
             other = other - gap / slope
         by_own = by_own + steep[:, None] * moves
     displacement, velocity = (other, at) if given_velocity else (at, other)

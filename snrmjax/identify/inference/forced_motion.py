@@ -149,8 +149,8 @@ def _bands(
     def step(_: int, point: tuple[Array, Array]) -> tuple[Array, Array]:
         x, omega = point
         first, second = by(1, x, omega) * x, by(2, x, omega) * omega
-        share = excess(vector, x, omega) / (first**2 + second**2)
-        return x - share * first * x, omega - share * second * omega
+        fraction = excess(vector, x, omega) / (first**2 + second**2)
+        return x - fraction * first * x, omega - fraction * second * omega
 
     x, omega = jax.lax.fori_loop(0, steps, step, (x, omega))
     by_x, by_omega = by(1, x, omega), by(2, x, omega)

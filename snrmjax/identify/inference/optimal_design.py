@@ -197,8 +197,10 @@ def _ranked(
             break
         best, variance = _best(slopes, covariance, rows, open_states)
         old = np.einsum("op,pq,oq->o", slopes, covariance, slopes)
-        arm = rows[best] @ covariance
-        covariance = covariance - arm.T @ np.linalg.solve(np.eye(2) + arm @ rows[best].T, arm)
+        sensitivity = rows[best] @ covariance
+        covariance = covariance - sensitivity.T @ np.linalg.solve(
+            np.eye(2) + sensitivity @ rows[best].T, sensitivity
+        )
         open_states[best] = False
         force = float(states.force[best])
         drive = float(fit.recorded_force(states.force[best]))
@@ -275,8 +277,8 @@ def _information(fit: JointFit, states: _States) -> Float[np.ndarray, "state par
     n, n_levels = len(states.force), int(states.level.max()) + 1
     std = np.median(np.asarray(fit.data.std), axis=0)
     sensor, sensed = fit.data.sensor, sensed_mode(fit.modes, states.frequency)
-    share = np.zeros((n, fit.data.share.shape[1]), dtype=fit.data.share.dtype)
-    share[:, sensor] = sensed.to_mode(sensor) if np.iscomplexobj(share) else 1.0
+    fraction = np.zeros((n, fit.data.fraction.shape[1]), dtype=fit.data.fraction.dtype)
+    fraction[:, sensor] = sensed.to_mode(sensor) if np.iscomplexobj(fraction) else 1.0
     phase = np.exp(1j * float(fit.unknowns.instrument_phase))
     constant = float(fit.problem.constant_of(fit.unknowns))
     z = 1j * states.frequency * constant * states.force / states.velocity
@@ -284,8 +286,8 @@ def _information(fit: JointFit, states: _States) -> Float[np.ndarray, "state par
         level=jnp.asarray(states.level),
         frequency=jnp.asarray(states.frequency),
         force=jnp.asarray(fit.recorded_force(states.force)),
-        velocity=jnp.asarray(states.velocity * share[:, sensor] * phase),
-        share=jnp.asarray(share),
+        velocity=jnp.asarray(states.velocity * fraction[:, sensor] * phase),
+        fraction=jnp.asarray(fraction),
         participation=jnp.asarray(relative_participation(fit.modes, states.frequency)),
         std=jnp.broadcast_to(jnp.asarray(std), (n, len(std))),
         weight=jnp.ones(n),
@@ -321,8 +323,8 @@ def _best(
     candidates = rows[index]
     through = candidates @ covariance  # (state, part, unknown)
     inner = np.eye(2) + through @ candidates.transpose(0, 2, 1)
-    arms = through @ slopes.T  # (state, part, output)
-    gain = np.einsum("sio,sio->so", arms, np.linalg.solve(inner, arms))
+    sensitivities = through @ slopes.T  # (state, part, output)
+    gain = np.einsum("sio,sio->so", sensitivities, np.linalg.solve(inner, sensitivities))
     variance = np.einsum("op,pq,oq->o", slopes, covariance, slopes)
     left = np.maximum(variance - gain, 0.0)
     best = int(np.argmin(np.mean(np.sqrt(left), axis=1)))
@@ -333,8 +335,10 @@ def _reason(target: Target, before: np.ndarray, after: np.ndarray) -> Fact:
     """Which band becomes narrower, and by what share."""
     narrowed = 1 - np.sqrt(after / before)
     if target == "curves":
-        shares = dict(zip(_CURVES, np.mean(narrowed.reshape(2, -1), axis=1).tolist(), strict=True))
-        curve = max(shares, key=lambda name: shares[name])
-        return Fact("band_narrower", curve=curve, share=shares[curve])
+        fractions = dict(
+            zip(_CURVES, np.mean(narrowed.reshape(2, -1), axis=1).tolist(), strict=True)
+        )
+        curve = max(fractions, key=lambda name: fractions[name])
+        return Fact("band_narrower", curve=curve, fraction=fractions[curve])
     curve = _CURVES[target == "damping"]
-    return Fact("band_narrower", curve=curve, share=float(np.mean(narrowed)))
+    return Fact("band_narrower", curve=curve, fraction=float(np.mean(narrowed)))

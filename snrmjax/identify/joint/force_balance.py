@@ -41,7 +41,9 @@ class BalanceData(eqx.Module):
     frequency: Float[Array, " state"]  # rad/s
     force: Float[Array, " state"]  # N, or V where only the drive is known
     velocity: Complex[Array, " state"]  # m/s, what the sensors together say of one of them
-    share: Shaped[Array, "state sensor"]  # of the sensors in it; complex as `modal_filter` has them
+    fraction: Shaped[
+        Array, "state sensor"
+    ]  # of the sensors in it; complex as `modal_filter` has them
     participation: Float[Array, " state"]  # `SensedMode.ratio`: over that of the mode alone
     std: Float[Array, "state input"]  # of `STATE_ERRORS`
     weight: Float[Array, " state"]  # 1, or less for an outlier under the robust loss
@@ -172,7 +174,7 @@ def balance_data(
     r = reference_sensor(modes)
     relative = relative_errors(jax.tree.map(np.asarray, data))
     filtered = _one_sensor(data, modes, r, data.velocity, relative)
-    velocity, share, errors, _ = map(np.asarray, filtered)
+    velocity, fraction, errors, _ = map(np.asarray, filtered)
     # The force in N, or the drive in V where only that is known.
     driven = not np.any(np.isfinite(np.asarray(data.force)))
     force = np.asarray(data.drive if driven else data.force)
@@ -190,7 +192,7 @@ def balance_data(
         "frequency": frequency,
         "force": force[keep],
         "velocity": velocity[keep],
-        "share": share[keep],
+        "fraction": fraction[keep],
         "participation": relative_participation(modes, frequency),
         "std": errors[keep],
         "weight": np.ones(int(keep.sum())),
@@ -240,10 +242,10 @@ class Motion(eqx.Module):
 
 @compiled
 def _velocity_of_others(
-    modes: LinearModes, change: tuple[Array, Array], frequency: Array, load: Array, share: Array
+    modes: LinearModes, change: tuple[Array, Array], frequency: Array, load: Array, fraction: Array
 ) -> Array:
     modes = with_deviations(modes, *change)
-    return jnp.sum(share * residual_velocity(modes, frequency, load), axis=1)
+    return jnp.sum(fraction * residual_velocity(modes, frequency, load), axis=1)
 
 
 def velocity_of_others(
@@ -257,7 +259,7 @@ def velocity_of_others(
     """
     data, change = problem.data, (deviation, problem.prior.linear)
     n, size = len(force), with_room(len(force))
-    rows = (filled(rows, size, None) for rows in (data.frequency, force, data.share))
+    rows = (filled(rows, size, None) for rows in (data.frequency, force, data.fraction))
     return np.asarray(_velocity_of_others(problem.modes, change, *rows))[:n]
 
 
@@ -294,7 +296,7 @@ def force_balance(
     force, velocity = _freed(unknowns, problem, error, jnp)
     linear = with_deviations(problem.modes, unknowns.linear, prior.linear)
     others = residual_velocity(linear, jnp.asarray(data.frequency), force)
-    of_mode = velocity - jnp.sum(data.share * others, axis=1)
+    of_mode = velocity - jnp.sum(data.fraction * others, axis=1)
     motion = Motion(of_mode, jnp.abs(of_mode) / data.frequency, force)
     level = (unknowns.level * prior.level)[data.level]
     squared = unknowns.squared_frequency(motion.amplitude(unknowns.squared_frequency))

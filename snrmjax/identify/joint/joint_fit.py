@@ -121,10 +121,10 @@ class JointFit(AbstractResult):
 
         Its 1σ, where one was stated, is then the fit's.
         """
-        share = self.problem.constant_of(self.unknowns) / self.problem.modal_constant
+        fraction = self.problem.constant_of(self.unknowns) / self.problem.modal_constant
         j, modes = self.modes.mode_of_interest, self.modes
         factor = np.ones(modes.n_modes)
-        factor[j] = share
+        factor[j] = fraction
         of_force = jax.device_put(modes.participation * factor)
         scaled = dataclasses.replace(modes, participation=of_force)
         if modes.participation_lag is not None:

@@ -78,7 +78,7 @@ def view_of(
     assumed = "force_gain" not in free and problem.modes.modal_mass_std is None
     states = _test_states(problem, free, stated, guess)
     rounds = Rounds(most_knots=MOST_KNOTS if knots is None else knots)
-    fit = functools.partial(fit_test, robust=robust, tempered=True)
+    fit = functools.partial(fit_test, robust=robust, power_likelihood=True)
     first = functools.partial(fit, compare_levels=False, parts_of_noise=True)
     posterior = first(states, rounds=rounds)
     if _noise_of(posterior, stated).exceeded:  # curves may be steeper than their knots let them
@@ -96,7 +96,7 @@ def view_of(
     if named:
         terms = _terms(posterior, choices, 0), _terms(posterior, choices, 1)
         # A family with its remainder follows states as well as smooth curves do: as many count.
-        start = start._replace(start=posterior.beginning(terms=terms), same_share=True)
+        start = start._replace(start=posterior.beginning(terms=terms), same_fraction=True)
         whole = fit(states, compare_levels=False, rounds=start)
         terms = _kept(whole, 0), _kept(whole, 1)
         start = start._replace(start=whole.beginning(terms=terms))
@@ -107,7 +107,7 @@ def view_of(
     noise = _noise_of(posterior, stated)
     # What a stated noise lets the posterior have may be less than the states show.
     wider = max(noise.scale / posterior.hyper.noise, 1.0) if noise.exceeded else 1.0
-    size = wider * posterior.hyper.noise / np.sqrt(posterior.share)
+    size = wider * posterior.hyper.noise / np.sqrt(posterior.fraction)
     errors = np.zeros((len(states.level), len(STATE_ERRORS)))
     corrections = np.zeros_like(errors)
     n_inputs = posterior.corrections.shape[1]
@@ -263,7 +263,7 @@ def _noise_of(posterior: TestPosterior, stated: bool) -> NoiseEstimate:
     rows = posterior.residuals.size
     left = max(rows - posterior.effective_unknowns, LEAST_LEFT * rows)
     noise = posterior.hyper.noise * float(np.sqrt(np.sum(posterior.residuals**2) / left))
-    std = noise / np.sqrt(2 * posterior.share * left)
+    std = noise / np.sqrt(2 * posterior.fraction * left)
     return NoiseEstimate(noise, std, np.array(posterior.hyper.level_std), stated)
 
 
@@ -353,17 +353,17 @@ def _curve(posterior: TestPosterior, which: int) -> AbstractFamily:
     """A curve as the posterior has it: its smooth functions are of the sizes that it found."""
     terms, hyper = posterior.terms[which], posterior.hyper
     basis, parameters = terms.basis, _parameters(posterior, which)
-    size = terms.unit * hyper.bends[which] / posterior.modal_mass[0]
-    bends = size * np.exp(basis.directions @ hyper.along)
+    size = terms.unit * hyper.roughness[which] / posterior.modal_mass[0]
+    roughness = size * np.exp(basis.directions @ hyper.along)
     if terms.family is None:
         scale = jax.device_put(basis.largest)
-        return SmoothingSpline.through(basis.knots, parameters, scale, terms.argument, bends)
+        return SmoothingSpline.through(basis.knots, parameters, scale, terms.argument, roughness)
     n = terms.n_own
     family = terms.family.at(parameters[:n])
     if not terms.smooth:
         return family
     functions = basis.values(basis.largest * np.sqrt(basis.knots))[0][:, 1:]
-    std = np.append(size * basis.reach, bends)
+    std = np.append(size * basis.reach, roughness)
     return WithRemainder.of(family, basis.knots, functions, parameters[n:], std)
 
 

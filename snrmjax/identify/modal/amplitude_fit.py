@@ -286,10 +286,10 @@ def _regressed(
     seen = np.isfinite(x)
     x = np.where(seen, x, 0.0)
     load, omega = np.asarray(data.load), data.omega
-    share = (np.abs(x) / np.abs(x).max()) ** power
+    fraction = (np.abs(x) / np.abs(x).max()) ** power
     use = seen & (np.abs(omega - natural) < _REGION * 2 * ratio * natural)
-    columns = [x, 1j * omega * x, natural**2 * share * x]
-    columns += [1j * natural * omega * share * x] * damping
+    columns = [x, 1j * omega * x, natural**2 * fraction * x]
+    columns += [1j * natural * omega * fraction * x] * damping
     table = np.stack([*columns, -load], axis=1)[use]
     goal = (omega**2 * x)[use]
     both, wanted = np.concatenate([table.real, table.imag]), np.append(goal.real, goal.imag)
@@ -394,8 +394,8 @@ def _told(
     column = receptance_bases(rows.data.omega, best.fit.unknowns, best.settings)[0].columns[:, k]
     half = len(column) // 2
     size = np.abs(column[:half] + 1j * column[half:]) * rows.data.load
-    share = (size / of.near.max()) ** of.power
-    ends = np.sqrt(natural[k] ** 2 + of.unit**2 * change * np.array([share.max(), 0.0]))
+    fraction = (size / of.near.max()) ** of.power
+    ends = np.sqrt(natural[k] ** 2 + of.unit**2 * change * np.array([fraction.max(), 0.0]))
     shift = float(ends[0] - ends[1])
     error = best.fit.covariance[2 * n, 2 * n] ** 0.5 * abs(shift / change) if change else np.inf
     lowest = rows.level == rows.level[0]
@@ -414,7 +414,9 @@ def _told(
         shift_hz=shift / HERTZ,
         shift_std_hz=float(error) / HERTZ,
         bandwidths=abs(shift) / float(2 * ratio[k] * natural[k]),
-        damping_change=float(0.5 * loss * of.unit / ends[0] * share.max()) if of.damping else None,
+        damping_change=float(0.5 * loss * of.unit / ends[0] * fraction.max())
+        if of.damping
+        else None,
         levels=tuple(dict.fromkeys(rows.level.tolist())),
         velocity=float(rows.velocity.max()),
     )

@@ -154,11 +154,11 @@ def _dependent(
             settled = np.abs(change) < _SETTLED * size
             if settled.all():
                 break
-        share = (size / largest) ** p
-        q = of.load / (linear + strength * share)
+        fraction = (size / largest) ** p
+        q = of.load / (linear + strength * fraction)
         q = np.where(settled, q, np.nan)
-        ahead = linear + strength * share * (1 + p / 2)
-        behind = strength * share * p / 2 * (q / np.abs(q)) ** 2
+        ahead = linear + strength * fraction * (1 + p / 2)
+        behind = strength * fraction * p / 2 * (q / np.abs(q)) ** 2
 
         def slope_by(equation: np.ndarray) -> np.ndarray:
             g = equation * q
@@ -167,8 +167,8 @@ def _dependent(
 
         by_frequency = slope_by(2 * natural + 2j * ratio * omega)
         by_ratio = slope_by(2j * natural * omega)
-        terms = [slope_by(of.unit**2 * share)]
-        terms += [slope_by(1j * of.unit * omega * share)] * of.damping
+        terms = [slope_by(of.unit**2 * fraction)]
+        terms += [slope_by(1j * of.unit * omega * fraction)] * of.damping
         if of.apart is not None:
             terms += [of.unit * apart * by_frequency, apart * by_ratio]
     return q / of.load, by_frequency, by_ratio, np.array(terms)

@@ -16,7 +16,7 @@ _ARC = 0.9 * 2 * np.pi  # of the circle, that the band covers
 _STABLE = 0.2  # of the decay rate: how far a stable pole moves from one order to the next
 _NEAR = 0.5  # of the decay rate: how far poles of one cluster lie apart
 _FLOOR = 2e-5  # of a frequency, below which poles are one
-_SHARE = 0.3  # of the orders from its first on, that a cluster has
+_FRACTION = 0.3  # of the orders from its first on, that a cluster has
 _FEWEST_ORDERS = 3
 LIGHTLY_DAMPED = 0.25
 """Damping ratio, below which a pole of an order may be a mode."""
@@ -115,7 +115,7 @@ def clusters(
         seed = int(np.argmax(near.sum(axis=1)))
         members = _nearest_of_each(at, np.abs(rest - rest[seed]), near[seed])
         count, first = len(np.unique(at[members])), at[members].min()
-        if count >= max(_FEWEST_ORDERS, _SHARE * (orders.highest - first + 1)):
+        if count >= max(_FEWEST_ORDERS, _FRACTION * (orders.highest - first + 1)):
             mine = rest[members]
             means.append(complex(np.median(mine.real), np.median(mine.imag)))
         left[np.flatnonzero(left)[members]] = False

@@ -128,9 +128,9 @@ def fit_notes(
     if settings.window_time is None and averaged and few.any():
         bias = np.where(few, leakage_bias(data, settings, fit, modes.curves.std)[rank], 0.0)
         for k in np.flatnonzero(np.abs(bias) > _BIASED).tolist():
-            lines, share = float(modes.lines_in_band[k]), float(bias[k])
+            lines, fraction = float(modes.lines_in_band[k]), float(bias[k])
             notes.append(
-                Fact("leakage", mode=k + 1, frequency_hz=hertz[k], lines=lines, bias=share)
+                Fact("leakage", mode=k + 1, frequency_hz=hertz[k], lines=lines, bias=fraction)
             )
     for k, (phase, std) in enumerate(zip(modes.mean_phase, modes.mean_phase_std, strict=True)):
         at = {"mode": k + 1, "frequency_hz": hertz[k]}

@@ -158,7 +158,7 @@ def _identify(
     velocity, relative_std = data.velocity, relative_errors(raw)
     if measure == "peak":
         velocity = velocity * peak_ratio(data)
-    combined, share, filtered_std, filter_residual = modal_filter(
+    combined, fraction, filtered_std, filter_residual = modal_filter(
         data, modes, r, velocity, relative_std
     )
     moving = jnp.isfinite(combined) & (combined != 0)
@@ -167,7 +167,7 @@ def _identify(
     inputs = jnp.stack([jnp.log(data.force), jnp.log(jnp.abs(phasor)), jnp.angle(phasor)], axis=1)
     sensed = sensed_mode(modes, data.frequency)
     solved, mode_velocity, argument, sensitivity, linear_variance = _solve(
-        modes, r, amplitude, data.frequency, inputs, share, usable, sensed
+        modes, r, amplitude, data.frequency, inputs, fraction, usable, sensed
     )
     natural, damping = solved.natural_frequency, solved.damping_ratio
     solved_well = jnp.isfinite(natural)
@@ -305,8 +305,8 @@ def modal_filter(
     weight = jnp.where(measured, 1 / jnp.where(known, along, 1.0) ** 2, 0.0)
     norm = jnp.sum(weight * (shape.real**2 + shape.imag**2), axis=1, keepdims=True)
     seen = norm > 0
-    share = jnp.where(seen, weight * shape.conj() * own / jnp.where(seen, norm, 1.0), 0.0)
-    modal = jnp.sum(share * of_mode, axis=1, keepdims=True) / own
+    fraction = jnp.where(seen, weight * shape.conj() * own / jnp.where(seen, norm, 1.0), 0.0)
+    modal = jnp.sum(fraction * of_mode, axis=1, keepdims=True) / own
     misfit = jnp.where(measured, of_mode - shape * modal, 0.0)
 
     def size_of(parts: Complex[Array, "state sensor"]) -> Float[Array, " state"]:
@@ -314,19 +314,19 @@ def modal_filter(
 
     relative_misfit = _ratio(size_of(misfit), size_of(of_mode))
     if not is_single(modes):
-        share = share * sensed.turn[:, None]
-    combined = jnp.sum(share * velocity, axis=1)
+        fraction = fraction * sensed.turn[:, None]
+    combined = jnp.sum(fraction * velocity, axis=1)
     length = jnp.abs(combined)
 
     # Errors of the sensors are independent; amplitude and phase errors lie along and across V.
     def error(component: int) -> Array:
-        each = jnp.where(measured, share * absolute[..., component], 0.0)
+        each = jnp.where(measured, fraction * absolute[..., component], 0.0)
         known_all = jnp.all(stated[..., component] | ~measured, axis=1)
         square = jnp.sum(each.real**2 + each.imag**2, axis=1)
         return jnp.where(known_all, _ratio(_root(square), length), jnp.nan)
 
     std = jnp.stack([relative_std[:, 0, 0], error(0), error(1)], axis=1)
-    return jnp.where(seen[:, 0], combined, jnp.nan), share, std, relative_misfit
+    return jnp.where(seen[:, 0], combined, jnp.nan), fraction, std, relative_misfit
 
 
 def _ratio(part: Float[Array, " state"], whole: Float[Array, " state"]) -> Float[Array, " state"]:
@@ -341,7 +341,7 @@ def _solve(
     amplitude: Argument,
     frequency: Array,
     inputs: Float[Array, "state input"],
-    share: Float[Array, "state sensor"],
+    fraction: Float[Array, "state sensor"],
     sound: Bool[Array, " state"],
     sensed: SensedMode,
 ) -> tuple[SnrmPoints, Array, Array, Array, Array]:
@@ -361,13 +361,13 @@ def _solve(
     ratio = jnp.broadcast_to(sensed.ratio, frequency.shape)
 
     def measured(
-        inputs: Array, parameters: Array, frequency: Array, share: Array, ratio: Array
+        inputs: Array, parameters: Array, frequency: Array, fraction: Array, ratio: Array
     ) -> tuple:
         """Modal constant at the reference sensor, velocity and residual of the sensors' sum."""
         force = jnp.exp(inputs[..., 0])
         velocity = jnp.exp(inputs[..., 1]) * jnp.exp(1j * inputs[..., 2])
         everywhere = residual_velocity(with_parameters(parameters), frequency, force)
-        residual = jnp.sum(share * everywhere, axis=-1)
+        residual = jnp.sum(fraction * everywhere, axis=-1)
         constant = modes.mode_shape[r, j] * participation_of(modes) * ratio * force
         return constant, velocity, residual
 
@@ -378,11 +378,11 @@ def _solve(
         inputs: Array,
         parameters: Array,
         frequency: Array,
-        share: Array,
+        fraction: Array,
         ratio: Array,
         solved: Array,
     ) -> Array:
-        constant, velocity, residual = measured(inputs, parameters, frequency, share, ratio)
+        constant, velocity, residual = measured(inputs, parameters, frequency, fraction, ratio)
         # What is not finite would pass to the whole batch: unsolved states get a harmless one.
         constant, frequency, velocity, residual = (
             jnp.where(solved, value, stand_in)
@@ -396,14 +396,14 @@ def _solve(
         argument = argument_of(own, frequency)
         return jnp.stack([natural**2, 2 * damping * natural, jnp.log(argument)])
 
-    constant, velocity, residual = measured(inputs, parameters, frequency, share, ratio)
+    constant, velocity, residual = measured(inputs, parameters, frequency, fraction, ratio)
     points = invert_phasor(constant, frequency, velocity, residual)
     points = jax.tree.map(
         lambda value: jnp.where(sound, value, jnp.nan) if value.dtype.kind == "f" else value, points
     )
     solved = jnp.isfinite(points.natural_frequency)
     slopes = jax.vmap(jax.jacfwd(outputs, argnums=(0, 1)), in_axes=(0, None, 0, 0, 0, 0))
-    by_input, by_parameter = slopes(inputs, parameters, frequency, share, ratio, solved)
+    by_input, by_parameter = slopes(inputs, parameters, frequency, fraction, ratio, solved)
     spread = jnp.concatenate([modes.natural_frequency_std[keep], modes.damping_ratio_std[keep]])
     variance = jnp.sum((by_parameter * spread) ** 2, axis=-1)
     by_input = jnp.where(solved[:, None, None], by_input, jnp.nan)

@@ -343,8 +343,8 @@ def _one_curve(
     load = abs(float(backbone.modal_constant)) * force
     # Points crowd where both sides meet: there the frequency changes with a square root.
     angle = np.linspace(0.0, 1.0, points_per_side)
-    share = 0.5 * (1 - np.cos(np.pi * angle)) if closed else np.sin(0.5 * np.pi * angle)
-    amplitude = low + (high - low) * share
+    fraction = 0.5 * (1 - np.cos(np.pi * angle)) if closed else np.sin(0.5 * np.pi * angle)
+    amplitude = low + (high - low) * fraction
     both = _on_backbone(backbone, np.concatenate([amplitude, amplitude[::-1]]))
     side, ratio = np.arange(2 * points_per_side) < points_per_side, both.participation(modes)
     # How strongly the force moves a mode that damping couples to others depends on the frequency.

@@ -142,7 +142,7 @@ class _Root(NamedTuple):
     """Where rows that start at zero first reach one, between two amplitudes."""
 
     place: np.ndarray  # of the first amplitude beyond
-    share: np.ndarray  # of the way back from there
+    fraction: np.ndarray  # of the way back from there
     found: np.ndarray
 
     @classmethod
@@ -159,7 +159,7 @@ class _Root(NamedTuple):
         here, before = values[rows, self.place], values[rows, np.maximum(self.place - 1, 0)]
         if at_rest is not None:
             before = np.where(self.place > 0, before, at_rest)
-        return np.where(self.found, here + self.share * (before - here), np.nan)
+        return np.where(self.found, here + self.fraction * (before - here), np.nan)
 
 
 def other_modes(
@@ -206,7 +206,7 @@ def notes_on_resonance(distribution: ResonanceDistribution, load: Fact) -> list[
     """Which curves were left out."""
     if not distribution.negative_damping > _WORTH:
         return []
-    return [Fact("negative_damping_left_out", load=load, share=distribution.negative_damping)]
+    return [Fact("negative_damping_left_out", load=load, fraction=distribution.negative_damping)]
 
 
 def notes_on_trends(trends: Sequence[LevelTrend], load: Fact) -> list[Fact]:

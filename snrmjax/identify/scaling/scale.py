@@ -311,9 +311,9 @@ def _shapes(
 ) -> tuple[Float[np.ndarray, "sensor mode"], Float[np.ndarray, "sensor mode"]]:
     """φ = A/p and its 1σ by the residues' errors; `slopes` are those of ln p by the residues."""
     shape = residue / participation
-    arms = np.eye(len(residue)) / participation[:, None, None]
-    arms = arms - shape.T[:, :, None] * slopes[:, None, :]
-    variance = np.einsum("kij,kjl,kil->ik", arms, covariance, arms)
+    sensitivities = np.eye(len(residue)) / participation[:, None, None]
+    sensitivities = sensitivities - shape.T[:, :, None] * slopes[:, None, :]
+    variance = np.einsum("kij,kjl,kil->ik", sensitivities, covariance, sensitivities)
     return shape, np.sqrt(np.maximum(variance, 0.0))
 
 

@@ -124,8 +124,8 @@ class Balance(NamedTuple):
         waves = waves * np.exp(-0.25 * (order * priors.DISCREPANCY_LENGTH) ** 2)
         along = np.log(states.amplitude / np.max(states.amplitude))[:, None]
         beside = damping[:, None] * np.sin(theta) * np.hstack([waves, waves * along])
-        share = (weight * mass) @ beside / max((weight * mass) @ mass, 1e-300)
-        return self._replace(beside=np.hstack([beside - np.outer(mass, share), 1j * beside]))
+        fraction = (weight * mass) @ beside / max((weight * mass) @ mass, 1e-300)
+        return self._replace(beside=np.hstack([beside - np.outer(mass, fraction), 1j * beside]))
 
     def nearest_errors(self, unknowns: np.ndarray, errors: np.ndarray) -> np.ndarray:
         """The most likely errors with which every state lies on the curves, from some on.

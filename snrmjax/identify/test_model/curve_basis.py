@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 
-from snrmjax.identify.curves.splines import amplitudes_apart, bends_of
+from snrmjax.identify.curves.splines import amplitudes_apart, roughness_of
 from snrmjax.identify.test_model.priors import CURVE_CONSTANT, CURVE_SLOPES, SIZES_ALIKE
 
 MOST_KNOTS = 42
@@ -52,9 +52,11 @@ class CurveBasis(NamedTuple):
     @classmethod
     def at(cls, largest: float, knots: Float[np.ndarray, " knot"]) -> "CurveBasis":
         """For knots of (a/largest)²."""
-        bends = bends_of(knots)
-        functions = np.column_stack([np.ones_like(knots), knots, np.linalg.pinv(bends)])
-        apart_by = np.subtract.outer(np.arange(len(bends)), np.arange(len(bends))) / SIZES_ALIKE
+        roughness = roughness_of(knots)
+        functions = np.column_stack([np.ones_like(knots), knots, np.linalg.pinv(roughness)])
+        apart_by = (
+            np.subtract.outer(np.arange(len(roughness)), np.arange(len(roughness))) / SIZES_ALIKE
+        )
         values, vectors = np.linalg.eigh(np.exp(-0.5 * apart_by**2))
         keep = values > _NO_VARIANCE * np.max(values, initial=0.0)
         directions = vectors[:, keep] * np.sqrt(values[keep])

@@ -40,7 +40,7 @@ class Hyper(NamedTuple):
     """The hyperparameters, by what they are of."""
 
     noise: float  # over the stated one, or relative where none is
-    bends: tuple[float, float]  # size of both curves' bends, over the curves' units
+    roughness: tuple[float, float]  # size of both curves' bends, over the curves' units
     level_std: tuple[float, float, float, float]  # of `LEVEL_ERRORS`
     along: Float[np.ndarray, " direction"]  # how the logarithm of the bends' size changes
     discrepancy: tuple[float, float]  # of both parts, over Ωδ
@@ -85,7 +85,7 @@ def places_of(
 
 # In the order of a point of hyperparameters: noise, bends of two curves, four errors of levels,
 # change of the bends' size along the curves, and two discrepancies where there are any.
-NOISE, BENDS, LEVELS, FIRST_ALONG = 0, slice(1, 3), slice(3, 7), 7
+NOISE, ROUGHNESS, LEVELS, FIRST_ALONG = 0, slice(1, 3), slice(3, 7), 7
 
 
 def end_of_along(terms: Pair) -> int:
@@ -109,7 +109,7 @@ def hyper_at(point: np.ndarray, terms: Pair) -> Hyper:
 
 def point_of(hyper: Hyper) -> np.ndarray:
     """The point of these hyperparameters, without a discrepancy."""
-    sizes = np.log([hyper.noise, *hyper.bends, *hyper.level_std])
+    sizes = np.log([hyper.noise, *hyper.roughness, *hyper.level_std])
     return np.concatenate([sizes, hyper.along])
 
 
@@ -121,7 +121,7 @@ def starting_point(states: TestStates, terms: Pair, discrepancy: bool) -> np.nda
         for std, prior in zip(states.level_std, priors.LEVELS, strict=True)
     ]
     more = [0.3 * priors.DISCREPANCY.scale] * (2 * discrepancy)
-    sizes = np.log([noise.median, *[priors.CURVE_BENDS.median] * 2, *levels])
+    sizes = np.log([noise.median, *[priors.CURVE_ROUGHNESS.median] * 2, *levels])
     return np.concatenate([sizes, np.zeros(end_of_along(terms) - FIRST_ALONG), np.log(more)])
 
 
@@ -165,7 +165,10 @@ def prior_variances(terms: Pair, places: Places, states: TestStates) -> PriorVar
         constant[: WITH_FREQUENCY.stop] = 2 * np.log([*held, *states.off_resonance_std])
     for k, functions in enumerate((places.stiffness, places.damping)):
         constant[functions], by = terms[k].log_variances()
-        slopes[functions, BENDS.start + k], slopes[functions, FIRST_ALONG:end] = by[:, 0], by[:, 1:]
+        slopes[functions, ROUGHNESS.start + k], slopes[functions, FIRST_ALONG:end] = (
+            by[:, 0],
+            by[:, 1:],
+        )
     for k in range(4):
         slopes[places.levels[:, k], LEVELS.start + k] = 2.0
     for k in range(2 * with_more):
@@ -192,12 +195,12 @@ def objective_of(
         None if stated > 0 or flat else prior
         for stated, prior in zip(states.level_std, priors.LEVELS, strict=True)
     ]
-    along = [priors.BENDS_VARY] * (end_of_along(terms) - FIRST_ALONG)
-    bends = [
-        priors.CURVE_BENDS if one.smooth and kept else None
+    along = [priors.ROUGHNESS_VARIES] * (end_of_along(terms) - FIRST_ALONG)
+    roughness = [
+        priors.CURVE_ROUGHNESS if one.smooth and kept else None
         for one, kept in zip(terms, drawn, strict=True)
     ]
-    densities = [noise, *bends, *of_levels, *along, *[priors.DISCREPANCY] * 2]
+    densities = [noise, *roughness, *of_levels, *along, *[priors.DISCREPANCY] * 2]
     prior = priors.JointDensity.of(densities[:n])
 
     def value(point: np.ndarray) -> tuple[float, np.ndarray]:
@@ -228,14 +231,14 @@ class SizedPoint(NamedTuple):
     point: Float[np.ndarray, " hyper"]
 
 
-def sizes_of_bends(
+def roughness_stds(
     objective: Objective,
     likeliest: Float[np.ndarray, " hyper"],
     bounds: list[tuple[float, float]],
 ) -> list[SizedPoint]:
     """The points of a grid about the likeliest: from neighbour to neighbour, while they count."""
-    step, low = priors.CURVE_BENDS.spread, np.log(_STRAIGHT)
-    middle, high = np.maximum(likeliest[BENDS], low), np.transpose(bounds[BENDS])[1]
+    step, low = priors.CURVE_ROUGHNESS.spread, np.log(_STRAIGHT)
+    middle, high = np.maximum(likeliest[ROUGHNESS], low), np.transpose(bounds[ROUGHNESS])[1]
     sized: dict[tuple[int, int], SizedPoint] = {}
     queue = [((0, 0), likeliest)]
     while queue:
@@ -244,8 +247,8 @@ def sizes_of_bends(
         if (a, b) in sized or np.any((sizes < low - step / 2) | (sizes > high)):
             continue
         held, start = list(bounds), start.copy()
-        start[BENDS] = np.maximum(sizes, low)
-        held[BENDS] = [(size, size) for size in start[BENDS]]
+        start[ROUGHNESS] = np.maximum(sizes, low)
+        held[ROUGHNESS] = [(size, size) for size in start[ROUGHNESS]]
         point = maximised(objective, start, held)
         here = SizedPoint(laplace_evidence(objective, point, held), point)
         sized[a, b] = here
@@ -292,7 +295,7 @@ def remainders(
         bounds = bounds_of(states, terms, point)
         for k, kept in enumerate(drawn):
             if not kept:
-                bounds[BENDS.start + k] = (bounds[BENDS.start + k][0],) * 2
+                bounds[ROUGHNESS.start + k] = (bounds[ROUGHNESS.start + k][0],) * 2
         objective = objective_of(equations, states, terms, places, drawn=drawn)
         best = maximised(objective, point, bounds)
         weights[drawn] = laplace_evidence(objective, best, bounds) + log_odds * sum(drawn)

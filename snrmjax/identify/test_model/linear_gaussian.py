@@ -30,7 +30,9 @@ class LinearRows(NamedTuple):
     across: float  # |r − Qc|²
     n_rows: int
     offset: float = 0.0  # ln of the Jacobian from the rows to what was recorded
-    share: float = 1.0  # of the rows that tell something of their own: a power of their likelihood
+    fraction: float = (
+        1.0  # of the rows that tell something of their own: a power of their likelihood
+    )
     n_flat: int = 0  # directions, the first, that unknowns without a prior take
 
     @classmethod
@@ -64,23 +66,25 @@ class LinearRows(NamedTuple):
         By orthogonal factors of rows and priors: what several unknowns do alike, of which wide and
         narrow priors say how they share it, would drown in the rounding of normal equations.
         """
-        scale, root = scale / np.sqrt(self.share), np.sqrt(variance)
+        scale, root = scale / np.sqrt(self.fraction), np.sqrt(variance)
         stacked = np.vstack([self.triangle * (root / scale), np.eye(len(root))])
         directions, triangle = np.linalg.qr(stacked)
-        arms = root[:, None] * solve_triangular(triangle, np.eye(len(root)))
-        return arms @ (directions[: len(self.along)].T @ (self.along / scale)), arms @ arms.T
+        sensitivities = root[:, None] * solve_triangular(triangle, np.eye(len(root)))
+        return sensitivities @ (
+            directions[: len(self.along)].T @ (self.along / scale)
+        ), sensitivities @ sensitivities.T
 
     def log_likelihood(
         self, scale: float, variance: Float[np.ndarray, " unknown"]
     ) -> tuple[float, float, Float[np.ndarray, " unknown"]]:
         """ln p of the rows, and its slopes by ln s and by the logarithms of the variances."""
         by_root = self.triangle[self.n_flat :] * np.sqrt(variance)
-        n, m = self.share * (self.n_rows - self.n_flat), len(by_root)
+        n, m = self.fraction * (self.n_rows - self.n_flat), len(by_root)
         constant = n * np.log(2 * np.pi * scale**2)
         if not m:  # which lapack refuses
-            square = self.across * self.share / scale**2
+            square = self.across * self.fraction / scale**2
             return -0.5 * (constant + square) + self.offset, square - n, np.zeros(len(variance))
-        scale = scale / np.sqrt(self.share)
+        scale = scale / np.sqrt(self.fraction)
         covariance = by_root @ by_root.T
         covariance[np.diag_indices(m)] += scale**2
         # In units that make it even.
@@ -94,15 +98,17 @@ class LinearRows(NamedTuple):
         both[:, :-1], both[:, -1] = by_root, self.along[self.n_flat :]
         both *= unit[:, None]
         both, _ = dtrtrs(factor, both, lower=True, overwrite_b=True)
-        arms, along = both[:, :-1], both[:, -1]
-        informed = np.einsum("ij,ij->j", arms, arms)  # of every unknown by the rows: m less noise's
+        sensitivities, along = both[:, :-1], both[:, -1]
+        informed = np.einsum(
+            "ij,ij->j", sensitivities, sensitivities
+        )  # of every unknown by the rows: m less noise's
         weighed = dtrtrs(factor, along, lower=True, trans=1)[0] * unit
         log_det = 2 * float(np.sum(np.log(np.diagonal(factor) / unit)))
         square = float(along @ along) + self.across / scale**2
         value = -0.5 * (constant - m * np.log(scale**2) + log_det + square)
         by_scale = scale**2 * float(weighed @ weighed) + self.across / scale**2
         by_scale += float(informed.sum()) - n
-        return value + self.offset, by_scale, 0.5 * ((along @ arms) ** 2 - informed)
+        return value + self.offset, by_scale, 0.5 * ((along @ sensitivities) ** 2 - informed)
 
 
 Objective = Callable[[Float[np.ndarray, " hyper"]], tuple[float, Float[np.ndarray, " hyper"]]]

@@ -47,7 +47,7 @@ from snrmjax.identify.test_model.hyper import (
     places_of,
     prior_variances,
     remainders,
-    sizes_of_bends,
+    roughness_stds,
 )
 from snrmjax.identify.test_model.linear_gaussian import laplace_evidence
 from snrmjax.identify.test_model.state_noise import StateNoise, noise_of_states
@@ -87,7 +87,7 @@ class TestPosterior(NamedTuple):
     places: Places
     differing: tuple[bool, bool, bool, bool]  # whether levels differ by more than is stated
     weight: Float[np.ndarray, " state"]  # 1, or less for an outlier
-    share: float  # of the states that count, where neighbours err alike
+    fraction: float  # of the states that count, where neighbours err alike
     settled: bool  # whether the last round moved nothing by more than its error
     in_order: tuple[bool, ...]  # which errors of levels run with their forces: curves do
     remainders: tuple[bool, bool]  # whether noise does not explain what a family leaves
@@ -197,7 +197,7 @@ def fit_test(
     *,
     discrepancy: bool = False,
     robust: bool = False,
-    tempered: bool = False,
+    power_likelihood: bool = False,
     over_sizes: bool = False,
     compare_levels: bool = True,
     parts_of_noise: bool = False,
@@ -207,8 +207,8 @@ def fit_test(
 
     Arguments: with `discrepancy` what one mode leaves off resonance is unknown too: smooth in phase
     and amplitude, zero at phase resonance; with `robust` noise has outliers (Student's t); with
-    `tempered` states whose neighbours miss the curves alike count as fewer; with `over_sizes`
-    curves are averaged over the sizes that their bends may have; without `compare_levels` nothing
+    `power_likelihood` states whose neighbours miss the curves alike count as fewer; with
+    `over_sizes` curves are averaged over the sizes that their bends may have; without `compare_levels` nothing
     is said on which errors levels differ by (`differing`), which takes half the time; with
     `parts_of_noise` scatter of the natural frequency from state to state is estimated, and a noise
     floor where no noise is stated (`StateNoise`): the posterior's `states` have them as errors.
@@ -222,7 +222,7 @@ def fit_test(
                 fit_test,
                 discrepancy=discrepancy,
                 robust=robust,
-                tempered=tempered,
+                power_likelihood=power_likelihood,
                 over_sizes=over_sizes,
                 compare_levels=compare_levels,
             ),
@@ -248,15 +248,15 @@ def fit_test(
     balance = Balance(states, terms, places, np.ones(n), beside)
     if start is not None:
         balance = balance._replace(in_order=start.in_order)
-    walk = likeliest_walk(balance, rounds, robust=robust, tempered=tempered)
+    walk = likeliest_walk(balance, rounds, robust=robust, power_likelihood=power_likelihood)
     # Where neighbouring states miss the curves alike, levels may differ by what the model lacks.
-    while walk.found is not None and walk.found.equations.share < 1:
+    while walk.found is not None and walk.found.equations.fraction < 1:
         in_order = walk.balance.in_order
         more = levels_in_order(states, walk.found.mean[places.levels])
         if not np.any(more > in_order):
             break
         balance = balance._replace(in_order=tuple((more | in_order).tolist()))
-        walk = likeliest_walk(balance, rounds, robust=robust, tempered=tempered)
+        walk = likeliest_walk(balance, rounds, robust=robust, power_likelihood=power_likelihood)
     reached = walk.found
     if reached is None:
         raise ValueError(f"`rounds.most` must be at least one, not {rounds.most}.")
@@ -264,12 +264,12 @@ def fit_test(
     # in common may be anything of that size, and so may what runs with their order: the curves
     # have it, and bands say that it may be the levels'.
     last = walk.balance.straight(reached.mean, reached.errors, apart=False)
-    equations = last.equations._replace(share=reached.equations.share)
+    equations = last.equations._replace(fraction=reached.equations.fraction)
     exchanged = equations
     if any(walk.balance.in_order):
         free = walk.balance._replace(in_order=(False,) * 4)
         anew = free.straight(reached.mean, reached.errors, apart=False)
-        exchanged = anew.equations._replace(share=equations.share)
+        exchanged = anew.equations._replace(fraction=equations.fraction)
 
     variances = prior_variances(terms, places, states)
 
@@ -293,7 +293,7 @@ def fit_test(
     bounds = bounds_of(states, terms, reached.point)
     point, summary = reached.point, gaussian(reached.point)
     if over_sizes:
-        sized = sizes_of_bends(objective, reached.point, bounds)
+        sized = roughness_stds(objective, reached.point, bounds)
         point, summary = averaged(sized, gaussian)
     flat = objective_of(reached.equations, states, terms, places, flat=True)
     posterior = TestPosterior(
@@ -310,7 +310,7 @@ def fit_test(
         places,
         differing_levels(flat, reached.point, bounds, states) if compare_levels else (False,) * 4,
         walk.balance.weight,
-        reached.equations.share,
+        reached.equations.fraction,
         walk.still,
         walk.balance.in_order,
         remainders(reached.equations, states, terms, places, reached.point),

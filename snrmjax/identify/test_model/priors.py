@@ -160,7 +160,7 @@ CURVE_CONSTANT = 1.0
 CURVE_SLOPES = 1.0
 """Of their terms in a²: changes as large as the curves themselves."""
 
-CURVE_BENDS = LogNormalSize(1e-3, 2.0)
+CURVE_ROUGHNESS = LogNormalSize(1e-3, 2.0)
 """Size of the bends at some twenty knots, over the same: nothing to as much as the curve."""
 
 NO_REMAINDER = 0.3
@@ -169,7 +169,7 @@ NO_REMAINDER = 0.3
 REMAINDER_BY_CHANCE = 0.05
 """Probability that a family leaves nothing, below which its remainder is drawn."""
 
-BENDS_VARY = NormalNumber(1.0)
+ROUGHNESS_VARIES = NormalNumber(1.0)
 """Of the logarithm of that size along a curve: where joints open a curve bends thrice as much."""
 
 SIZES_ALIKE = 2.0
@@ -185,5 +185,5 @@ DISCREPANCY_LENGTH = np.radians(30.0)
 STUDENT_FREEDOM = 4.0
 """Degrees of freedom of noise with outliers, on request: one state in 20 beyond three times 1σ."""
 
-LEAST_SHARE = 0.1
+LEAST_FRACTION = 0.1
 """Of states that tell something of their own: from curves that are far off fewer seem to."""

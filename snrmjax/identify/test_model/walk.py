@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from snrmjax.identify.checks.residual_autocorrelation import share_told_by
+from snrmjax.identify.checks.residual_autocorrelation import fraction_told_by
 from snrmjax.identify.test_model import priors
 from snrmjax.identify.test_model.balance import Balance
 from snrmjax.identify.test_model.curve_basis import MOST_KNOTS
 from snrmjax.identify.test_model.hyper import (
-    BENDS,
     FIRST_ALONG,
     LEVELS,
     NOISE,
+    ROUGHNESS,
     bounds_of,
     end_of_along,
     objective_of,
@@ -56,10 +56,12 @@ class Rounds(NamedTuple):
     levels_apart: bool = False
     start: "TestPosterior | None" = None
     crowded: bool = False  # whether knots crowd where states do
-    same_share: bool = False  # whether as many states count as at the start
+    same_fraction: bool = False  # whether as many states count as at the start
 
 
-def likeliest_walk(balance: Balance, rounds: Rounds, *, robust: bool, tempered: bool) -> "Walk":
+def likeliest_walk(
+    balance: Balance, rounds: Rounds, *, robust: bool, power_likelihood: bool
+) -> "Walk":
     """The more probable of the ends of all starts.
 
     From straight lines over a², which hardening by hundreds of bandwidths is, and from curves that
@@ -67,24 +69,32 @@ def likeliest_walk(balance: Balance, rounds: Rounds, *, robust: bool, tempered: 
     """
     starts = [(True, False), (False, False), *[(False, True)] * rounds.levels_apart]
     walks = [
-        Walk(balance, straight=straight, apart=apart, robust=robust, tempered=tempered)
+        Walk(
+            balance,
+            straight=straight,
+            apart=apart,
+            robust=robust,
+            power_likelihood=power_likelihood,
+        )
         for straight, apart in starts
     ]
     if rounds.start is not None:
         walks = [walks[0].from_(rounds.start)]
-        if rounds.same_share:
-            walks[0].share, walks[0].share_is_known = rounds.start.share, True
+        if rounds.same_fraction:
+            walks[0].fraction, walks[0].fraction_is_known = rounds.start.fraction, True
     first = min(_TRIED, rounds.most)
     for walk in walks:
         walk.advance(first)
-    share = min(walk.share for walk in walks)
-    best = max(walks, key=lambda one: one.likelihood_of(share))
+    fraction = min(walk.fraction for walk in walks)
+    best = max(walks, key=lambda one: one.likelihood_of(fraction))
     best.advance(rounds.most - first)
     if rounds.most == _ROUNDS and best.is_lost:  # among steep curves the way is long
         for one in walks:
             one.advance(_MANY - one.turn)
-        best = max(walks, key=lambda one: one.likelihood_of(share))
-    elif rounds.most == _ROUNDS and not tempered:  # which of two processors is still is chance
+        best = max(walks, key=lambda one: one.likelihood_of(fraction))
+    elif (
+        rounds.most == _ROUNDS and not power_likelihood
+    ):  # which of two processors is still is chance
         best.advance(_FURTHER)
     return best
 
@@ -104,20 +114,20 @@ class Walk:
     """Rounds of making the problem straight and solving it, from one start on."""
 
     def __init__(
-        self, balance: Balance, *, straight: bool, apart: bool, robust: bool, tempered: bool
+        self, balance: Balance, *, straight: bool, apart: bool, robust: bool, power_likelihood: bool
     ):
         """From the records; the first rounds with `straight` lines over a², the very first with
         natural frequencies of levels `apart`, if asked.
         """
         places, discrepancy = balance.places, balance.beside.shape[1] > 0
         self.balance, self.straight, self.apart = balance, straight, apart
-        self.robust, self.tempered = robust, tempered
+        self.robust, self.power_likelihood = robust, power_likelihood
         self.start = starting_point(balance.states, balance.terms, discrepancy)
         self.point, self.errors = self.start, np.zeros_like(balance.states.errors)
         self.mean = np.zeros(places.others.stop)
         self.mean[places.damping.start] = 1.0
         self.found: Reached | None = None
-        self.turn, self.still, self.share, self.share_is_known = 0, False, 1.0, False
+        self.turn, self.still, self.fraction, self.fraction_is_known = 0, False, 1.0, False
 
     def from_(self, start: "TestPosterior") -> "Walk":
         """The same, going on from what was found for other states."""
@@ -141,7 +151,7 @@ class Walk:
         if self.still or self.found is None:
             return False
         if not self.balance.states.stated:
-            return not self.tempered
+            return not self.power_likelihood
         beyond = self.found.point[NOISE] - np.log(priors.STATED_NOISE.median)
         return bool(beyond > _LOST * priors.STATED_NOISE.spread)
 
@@ -152,12 +162,12 @@ class Walk:
                 return
             self._round()
 
-    def likelihood_of(self, share: float) -> float:
+    def likelihood_of(self, fraction: float) -> float:
         """The same, were so many of the states independent."""
         if self.found is None:
             return -np.inf
         states, terms, places = self.balance.states, self.balance.terms, self.balance.places
-        equations = self.found.equations._replace(share=share)
+        equations = self.found.equations._replace(fraction=fraction)
         return objective_of(equations, states, terms, places)(self.found.point)[0]
 
     def _round(self) -> None:
@@ -166,7 +176,7 @@ class Walk:
         if k == _SETTLED:
             self.balance = self.balance.with_discrepancy(self.mean, self.errors)
         this = self.balance.straight(self.mean, self.errors, first=k == 0)
-        this = this._replace(equations=this.equations._replace(share=self.share))
+        this = this._replace(equations=this.equations._replace(fraction=self.fraction))
         bounds = bounds_of(states, terms, self.point)
         along = slice(FIRST_ALONG, end_of_along(terms))
         if k == 0:  # no level differs from another yet, and bends are of one size
@@ -176,7 +186,7 @@ class Walk:
             ]
             bounds[along] = [(0.0, 0.0)] * (along.stop - along.start)
         if k < _SETTLED and self.straight:
-            bounds[BENDS] = [(low, low) for low, _ in bounds[BENDS]]
+            bounds[ROUGHNESS] = [(low, low) for low, _ in bounds[ROUGHNESS]]
         # What curves do not follow yet would pass for another modal mass.
         free = k >= _SETTLED or states.mass_std > _GUESS
         held = states if free else states._replace(mass_std=0.0)
@@ -196,15 +206,15 @@ class Walk:
         )
         left = (this.rows - this.design @ goal).reshape(-1, 2)
         value = objective(point)[0]
-        if k <= _SETTLED or self.tempered or value > self.likelihood:
+        if k <= _SETTLED or self.power_likelihood or value > self.likelihood:
             self.found = Reached(point, value, this.equations, goal, left / noise, moved.errors)
         size = np.sqrt(np.diag(covariance) + 1e-300)
         self.still = k > _SETTLED and np.max(np.abs(moved.unknowns - self.mean) / size) < _STILL
         self.point, self.mean, self.errors = point, moved.unknowns, moved.errors
         self.turn += 1
-        if self.tempered and not self.share_is_known:
-            share = share_told_by(left, states.level, states.frequency)
-            self.share = max(share, priors.LEAST_SHARE)
+        if self.power_likelihood and not self.fraction_is_known:
+            fraction = fraction_told_by(left, states.level, states.frequency)
+            self.fraction = max(fraction, priors.LEAST_FRACTION)
         if self.robust:
             square = np.sum(left**2, axis=1) / noise**2
             weight = (priors.STUDENT_FREEDOM + 2) / (priors.STUDENT_FREEDOM + square)
@@ -242,14 +252,14 @@ def _step(
         # Where phasors are no mode's the way may be lost.
         return _Moved(goal, nearest) if np.all(np.isfinite(nearest)) else _Moved(mean, errors)
     before = cost(mean, balance.nearest_errors(mean, errors))
-    share, best = 1.0, (np.inf, mean, errors)
-    while share > _SHORTEST:
-        unknowns = mean + share * (goal - mean)
+    fraction, best = 1.0, (np.inf, mean, errors)
+    while fraction > _SHORTEST:
+        unknowns = mean + fraction * (goal - mean)
         nearest = balance.nearest_errors(unknowns, errors)
         value = cost(unknowns, nearest)
         if np.isfinite(value) and value < best[0]:
             best = (value, unknowns, nearest)
         if value <= before:
             break
-        share *= 0.5
+        fraction *= 0.5
     return _Moved(*best[1:])

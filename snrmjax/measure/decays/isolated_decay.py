@@ -39,20 +39,20 @@ from snrmjax.measure.decays.mode_ridge import ridge_of_mode, spectral_peaks
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.units import HERTZ
 
-MOST_COMPANY = 0.01  # largest share of the energy inside the band that is not the mode's
+MOST_INTERFERING = 0.01  # largest share of the energy inside the band that is not the mode's
 NOT_KNOWN = 1 / 1.96  # 1σ over the damping, from where on its 95 % band holds zero
 _SCATTER = 4.0  # σ of the filter, over which scatter is averaged
 _HARMONICS = (2, 3, 4, 5)
 _COHERENT = 0.1  # of what lies near a harmonic, that may not turn with the mode
 
 
-class Company(NamedTuple):
+class InterferingModes(NamedTuple):
     """What else lies in a decay, by energy of the velocity from the record's begin on."""
 
-    mode_share: float
-    other_share: float  # modes and noise
+    mode_fraction: float
+    other_fraction: float  # modes and noise
     frequency: float  # rad/s, of the strongest other line
-    line_share: float  # within 10 % of it
+    line_fraction: float  # within 10 % of it
     hum: tuple[tuple[float, float], ...]  # frequency in Hz and amplitude in m/s
 
 
@@ -73,22 +73,22 @@ class IsolatedDecay(NamedTuple):
     bias: Complex[np.ndarray, " k"]  # of the rate, by the filter; it is taken away
     begin: float  # s from the record's first sample to where the mode dominates
     band: tuple[float, float]  # rad/s: beyond, the filter passes less than 1 %
-    company: Company
+    interfering: InterferingModes
 
     def notes(self) -> tuple[Fact, ...]:
         """What was done and what else lies in the record."""
         low, high = (edge / HERTZ for edge in self.band)
-        of = self.company
+        of = self.interfering
         omega = float(np.median(np.abs(self.bias.imag / self.rate.imag)))
         decay = float(np.median(np.abs(self.bias.real / self.smooth_rate.real)))
         about = {"low_hz": low, "high_hz": high, "begin": self.begin}
         return (
-            Fact("mode_isolated", share=of.mode_share, **about),
+            Fact("mode_isolated", fraction=of.mode_fraction, **about),
             Fact(
-                "company_of_decay",
-                share=of.other_share,
+                "interfering_modes_of_decay",
+                fraction=of.other_fraction,
                 frequency_hz=of.frequency / HERTZ,
-                line_share=of.line_share,
+                line_fraction=of.line_fraction,
             ),
             Fact("bias_of_mode_filter", frequency=omega, damping=decay),
             *(Fact("hum_taken_away", frequency_hz=hz, amplitude=size) for hz, size in of.hum),
@@ -135,9 +135,9 @@ def isolate_decay(
 
 def _usable(reading: DecayReading) -> slice:
     """The longest stretch of instants in which the mode dominates inside the filter's band."""
-    company = np.abs(reading.smooth.off) ** 2
-    around = gaussian_filter1d(company, reading.sigma * PER_CYCLE, mode="nearest")
-    good = np.concatenate([[False], around < MOST_COMPANY, [False]])
+    interfering = np.abs(reading.smooth.off) ** 2
+    around = gaussian_filter1d(interfering, reading.sigma * PER_CYCLE, mode="nearest")
+    good = np.concatenate([[False], around < MOST_INTERFERING, [False]])
     edges = np.flatnonzero(np.diff(good.astype(int)))
     runs = [slice(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True)]
     longest = max(runs, key=lambda run: run.stop - run.start, default=slice(0, 0))
@@ -154,18 +154,18 @@ def _refusal(reading: DecayReading, part: slice) -> str:
     off = reading.smooth.off[part]
     off = off * np.minimum(1.0, 1 / np.maximum(np.abs(off), 1e-300))
     low, high = (edge / HERTZ for edge in _band(reading, part))
-    share = float(np.median(np.abs(off) ** 2))
+    fraction = float(np.median(np.abs(off) ** 2))
     where = f"inside its band of {low:.4g} to {high:.4g} Hz"
     what = "noise"
-    if share > 2 * float(np.median(2 * reading.noise[part] ** 2)):
+    if fraction > 2 * float(np.median(2 * reading.noise[part] ** 2)):
         order = np.fft.fftfreq(len(off), 1 / PER_CYCLE)
         line = np.abs(np.fft.fft((off - off.mean()) * np.hanning(len(off))))
         away = 1 + float(order[np.argmax(line)])
         other = float(np.median(reading.rate.imag[part])) / HERTZ * away
         what = f"another motion near {other:.3g} Hz"
     return (
-        f"the mode cannot be isolated: {where} {what} has about {100 * share:.2g} % of its energy, "
-        "which hides how it decays."
+        f"the mode cannot be isolated: {where} {what} has about {100 * fraction:.2g} % of its "
+        "energy, which hides how it decays."
     )
 
 
@@ -227,7 +227,7 @@ def _isolated(
         bias,
         float(at[0] - time[0]),
         _band(reading, part),
-        _company(time[: inside.stop], mode[: inside.stop], left[: inside.stop], hum),
+        _interfering_modes(time[: inside.stop], mode[: inside.stop], left[: inside.stop], hum),
     )
 
 
@@ -272,9 +272,9 @@ def _harmonics(
     return waves
 
 
-def _company(
+def _interfering_modes(
     time: np.ndarray, mode: np.ndarray, left: np.ndarray, hum: list[tuple[float, float]]
-) -> Company:
+) -> InterferingModes:
     total = float(np.sum(mode**2) + np.sum(left**2))
     fading = np.hanning(2 * len(left))[len(left) :]  # the begin, where company is loud, counts
     power = np.abs(np.fft.rfft((left - left.mean()) * fading)) ** 2
@@ -283,5 +283,7 @@ def _company(
     line = float(omega[np.argmax(power)])
     near = np.abs(omega / line - 1) < 0.1
     other = float(np.sum(left**2)) / total
-    share = float(power[near].sum() / max(power.sum(), 1e-300))
-    return Company(float(np.sum(mode**2)) / total, other, line, other * share, tuple(hum))
+    fraction = float(power[near].sum() / max(power.sum(), 1e-300))
+    return InterferingModes(
+        float(np.sum(mode**2)) / total, other, line, other * fraction, tuple(hum)
+    )

@@ -56,8 +56,8 @@ class MultisineResponses(AbstractResult):
             f"noise {100 * _relative(self.noise_std, self.responses.values):.2g} %",
         ]
         if self.realisations > 1:
-            share = 100 * _relative(self.total_std, self.responses.values)
-            lines.append(f"noise and nonlinear scatter {share:.2g} %")
+            fraction = 100 * _relative(self.total_std, self.responses.values)
+            lines.append(f"noise and nonlinear scatter {fraction:.2g} %")
         return tuple(lines)
 
     def variables(self) -> dict[str, Variable]:

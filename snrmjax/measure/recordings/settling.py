@@ -115,8 +115,8 @@ def moves(blocks: BlockPhasors, tolerance: float) -> float:
     if n < 4:
         return 0.0
     mean = series.mean(axis=1)
-    share = series / mean[:, None] - 1
-    parts = np.stack([share.real, share.imag])  # of amplitude and phase
+    fraction = series / mean[:, None] - 1
+    parts = np.stack([fraction.real, fraction.imag])  # of amplitude and phase
     place = (np.arange(n) - (n - 1) / 2) / n
     slope = parts @ place / (place @ place)
     rest = parts - parts.mean(axis=2, keepdims=True) - slope[:, :, None] * place

@@ -298,15 +298,15 @@ def _measure(
         return _Measured(step, StepStatus.TOO_SHORT)
     means = mean_phasors(kept)
     left = part.left[:, first]
-    share = float(np.max(left / np.abs(means.phasors[:, 0])))
+    fraction = float(np.max(left / np.abs(means.phasors[:, 0])))
     begins = float(kept.time[0] - each / 2)
-    unsettled = moved > 0 or share > tolerance
+    unsettled = moved > 0 or fraction > tolerance
     return _Measured(
         step._replace(amplitude=float(np.abs(means.phasors[0, 0]))),
         StepStatus.UNSETTLED if unsettled else StepStatus.SETTLED,
         np.nan if unsettled else begins,
         part.decay_time,
-        max(moved, share),
+        max(moved, fraction),
         left,
         means,
         float(kept.time.mean()),

@@ -112,8 +112,8 @@ def _deviations(values: np.ndarray, middle: np.ndarray, floor: float) -> np.ndar
 
     if len(values) < 5:
         return np.full(len(values), floor)
-    share = (middle[1:-1] - middle[:-2]) / (middle[2:] - middle[:-2])
-    bend = values[1:-1] - (1 - share) * values[:-2] - share * values[2:]
+    fraction = (middle[1:-1] - middle[:-2]) / (middle[2:] - middle[:-2])
+    bend = values[1:-1] - (1 - fraction) * values[:-2] - fraction * values[2:]
     # Frames overlap by half: neighbours of a white noise are correlated by one sixth.
     around = median_filter(np.abs(bend), size=_AROUND, mode="nearest")
     middle_of = np.concatenate([around[:1], around, around[-1:]])

@@ -19,7 +19,7 @@ _BLOCK = 2**18  # samples read at once
 _SHORTEST, _LONGEST = 4, 16  # powers of two of a frame
 _CYCLES = (3, 6)  # of a frame, from and to
 _BINS = 9
-_SHARE = 0.01  # of a block's power, for an octave to be looked at
+_FRACTION = 0.01  # of a block's power, for an octave to be looked at
 _TONE = 0.5  # least share of a frame's power that is the tone's
 _FEWEST_SAMPLES = 4  # a cycle
 
@@ -111,7 +111,7 @@ def _octaves(values: np.ndarray) -> list[int]:
     for power in range(_SHORTEST, _LONGEST + 1):
         low, high = _CYCLES[0] / 2**power, _CYCLES[1] / 2**power
         inside = (per_sample >= low * 0.98) & (per_sample < high * 1.02)
-        if spectrum[inside].sum() > _SHARE * total:
+        if spectrum[inside].sum() > _FRACTION * total:
             powers.append(power)
     return powers
 
@@ -137,9 +137,9 @@ def _frames(windows: np.ndarray, start: int, size: int) -> ToneTrack:
     ratio = np.maximum(left, right) / at
     shift = np.clip(np.where(right >= left, 1, -1) * (2 * ratio - 1) / (1 + ratio), -0.6, 0.6)
     amplitude = 2 * at * (1 - shift**2) / np.sinc(shift) / (size / 2)
-    share = amplitude**2 / 2 * np.sum(window**2) / energy[rows]
+    fraction = amplitude**2 / 2 * np.sum(window**2) / energy[rows]
     cycles = peak + shift
-    good = (share > _TONE) & (cycles >= _CYCLES[0] * 0.985) & (cycles < _CYCLES[1] * 1.03)
+    good = (fraction > _TONE) & (cycles >= _CYCLES[0] * 0.985) & (cycles < _CYCLES[1] * 1.03)
     good &= cycles <= size / _FEWEST_SAMPLES * 1.01
     rows, peak = rows[good], peak[good]
     middle = start + rows * (size // 2) + (size - 1) / 2

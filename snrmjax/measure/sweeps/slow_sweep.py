@@ -242,8 +242,8 @@ def _result(
         balance = modal_balance(swept_motion(along, reference))
         corrected = correct and bool(np.isfinite(balance.constant))
         held, held_std = held_force(moments, reference, balance, corrected)
-        share = 1 - held / np.array([moment.phasors.series[0, 0] for moment in moments])
-        slow = np.abs(share) <= _MUCH
+        fraction = 1 - held / np.array([moment.phasors.series[0, 0] for moment in moments])
+        slow = np.abs(fraction) <= _MUCH
         left_out[int(SweepStatus.TOO_FAST)] += int(np.sum(~slow))
     if not moments or not slow.any():
         reasons = "; ".join(
@@ -256,7 +256,7 @@ def _result(
     kept = [moment for moment, good in zip(moments, slow, strict=True) if good]
     table = table_of(kept, reader.chosen, held[slow], held_std[slow])
     number = np.array([moment.sweep for moment in kept])
-    share = share[slow]
+    fraction = fraction[slow]
     notes = [Fact("sweep_bias_unknown")] if correct and not corrected else []
     states = states_of_phasors(reader.recording, reader.chosen, table, orders, level, notes)
     rate, begin = reader.recording.sampling_rate, reader.recording.start_time
@@ -270,7 +270,9 @@ def _result(
     )
     bias = tuple(_bias(balance, along, k) for k in range(len(runs)))
     facts = (*_facts_of_sweeps(bias, corrected, left_out), *states.notes)
-    return SweptStates(states, sweeps, bias, balance, number, table.time, share, corrected, facts)
+    return SweptStates(
+        states, sweeps, bias, balance, number, table.time, fraction, corrected, facts
+    )
 
 
 def _facts_of_sweeps(

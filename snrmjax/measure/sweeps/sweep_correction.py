@@ -88,7 +88,7 @@ def modal_balance(motion: SweptMotion) -> ModalBalance:
     return balance._replace(constant_std=std)
 
 
-def share_of_bias(motion: SweptMotion) -> Float[np.ndarray, " state"]:
+def fraction_of_bias(motion: SweptMotion) -> Float[np.ndarray, " state"]:
     """About how much of each phasor is the sweep's doing, where nothing is known of the mode.
 
     To first order a sweep answers with H − (i/2) dΩ/dt d²H/dΩ² in place of H, at most all of it.

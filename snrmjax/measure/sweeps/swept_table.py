@@ -7,7 +7,7 @@ from jaxtyping import Complex, Float
 
 from snrmjax.measure.recordings.channels import DERIVATIVE
 from snrmjax.measure.recordings.velocity_states import ChosenChannels, PhasorTable
-from snrmjax.measure.sweeps.sweep_correction import ModalBalance, SweptMotion, share_of_bias
+from snrmjax.measure.sweeps.sweep_correction import ModalBalance, SweptMotion, fraction_of_bias
 from snrmjax.measure.sweeps.swept_phasors import SweptPhasors, displacement_series
 
 
@@ -62,7 +62,7 @@ def held_force(
     motion = swept_motion(moments, reference)
     std = np.array([moment.phasors.std[0, 0] for moment in moments])
     if not corrected:
-        return motion.force, np.hypot(std, np.abs(motion.force) * share_of_bias(motion))
+        return motion.force, np.hypot(std, np.abs(motion.force) * fraction_of_bias(motion))
     moving = balance.force_to_move(motion)
     of_slope = 2 * motion.frequency * motion.first_std / abs(balance.constant)
     of_constant = np.abs(moving) * balance.constant_std / abs(balance.constant)

@@ -136,12 +136,12 @@ def _slow_flow(
     terms = len(form.decay)
     # Values of the polynomials, and 4 r times their derivatives: d/d ln ρ.
     values = np.eye(terms)
-    bends = chebyshev.chebder(values, axis=0)
+    roughness = chebyshev.chebder(values, axis=0)
 
     def rate(_: float, state: np.ndarray) -> np.ndarray:
         square = np.exp(2 * min(state[0], 0.5 * np.log(_LARGEST)))
         known = chebyshev.chebval(2 * square - 1, values)
-        bent = 4 * square * chebyshev.chebval(2 * square - 1, bends) * (square < _LARGEST)
+        bent = 4 * square * chebyshev.chebval(2 * square - 1, roughness) * (square < _LARGEST)
         size = state[2 : 3 + terms]
         d_size, d_phase = (form.decay @ bent) * size, (form.frequency @ bent) * size
         d_size[1:] += known

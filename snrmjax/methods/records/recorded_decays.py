@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 
 from snrmjax.measure.decays.isolated_decay import (
-    MOST_COMPANY,
+    MOST_INTERFERING,
     NOT_KNOWN,
     IsolatedDecay,
     isolate_decay,
@@ -68,7 +68,7 @@ def restoring_force_of_mode(decay: IsolatedDecay) -> MethodResult:
     the 1σ of that. Raises `ValueError` as the method does, and where its forces leave 1 % of the
     acceleration's power: nothing else is in the record.
     """
-    found = restoring_force(decay.time, decay.velocity, most_left=MOST_COMPANY)
+    found = restoring_force(decay.time, decay.velocity, most_left=MOST_INTERFERING)
     (omega, omega_std), (ratio, ratio_std) = _reading_at(decay, np.asarray(found.velocity))
     return dataclasses.replace(
         found,

@@ -285,8 +285,8 @@ def _of_fall(motion: Float[np.ndarray, " sample"], fall: _Fall, rate: float, res
 
 def _band(force: Float[np.ndarray, " sample"], rate: float) -> tuple[float, float]:
     omega, power = _spectrum(force, rate)
-    share = np.cumsum(power) / np.sum(power)
-    low, high = (float(omega[np.searchsorted(share, edge)]) for edge in _BAND)
+    fraction = np.cumsum(power) / np.sum(power)
+    low, high = (float(omega[np.searchsorted(fraction, edge)]) for edge in _BAND)
     return low, high
 
 

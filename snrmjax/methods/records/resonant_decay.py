@@ -133,7 +133,7 @@ def decay_of_mode(decay: IsolatedDecay) -> MethodResult:
     apart = float(np.max(np.abs(moves / 2 / smooth.real)))
     notes = [
         Fact("decay_read_by", reading="a filter that moves with it"),
-        Fact("decrement_apart", share=apart),
+        Fact("decrement_apart", fraction=apart),
     ]
     return method_result("resonant_decay", points, 0, notes)
 
@@ -200,8 +200,8 @@ def _by_peaks(time: np.ndarray, signal: np.ndarray) -> _Trace:
 
 def _by_zero_crossings(time: np.ndarray, signal: np.ndarray) -> _Trace:
     before = np.flatnonzero(np.signbit(signal[:-1]) != np.signbit(signal[1:]))
-    share = signal[before] / (signal[before] - signal[before + 1])
-    zeros = time[before] + share * (time[before + 1] - time[before])
+    fraction = signal[before] / (signal[before] - signal[before + 1])
+    zeros = time[before] + fraction * (time[before + 1] - time[before])
     zeros = _of_neighbours(zeros)
     peaks, size = velocity_extremes(time, signal)
     peaks = _of_neighbours(peaks)

@@ -59,8 +59,8 @@ def _pairs(level: int, states: SensorStates) -> list[MethodPoint]:
                 continue
             upper = int(np.clip(np.searchsorted(reach, size[k]), 1, len(other) - 1))
             two = other[[upper - 1, upper]]
-            share = (size[k] - size[two[0]]) / (size[two[1]] - size[two[0]])
-            points.append(_point(level, states, int(k), two, np.array([1 - share, share])))
+            fraction = (size[k] - size[two[0]]) / (size[two[1]] - size[two[0]])
+            points.append(_point(level, states, int(k), two, np.array([1 - fraction, fraction])))
     return points or [MethodPoint(MethodStatus.ONE_SIDE, level)]
 
 

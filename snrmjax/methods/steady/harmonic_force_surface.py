@@ -44,8 +44,8 @@ class ForceSurface(NamedTuple):
             real = np.interp(fine, self.amplitude, column.real)
             size = np.abs(real + 1j * np.interp(fine, self.amplitude, column.imag)) - force
             for j in np.flatnonzero(np.sign(size[:-1]) != np.sign(size[1:])):
-                share = size[j] / (size[j] - size[j + 1])
-                found.append((float(omega), float(fine[j] + share * (fine[j + 1] - fine[j]))))
+                fraction = size[j] / (size[j] - size[j + 1])
+                found.append((float(omega), float(fine[j] + fraction * (fine[j + 1] - fine[j]))))
         points = np.array(sorted(found)).reshape(-1, 2)
         return points[:, 0], points[:, 1]
 

@@ -9,13 +9,13 @@ from snrmjax.model.effect_base import AbstractMemoryless, Scalar
 from snrmjax.model.effect_metadata import (
     NOT_BELOW_ZERO,
     Argument,
-    Confusion,
+    Confounder,
     Part,
     Shape,
     Symmetry,
     parameter,
 )
-from snrmjax.model.library.confusions import TOLD_BY_THIRD_HARMONIC
+from snrmjax.model.library.confounders import TOLD_BY_THIRD_HARMONIC
 
 _OF_VELOCITY = Shape(Part.DAMPING, Symmetry.ODD, Argument.VELOCITY)
 
@@ -30,7 +30,7 @@ class QuadraticDamping(AbstractMemoryless):
     shape: ClassVar[Shape] = _OF_VELOCITY._replace(
         power=1, factor=8 / (3 * np.pi), frequency_power=2
     )
-    confusions: ClassVar[tuple[Confusion, ...]] = (TOLD_BY_THIRD_HARMONIC,)
+    confounders: ClassVar[tuple[Confounder, ...]] = (TOLD_BY_THIRD_HARMONIC,)
     coefficient: Scalar = parameter("1/(kg^1/2 m)", "quadratic damping", prior=NOT_BELOW_ZERO)
 
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
@@ -45,7 +45,7 @@ class CubicDamping(AbstractMemoryless):
         "A damping force with the third power of the velocity, as of some dampers and seals."
     )
     shape: ClassVar[Shape] = _OF_VELOCITY._replace(power=2, factor=0.75, frequency_power=3)
-    confusions: ClassVar[tuple[Confusion, ...]] = (TOLD_BY_THIRD_HARMONIC,)
+    confounders: ClassVar[tuple[Confounder, ...]] = (TOLD_BY_THIRD_HARMONIC,)
     coefficient: Scalar = parameter("s/(kg m²)", "cubic damping")
 
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
@@ -63,7 +63,7 @@ class VanDerPolDamping(AbstractMemoryless):
     shape: ClassVar[Shape] = Shape(
         *(Part.DAMPING, Symmetry.ODD, Argument.BOTH), power=2, factor=0.25, frequency_power=1
     )
-    confusions: ClassVar[tuple[Confusion, ...]] = (TOLD_BY_THIRD_HARMONIC,)
+    confounders: ClassVar[tuple[Confounder, ...]] = (TOLD_BY_THIRD_HARMONIC,)
     coefficient: Scalar = parameter("1/(kg m² s)", "damping per squared displacement")
 
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:

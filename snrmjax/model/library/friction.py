@@ -30,7 +30,7 @@ from snrmjax.model.effect_base import (
 from snrmjax.model.effect_metadata import (
     NOT_BELOW_ZERO,
     Argument,
-    Confusion,
+    Confounder,
     MotionScales,
     Part,
     Prior,
@@ -38,7 +38,7 @@ from snrmjax.model.effect_metadata import (
     Symmetry,
     parameter,
 )
-from snrmjax.model.library.confusions import FRICTION_OR_FORCE_OFFSET
+from snrmjax.model.library.confounders import FRICTION_OR_FORCE_OFFSET
 from snrmjax.numerics.rules import BETWEEN_ONE_AND_THREE, NOT_NEGATIVE, POSITIVE
 
 _SLIP = Shape(Part.STIFFNESS_AND_DAMPING, Symmetry.ODD, Argument.HISTORY)
@@ -195,8 +195,8 @@ class JenkinsSlider(AbstractSliders):
     @classmethod
     def starts(cls, scales: MotionScales) -> Starts:
         """Slip at several shares of the largest amplitude."""
-        shares = (0.05, 0.15, 0.3, 0.5, 0.75)
-        return [(3.0 * scales.change, share * scales.largest) for share in shares]
+        fractions = (0.05, 0.15, 0.3, 0.5, 0.75)
+        return [(3.0 * scales.change, fraction * scales.largest) for fraction in fractions]
 
     def sliders(self) -> Sliders:
         return Sliders(jnp.asarray(self.stiffness)[None], jnp.asarray(self.slip_displacement)[None])
@@ -321,7 +321,7 @@ class CoulombFriction(AbstractHysteresis):
     shape: ClassVar[Shape] = Shape(
         *(Part.DAMPING, Symmetry.ODD, Argument.VELOCITY), power=-1, factor=4 / np.pi
     )
-    confusions: ClassVar[tuple[Confusion, ...]] = (FRICTION_OR_FORCE_OFFSET,)
+    confounders: ClassVar[tuple[Confounder, ...]] = (FRICTION_OR_FORCE_OFFSET,)
     force: Scalar = parameter(
         "kg^1/2 m/s²", "friction force", rules=(NOT_NEGATIVE,), prior=NOT_BELOW_ZERO
     )

@@ -76,9 +76,11 @@ class BoucWen(AbstractHysteresis):
 
     def _slope(self, force: Array, direction: Array) -> Array:
         """df/dx where x goes up (1) or down (−1)."""
-        share = jnp.abs(force) / self.slip_force
+        fraction = jnp.abs(force) / self.slip_force
         # The derivative by the exponent holds at zero force too.
-        power = jnp.where(share > 0, jnp.where(share > 0, share, 1.0) ** self.exponent, 0.0)
+        power = jnp.where(
+            fraction > 0, jnp.where(fraction > 0, fraction, 1.0) ** self.exponent, 0.0
+        )
         side = direction * jnp.sign(force)
         return self.stiffness * (1 - power * (self.unloading * side + 1 - self.unloading))
 
@@ -208,11 +210,11 @@ class FrictionContact(AbstractHysteresis):
         """The slider, pushed to where its bounds turn within the step and then to its end."""
         (x0, v0), (x1, v1) = begin, end
         for side in (1.0, -1.0):
-            share = side * self.friction * self.normal_stiffness / self.stiffness
+            fraction = side * self.friction * self.normal_stiffness / self.stiffness
             rates = []
             for x, v in ((x0, v0), (x1, v1)):
                 closed = self.pressure(x[1]) > 0
-                rates.append(v[0] + jnp.where(closed, share * v[1], 0.0))
+                rates.append(v[0] + jnp.where(closed, fraction * v[1], 0.0))
             turns = rates[0] * rates[1] < 0
             until = time * rates[0] / jnp.where(turns, rates[0] - rates[1], 1.0)
             there = x0 + (v0 + 0.5 * (v1 - v0) * until / time) * until

@@ -11,14 +11,14 @@ from jaxtyping import Array
 from snrmjax.model.effect_base import AbstractAddedMode, Bounds, Scalar, Starts
 from snrmjax.model.effect_metadata import (
     FURTHER_DAMPING,
-    Confusion,
+    Confounder,
     MotionScales,
     Part,
     Shape,
     Symmetry,
     parameter,
 )
-from snrmjax.model.library.confusions import WHICH_RESONANCE
+from snrmjax.model.library.confounders import WHICH_RESONANCE
 from snrmjax.model.modes import LinearModes
 from snrmjax.model.potential import Monomial, PolynomialPotential
 from snrmjax.numerics.rules import OF_A_DAMPING_RATIO, OF_A_FREQUENCY
@@ -35,7 +35,7 @@ class AbstractInternalResonance(AbstractAddedMode):
     """
 
     order: ClassVar[int]  # n: cycles of the further mode to one of the mode of interest
-    confusions: ClassVar[tuple[Confusion, ...]] = (WHICH_RESONANCE,)
+    confounders: ClassVar[tuple[Confounder, ...]] = (WHICH_RESONANCE,)
     coefficient: Scalar
     frequency_hz: Scalar = parameter(
         "Hz", "natural frequency of the further mode", rules=OF_A_FREQUENCY
@@ -54,8 +54,8 @@ class AbstractInternalResonance(AbstractAddedMode):
         n, hz = cls.order, scales.frequency / HERTZ
         size = np.sqrt(scales.change * 0.02 * (n * scales.frequency) ** 2)
         size = float(size / scales.amplitude ** (n - 1))
-        shares = (0.95, 0.985, 1.0, 1.015, 1.05)
-        return [(size, n * hz * share, scales.damping_ratio) for share in shares]
+        fractions = (0.95, 0.985, 1.0, 1.015, 1.05)
+        return [(size, n * hz * fraction, scales.damping_ratio) for fraction in fractions]
 
     @classmethod
     def bounds(cls, scales: MotionScales) -> Bounds:

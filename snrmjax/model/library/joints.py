@@ -100,8 +100,10 @@ class FourParameterIwan(AbstractSliders):
         power, end = self.exponent + 1, self.end
         largest = end if self.largest_slip is None else jnp.minimum(self.largest_slip, end)
         spread = self.stiffness / (1 + self.ratio)  # of all below φ_max
-        share = jnp.where(largest > 0, largest, 0.0) / end
-        some = jnp.where(share > 0, share, 1.0) ** power * jnp.where(share > 0, spread, 0.0)
+        fraction = jnp.where(largest > 0, largest, 0.0) / end
+        some = jnp.where(fraction > 0, fraction, 1.0) ** power * jnp.where(
+            fraction > 0, spread, 0.0
+        )
         slip = largest * jnp.asarray(NODE) ** (1 / power)
         rest = jnp.stack([self.stiffness - spread, spread - some])
         return Sliders(

@@ -7,12 +7,12 @@ import jax.numpy as jnp
 from snrmjax.model.effect_base import AbstractLinearChange, Scalar
 from snrmjax.model.effect_metadata import (
     MORE_THAN_NOTHING,
-    Confusion,
+    Confounder,
     Part,
     Shape,
     parameter,
 )
-from snrmjax.model.library.confusions import DRIFT, STIFFNESS_OR_MASS
+from snrmjax.model.library.confounders import DRIFT, STIFFNESS_OR_MASS
 from snrmjax.numerics.rules import ABOVE_MINUS_ONE
 
 
@@ -34,7 +34,7 @@ class LinearFrequencyShift(AbstractLinearChange):
         "the linear test."
     )
     shape: ClassVar[Shape] = Shape(Part.STIFFNESS, power=0)
-    confusions: ClassVar[tuple[Confusion, ...]] = (STIFFNESS_OR_MASS,)
+    confounders: ClassVar[tuple[Confounder, ...]] = (STIFFNESS_OR_MASS,)
     relative_shift: Scalar = parameter(
         "1",
         "relative shift of the natural frequency",
@@ -61,7 +61,7 @@ class FrequencyDrift(AbstractLinearChange):
         "settles."
     )
     shape: ClassVar[Shape] = Shape(Part.TIME)
-    confusions: ClassVar[tuple[Confusion, ...]] = (DRIFT,)
+    confounders: ClassVar[tuple[Confounder, ...]] = (DRIFT,)
     relative_drift: Scalar = parameter(
         "1",
         "relative shift of the natural frequency over the test",
@@ -101,7 +101,7 @@ class AddedMass(AbstractLinearChange):
         "A mass that the model lacks, such as that of a sensor or of a shaker's armature."
     )
     shape: ClassVar[Shape] = Shape(Part.STIFFNESS, power=0)
-    confusions: ClassVar[tuple[Confusion, ...]] = (STIFFNESS_OR_MASS,)
+    confounders: ClassVar[tuple[Confounder, ...]] = (STIFFNESS_OR_MASS,)
     like_force_gain: ClassVar[bool] = True
     mass: Scalar = parameter(
         *("1", "mass over the modal mass"),

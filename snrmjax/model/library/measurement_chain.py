@@ -17,14 +17,14 @@ from snrmjax.model.effect_metadata import (
     FURTHER_DAMPING,
     MORE_THAN_NOTHING,
     VISIBLE_CHANGE,
-    Confusion,
+    Confounder,
     MotionScales,
     Part,
     Prior,
     Shape,
     parameter,
 )
-from snrmjax.model.library.confusions import (
+from snrmjax.model.library.confounders import (
     FAR_MODE_OR_PHASE_ERROR,
     FORCE_OR_SENSOR_GAIN,
     FRICTION_OR_FORCE_OFFSET,
@@ -55,7 +55,7 @@ class ForceHarmonics(AbstractForceSpectrum):
         "The force of the shaker is not a pure sine: it has harmonics 2 and 3 of its own."
     )
     shape: ClassVar[Shape] = Shape(Part.HARMONICS)
-    confusions: ClassVar[tuple[Confusion, ...]] = (STRUCTURE_OR_FORCE_SPECTRUM,)
+    confounders: ClassVar[tuple[Confounder, ...]] = (STRUCTURE_OR_FORCE_SPECTRUM,)
     second: Scalar = parameter(
         "1", "harmonic 2 of the force over its fundamental", start=lambda _: 0.02
     )
@@ -75,7 +75,7 @@ class ForceGainError(AbstractMeasurementEffect):
         "The force is recorded in a wrong scale: the calibration factor of the force sensor, or a "
         "mass between it and the structure."
     )
-    confusions: ClassVar[tuple[Confusion, ...]] = (SIZE_OF_RESPONSE, FORCE_OR_SENSOR_GAIN)
+    confounders: ClassVar[tuple[Confounder, ...]] = (SIZE_OF_RESPONSE, FORCE_OR_SENSOR_GAIN)
     like_force_gain: ClassVar[bool] = True
     gain: Scalar = parameter(*("1", "relative error of the force"), **_RELATIVE)
 
@@ -93,7 +93,7 @@ class ForceOffsetError(AbstractMeasurementEffect):
         "The recorded amplitude of the force is too small or too large by a constant, as a noise "
         "floor or a threshold makes it."
     )
-    confusions: ClassVar[tuple[Confusion, ...]] = (FRICTION_OR_FORCE_OFFSET,)
+    confounders: ClassVar[tuple[Confounder, ...]] = (FRICTION_OR_FORCE_OFFSET,)
     offset: Scalar = parameter(
         *("N", "true less recorded amplitude of the force"),
         start=lambda scales: VISIBLE_CHANGE * scales.smallest_force,
@@ -113,7 +113,7 @@ class SensorGainError(AbstractMeasurementEffect):
         "The velocity is recorded in a wrong scale: the calibration factor of the sensor, or peak "
         "values taken for amplitudes."
     )
-    confusions: ClassVar[tuple[Confusion, ...]] = (SIZE_OF_RESPONSE, FORCE_OR_SENSOR_GAIN)
+    confounders: ClassVar[tuple[Confounder, ...]] = (SIZE_OF_RESPONSE, FORCE_OR_SENSOR_GAIN)
     like_force_gain: ClassVar[bool] = True
     gain: Scalar = parameter(*("1", "relative error of the velocity"), **_RELATIVE)
 
@@ -134,7 +134,7 @@ class SensorPhaseError(AbstractMeasurementEffect):
         "The recorded velocity leads or lags by a constant phase, as a filter or a delay between "
         "the channels makes it."
     )
-    confusions: ClassVar[tuple[Confusion, ...]] = (FAR_MODE_OR_PHASE_ERROR,)
+    confounders: ClassVar[tuple[Confounder, ...]] = (FAR_MODE_OR_PHASE_ERROR,)
     only_phase: ClassVar[bool] = True
     phase_deg: Scalar = parameter(
         *("°", "phase by which the recorded velocity leads"),
@@ -159,7 +159,7 @@ class ResidualMode(AbstractMeasurementEffect):
         "Modes far from the measured frequencies, which the model lacks, add a displacement that "
         "is proportional to the force."
     )
-    confusions: ClassVar[tuple[Confusion, ...]] = (FAR_MODE_OR_PHASE_ERROR,)
+    confounders: ClassVar[tuple[Confounder, ...]] = (FAR_MODE_OR_PHASE_ERROR,)
     follows_force: ClassVar[bool] = True
     stage: ClassVar[int] = 1
     receptance: Scalar = parameter(
@@ -187,7 +187,7 @@ class CloseMode(AbstractMeasurementEffect):
         "A further linear mode near the measured frequencies, which the model lacks, adds its own "
         "response."
     )
-    confusions: ClassVar[tuple[Confusion, ...]] = (FURTHER_MODE,)
+    confounders: ClassVar[tuple[Confounder, ...]] = (FURTHER_MODE,)
     searched: ClassVar[bool] = False
     follows_force: ClassVar[bool] = True
     stage: ClassVar[int] = 1
@@ -207,9 +207,9 @@ class CloseMode(AbstractMeasurementEffect):
         starts: Starts = []
         ratio = max(scales.damping_ratio, _LIGHT)
         for away in (-8.0, -3.0, 3.0, 8.0):
-            share = 1 + float(np.clip(away * ratio, -_WIDE, _WIDE))
-            distance = abs(share**2 - 1 + 2j * ratio * share) * scales.frequency**2
-            hz = share * scales.frequency / HERTZ
+            fraction = 1 + float(np.clip(away * ratio, -_WIDE, _WIDE))
+            distance = abs(fraction**2 - 1 + 2j * ratio * fraction) * scales.frequency**2
+            hz = fraction * scales.frequency / HERTZ
             starts.append((VISIBLE_CHANGE * scales.receptance * distance, hz, ratio))
         return starts
 
@@ -240,7 +240,7 @@ class ModeShapeChange(AbstractMeasurementEffect):
         "The mode shape changes with the amplitude: the sensor's share of the motion is not "
         "constant."
     )
-    confusions: ClassVar[tuple[Confusion, ...]] = (SIZE_OF_RESPONSE,)
+    confounders: ClassVar[tuple[Confounder, ...]] = (SIZE_OF_RESPONSE,)
     stage: ClassVar[int] = 0
     coefficient: Scalar = parameter(
         *("1/(kg m²)", "relative change per squared amplitude"),

@@ -5,11 +5,11 @@ from typing import ClassVar
 import jax.numpy as jnp
 import numpy as np
 
-from snrmjax.model.effect_base import AbstractKinked, AbstractMemoryless, Scalar, Starts
+from snrmjax.model.effect_base import AbstractMemoryless, AbstractNonsmooth, Scalar, Starts
 from snrmjax.model.effect_metadata import (
     NOT_BELOW_ZERO,
     Argument,
-    Confusion,
+    Confounder,
     MotionScales,
     Part,
     Prior,
@@ -17,22 +17,22 @@ from snrmjax.model.effect_metadata import (
     Symmetry,
     parameter,
 )
-from snrmjax.model.kinks import Kinks
-from snrmjax.model.library.confusions import (
+from snrmjax.model.library.confounders import (
     ONE_SIDED_OR_TWO_SIDED,
     STRUCTURE_OR_FORCE_SPECTRUM,
     TOLD_BY_MEAN_OR_SECOND_HARMONIC,
 )
+from snrmjax.model.nonsmooth_points import NonsmoothPoints
 from snrmjax.numerics.rules import NOT_NEGATIVE
 
 _ODD = Shape(Part.STIFFNESS, Symmetry.ODD, Argument.DISPLACEMENT)
 _EVEN = Shape(Part.STIFFNESS, Symmetry.EVEN, Argument.DISPLACEMENT, strength_order=2)
 _OF_A_GAP = Prior(0.0, 1.2, lambda scales: scales.largest)
-_SHARES = (0.3, 0.55, 0.75, 0.9)  # of the largest amplitude: gaps from which a fit begins
+_FRACTIONS = (0.3, 0.55, 0.75, 0.9)  # of the largest amplitude: gaps from which a fit begins
 
 
-def _contact_starts(scales: MotionScales, share: float) -> Starts:
-    return [(share * scales.change, gap * scales.largest) for gap in _SHARES]
+def _contact_starts(scales: MotionScales, fraction: float) -> Starts:
+    return [(fraction * scales.change, gap * scales.largest) for gap in _FRACTIONS]
 
 
 class CubicStiffness(AbstractMemoryless):
@@ -44,7 +44,7 @@ class CubicStiffness(AbstractMemoryless):
         "stretching of a clamped beam makes it."
     )
     shape: ClassVar[Shape] = _ODD._replace(power=2, factor=0.75)
-    confusions: ClassVar[tuple[Confusion, ...]] = (TOLD_BY_MEAN_OR_SECOND_HARMONIC,)
+    confounders: ClassVar[tuple[Confounder, ...]] = (TOLD_BY_MEAN_OR_SECOND_HARMONIC,)
     coefficient: Scalar = parameter("1/(kg m² s²)", "cubic stiffness")
 
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
@@ -64,7 +64,7 @@ class QuadraticStiffness(AbstractMemoryless):
         "makes it: the motion loses its symmetry and softens."
     )
     shape: ClassVar[Shape] = _EVEN._replace(power=2)
-    confusions: ClassVar[tuple[Confusion, ...]] = (TOLD_BY_MEAN_OR_SECOND_HARMONIC,)
+    confounders: ClassVar[tuple[Confounder, ...]] = (TOLD_BY_MEAN_OR_SECOND_HARMONIC,)
     coefficient: Scalar = parameter("1/(kg^1/2 m s²)", "quadratic stiffness")
 
     @classmethod
@@ -92,7 +92,7 @@ class QuinticStiffness(AbstractMemoryless):
         return self.coefficient * displacement**5
 
 
-class BilinearStiffness(AbstractKinked):
+class BilinearStiffness(AbstractNonsmooth):
     """f = k|q|/2: the stiffness differs by k between the two sides; `stiffness` is k in 1/s².
 
     Its even harmonics are proportional to the amplitude.
@@ -105,7 +105,7 @@ class BilinearStiffness(AbstractKinked):
         "closes makes it."
     )
     shape: ClassVar[Shape] = _EVEN
-    confusions: ClassVar[tuple[Confusion, ...]] = (STRUCTURE_OR_FORCE_SPECTRUM,)
+    confounders: ClassVar[tuple[Confounder, ...]] = (STRUCTURE_OR_FORCE_SPECTRUM,)
     stiffness: Scalar = parameter("1/s²", "difference of stiffness between the two sides")
 
     @classmethod
@@ -116,12 +116,12 @@ class BilinearStiffness(AbstractKinked):
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
         return 0.5 * self.stiffness * jnp.abs(displacement)
 
-    def kinks(self) -> Kinks:
+    def nonsmooth_points(self) -> NonsmoothPoints:
         stiffness = jnp.asarray(self.stiffness)[None]
-        return Kinks(jnp.zeros_like(stiffness), stiffness)
+        return NonsmoothPoints(jnp.zeros_like(stiffness), stiffness)
 
 
-class GapStiffness(AbstractKinked):
+class GapStiffness(AbstractNonsmooth):
     """A spring that engages beyond ±`gap` (kg^1/2 m); its `stiffness` is in 1/s².
 
     It shows above an amplitude of `gap` only, in odd harmonics.
@@ -134,7 +134,7 @@ class GapStiffness(AbstractKinked):
         "displacement exceeds the gap."
     )
     shape: ClassVar[Shape] = _ODD
-    confusions: ClassVar[tuple[Confusion, ...]] = (ONE_SIDED_OR_TWO_SIDED,)
+    confounders: ClassVar[tuple[Confounder, ...]] = (ONE_SIDED_OR_TWO_SIDED,)
     stiffness: Scalar = parameter("1/s²", "stiffness of the contact", prior=NOT_BELOW_ZERO)
     gap: Scalar = parameter(
         "kg^1/2 m", "displacement at contact", rules=(NOT_NEGATIVE,), prior=_OF_A_GAP
@@ -149,12 +149,12 @@ class GapStiffness(AbstractKinked):
         above = jnp.maximum(displacement - self.gap, 0.0)
         return self.stiffness * (above - jnp.maximum(-displacement - self.gap, 0.0))
 
-    def kinks(self) -> Kinks:
+    def nonsmooth_points(self) -> NonsmoothPoints:
         gap, stiffness = jnp.asarray(self.gap), jnp.asarray(self.stiffness)
-        return Kinks(jnp.stack([gap, -gap]), jnp.stack([stiffness, -stiffness]))
+        return NonsmoothPoints(jnp.stack([gap, -gap]), jnp.stack([stiffness, -stiffness]))
 
 
-class OneSidedStop(AbstractKinked):
+class OneSidedStop(AbstractNonsmooth):
     """A spring that engages beyond +`gap` (kg^1/2 m); its `stiffness` is in 1/s².
 
     It shows above an amplitude of `gap` only, in even and odd harmonics.
@@ -166,7 +166,7 @@ class OneSidedStop(AbstractKinked):
         "A stop on one side: a further spring that engages where the displacement exceeds the gap."
     )
     shape: ClassVar[Shape] = Shape(Part.STIFFNESS, Symmetry.NEITHER, Argument.DISPLACEMENT)
-    confusions: ClassVar[tuple[Confusion, ...]] = (ONE_SIDED_OR_TWO_SIDED,)
+    confounders: ClassVar[tuple[Confounder, ...]] = (ONE_SIDED_OR_TWO_SIDED,)
     stiffness: Scalar = parameter("1/s²", "stiffness of the contact", prior=NOT_BELOW_ZERO)
     gap: Scalar = parameter("kg^1/2 m", "displacement at contact", prior=_OF_A_GAP)
 
@@ -178,8 +178,8 @@ class OneSidedStop(AbstractKinked):
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
         return self.stiffness * jnp.maximum(displacement - self.gap, 0.0)
 
-    def kinks(self) -> Kinks:
-        return Kinks(jnp.asarray(self.gap)[None], jnp.asarray(self.stiffness)[None])
+    def nonsmooth_points(self) -> NonsmoothPoints:
+        return NonsmoothPoints(jnp.asarray(self.gap)[None], jnp.asarray(self.stiffness)[None])
 
 
 class StaticPreload(AbstractMemoryless):
@@ -197,7 +197,7 @@ class StaticPreload(AbstractMemoryless):
         "where a nonlinear spring is stiffer or softer; at points along the positive direction."
     )
     shape: ClassVar[Shape] = _EVEN
-    confusions: ClassVar[tuple[Confusion, ...]] = (TOLD_BY_MEAN_OR_SECOND_HARMONIC,)
+    confounders: ClassVar[tuple[Confounder, ...]] = (TOLD_BY_MEAN_OR_SECOND_HARMONIC,)
     # A linear structure does not show it; with a cubic spring it is a quadratic one.
     searched: ClassVar[bool] = False
     constant_force: Scalar = parameter("kg^1/2 m/s²", "constant force")

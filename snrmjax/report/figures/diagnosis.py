@@ -384,8 +384,8 @@ def _single_valued_against(q: np.ndarray, v: np.ndarray, force: np.ndarray) -> i
 
 def _force_course(effect: AbstractForceSpectrum) -> _Law:
     time = np.linspace(0.0, 1.0, _SAMPLES)
-    shares = np.asarray(effect.load_orders())
-    extra = sum(a * np.cos(2 * np.pi * h * time) for h, a in enumerate(shares) if h != 1)
+    fractions = np.asarray(effect.load_orders())
+    extra = sum(a * np.cos(2 * np.pi * h * time) for h, a in enumerate(fractions) if h != 1)
     sine = np.cos(2 * np.pi * time)
     curves = (_Curve(time, sine + extra, "force"), _Curve(time, sine, "fundamental alone"))
     return _Law(("Time", "periods"), ("Force over its amplitude", "1"), curves)

@@ -53,7 +53,7 @@ from snrmjax.report.style import (
 from snrmjax.simulate.solutions.controlled import DampedModeBranch
 from snrmjax.simulate.solutions.normal_modes import NormalModeBranch
 
-_LEAST_SHARE = 0.005  # of a band's variance: what is smaller stands in one bar together
+_LEAST_FRACTION = 0.005  # of a band's variance: what is smaller stands in one bar together
 
 
 class FitSeries(NamedTuple):
@@ -185,23 +185,27 @@ def contributions_figure(rows: Sequence[Contribution]) -> Figure:
     if not rows:
         raise ValueError("there is nothing to show: `rows` is empty.")
     kinds = Contributions(tuple(rows)).by_kind()
-    large = [row for row in kinds if max(row.frequency_share, row.damping_share) >= _LEAST_SHARE]
+    large = [
+        row for row in kinds if max(row.frequency_fraction, row.damping_fraction) >= _LEAST_FRACTION
+    ]
     small = [row for row in kinds if row not in large]
     names = [row.source for row in large]
-    shares = [(row.frequency_share, row.damping_share) for row in large]
+    fractions = [(row.frequency_fraction, row.damping_fraction) for row in large]
     if small:
         names.append(small[0].source if len(small) == 1 else f"{len(small)} smaller ones together")
-        shares.append((sum(r.frequency_share for r in small), sum(r.damping_share for r in small)))
+        fractions.append(
+            (sum(r.frequency_fraction for r in small), sum(r.damping_fraction for r in small))
+        )
     place = np.arange(len(names))
     figure, ((axes,),) = panels(COLUMN, 1.0 + 0.36 * len(names), 1, 1)
     for k, (what, colour) in enumerate((("natural frequency", MEASURED), ("damping", IDENTIFIED))):
-        widths = [100 * share[k] for share in shares]
+        widths = [100 * fraction[k] for fraction in fractions]
         bars = axes.barh(place + (k - 0.5) * 0.38, widths, 0.36, color=colour, label=what)
         axes.bar_label(bars, [f"{w:.1f} %" for w in widths], padding=2, fontsize=SMALL)
     axes.set_yticks(place, [plain(name) for name in names])
     axes.invert_yaxis()
     axes.grid(visible=False, axis="y")
-    axes.set_xlim(0.0, 1.22 * 100 * max(max(share) for share in shares))
+    axes.set_xlim(0.0, 1.22 * 100 * max(max(fraction) for fraction in fractions))
     axes.xaxis.set_major_formatter(PercentFormatter(decimals=0))
     name_axes(axes, "", "Share of the band's variance", "")
     legend(figure)

@@ -50,7 +50,7 @@ from snrmjax.simulate.solutions.forced_response import ResponseBatch, ResponseCu
 from snrmjax.simulate.solutions.normal_modes import NormalModeBranch
 from snrmjax.simulate.solutions.quasi_periodic import QuasiPeriodicBranch
 
-_SEEN_SHARE = 1e-3  # of the energy: the width of a line in its panel
+_SEEN_FRACTION = 1e-3  # of the energy: the width of a line in its panel
 
 
 def simulated_response_figure(
@@ -198,7 +198,7 @@ def normal_mode_figure(branch: NormalModeBranch, *, sensor: str | None = None) -
     fundamental = np.abs(velocity_of(branch, name))
     peak = velocity_peaks(branch.velocity[:, :, branch.sensors.index(name)])
     unit, omega = unit_for(peak, "m/s"), branch.frequency / HERTZ
-    several = branch.mode_share.shape[1] > 1
+    several = branch.mode_fraction.shape[1] > 1
     figure, grid = panels(PAGE, 6.0 if several else 3.2, 2 if several else 1, 2)
     speeds, energies = grid[0]
     stable = branch.stability
@@ -208,8 +208,8 @@ def normal_mode_figure(branch: NormalModeBranch, *, sensor: str | None = None) -
     _energy_axis(energies, branch)
     drawn = [t for t in branch.tongues if t.last >= t.first]  # not those left out
     for tongue, marker in zip(drawn, cycle("osD^v"), strict=False):
-        share = branch.mode_share[tongue.first : tongue.last + 1, tongue.mode]
-        tip = tongue.first + int(np.argmax(share))
+        fraction = branch.mode_fraction[tongue.first : tongue.last + 1, tongue.mode]
+        tip = tongue.first + int(np.argmax(fraction))
         style: Style = {**HOLLOW, "marker": marker}
         marks(energies, branch.energy[tip], omega[tip], style, f"internal resonance {tongue.name}")
     speeds.set_ylim(bottom=0.0)
@@ -217,27 +217,27 @@ def normal_mode_figure(branch: NormalModeBranch, *, sensor: str | None = None) -
     name_axes(speeds, title, "Frequency (Hz)", level)
     name_axes(energies, "(b) frequency and energy", "Energy (J)", "Frequency (Hz)")
     if several:
-        shares, shapes = grid[1]
-        _draw_shapes(branch, shares, shapes, branch.sensors.index(name))
+        fractions, shapes = grid[1]
+        _draw_shapes(branch, fractions, shapes, branch.sensors.index(name))
     explain_lines(figure)
     legend(figure)
     return figure
 
 
-def _draw_shapes(branch: NormalModeBranch, shares: Axes, shapes: Axes, reference: int) -> None:
+def _draw_shapes(branch: NormalModeBranch, fractions: Axes, shapes: Axes, reference: int) -> None:
     """Shares of the modes in the energy, and fundamentals of the sensors over one of them."""
     energy, stable = branch.energy, branch.stability
-    seen = np.flatnonzero(branch.mode_share.max(axis=0) > _SEEN_SHARE)
+    seen = np.flatnonzero(branch.mode_fraction.max(axis=0) > _SEEN_FRACTION)
     for k, colour in zip(seen.tolist(), _many_colours(len(seen)), strict=True):
-        share = 100.0 * branch.mode_share[:, k]
-        response_line(shares, energy, share, stable, f"mode {k + 1}", colour, LINE)
-    name_axes(shares, "(c) share of the modes", "Energy (J)", "Share of the kinetic energy (%)")
-    _energy_axis(shares, branch)
+        fraction = 100.0 * branch.mode_fraction[:, k]
+        response_line(fractions, energy, fraction, stable, f"mode {k + 1}", colour, LINE)
+    name_axes(fractions, "(c) share of the modes", "Energy (J)", "Share of the kinetic energy (%)")
+    _energy_axis(fractions, branch)
     if len(branch.sensors) == 1:
-        spec = shares.get_subplotspec()
+        spec = fractions.get_subplotspec()
         shapes.remove()
         if spec is not None:
-            shares.set_subplotspec(spec.get_gridspec()[1, :])
+            fractions.set_subplotspec(spec.get_gridspec()[1, :])
         return
     shape = branch.shape(reference)
     over = shape / np.maximum(np.abs(shape[:, [reference]]), np.finfo(float).tiny)

@@ -207,5 +207,5 @@ def _fitted(one: FoldedRecord, moved: Unit, load: Unit) -> dict[str, np.ndarray]
 
 def _force_orders(one: FoldedRecord, orders: Sequence[int]) -> dict[str, np.ndarray]:
     size = {order: abs(one.force_harmonics[one.orders.index(order)]) for order in orders}
-    share = [100 * size[order] / size[1] if order > 1 else np.nan for order in orders]
-    return {"order": np.array(orders, dtype=float), "share": np.array(share)}
+    fraction = [100 * size[order] / size[1] if order > 1 else np.nan for order in orders]
+    return {"order": np.array(orders, dtype=float), "share": np.array(fraction)}

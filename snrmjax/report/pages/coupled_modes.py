@@ -72,7 +72,7 @@ def write(folder: Path, found: CoupledDetails) -> dict[str, object]:
                 "modes": [one.mode + 1, one.other + 1],
                 "ratio": one.ratio,
                 "probability": one.probability,
-                "energy_share": None if np.isnan(one.share) else one.share,
+                "energy_fraction": None if np.isnan(one.fraction) else one.fraction,
             }
             for one in found.modes.interactions
         ],

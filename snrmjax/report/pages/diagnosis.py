@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from snrmjax.diagnose.diagnosis_result import Diagnosis
 from snrmjax.diagnose.fitted_effects import TriedEffect
-from snrmjax.diagnose.location.where import PlacedForce, Whereabouts
+from snrmjax.diagnose.location.where import Localisation, PlacedForce
 from snrmjax.diagnose.misfit.candidates import scales_of_motions
 from snrmjax.diagnose.misfit.locating import Located
 from snrmjax.diagnose.naming.detection import beyond_data
@@ -114,7 +114,7 @@ def write(folder: Path, found: DiagnosedTest, *, title: str = "", data: str = ""
         figures["responses"] = responses_figure(diagnosis, found.simulated)
     summary = written.summarise_diagnosis(diagnosis, predicted)
     if found.where is not None:
-        summary |= written.summarise_whereabouts(found.where)
+        summary |= written.summarise_localisation(found.where)
         if found.is_placed:
             summary |= written.placed_answer(found.where)
     write_summary(folder / "diagnosis.json", summary)
@@ -137,7 +137,7 @@ def write(folder: Path, found: DiagnosedTest, *, title: str = "", data: str = ""
     return report
 
 
-def _place_section(where: Whereabouts) -> Section:
+def _place_section(where: Localisation) -> Section:
     """The places with their probabilities, and the law that explains the sensors best at each."""
     rows = []
     for place in where.places:

@@ -213,7 +213,7 @@ def write(
         _write_fit(folder, found.joint, added)
         banded = [response for prediction in found.predictions for response in prediction.banded]
         details = found.joint
-        summary["joint_fit"] = joint_results.summarise_fit(details.fit, banded, details.shares)
+        summary["joint_fit"] = joint_results.summarise_fit(details.fit, banded, details.fractions)
     summary |= results.summarise(found.identification, found.values)
     summary["resonances"] = [
         load_named(results.summarise_resonance(each), unit) | _further_load(prediction)

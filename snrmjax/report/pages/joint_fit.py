@@ -46,7 +46,7 @@ RESIDUALS_CAPTION = (
     "without shape, and one in twenty lies outside the dashed lines. A bend means that "
     "the curves, the phase or the linear modes are wrong; a funnel, that the noise is."
 )
-SHARES_CAPTION = (
+FRACTIONS_CAPTION = (
     "Where the width of the bands comes from: shares of the variance, mean over the measured "
     "amplitudes. Bars of one colour sum to 100 %. Random errors shrink with more states, errors "
     "of levels only with more levels."
@@ -69,7 +69,7 @@ def joint_figures(
     figures = {
         "joint_fit": drawn,
         "residuals": residuals_figure(details.fit, shown),
-        "contributions": contributions_figure(details.shares),
+        "contributions": contributions_figure(details.fractions),
     }
     if details.advice:
         sensor = details.fit.modes.sensors[details.fit.data.sensor]
@@ -101,8 +101,8 @@ def joint_sections(
         Section(
             "What the bands are made of",
             (),
-            [ReportFigure(figures["contributions"], SHARES_CAPTION)],
-            [contribution_table(details.shares)],
+            [ReportFigure(figures["contributions"], FRACTIONS_CAPTION)],
+            [contribution_table(details.fractions)],
         ),
     ]
     if details.advice:
@@ -196,12 +196,12 @@ def error_table(summary: dict) -> ReportTable:
     return ReportTable(("error", "1σ"), rows, "Errors as the fit takes them, stated or found.")
 
 
-def contribution_table(shares: Sequence[Contribution]) -> ReportTable:
+def contribution_table(fractions: Sequence[Contribution]) -> ReportTable:
     """The largest contributions to the bands by name, and all others in one row."""
-    named, others = shares[:_LISTED], shares[_LISTED:]
-    pairs = [(one.source, one.frequency_share, one.damping_share) for one in named]
+    named, others = fractions[:_LISTED], fractions[_LISTED:]
+    pairs = [(one.source, one.frequency_fraction, one.damping_fraction) for one in named]
     if others:
-        rest = sum(o.frequency_share for o in others), sum(o.damping_share for o in others)
+        rest = sum(o.frequency_fraction for o in others), sum(o.damping_fraction for o in others)
         pairs.append((f"{len(others)} further ones together", *rest))
     rows = [(name, f"{100 * a:.1f}", f"{100 * b:.1f}") for name, a, b in pairs]
     header = ("source of error", "natural frequency (%)", "damping (%)")

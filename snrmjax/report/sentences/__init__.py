@@ -1,7 +1,7 @@
 """Every sentence that a fact becomes, a file a subject, each a table `SENTENCES` by kind.
 
 An entry is a template with the fact's values by name, or a function of them. Beside Python's own
-formats, templates know `{n:#state}` (1 state, 2 states), `{share:%.3g}` (of 0.05: 5 %) and lists
+formats, templates know `{n:#state}` (1 state, 2 states), `{fraction:%.3g}` (of 0.05: 5 %) and lists
 ("1, 2 and 5").
 """
 

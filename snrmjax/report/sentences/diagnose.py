@@ -314,9 +314,9 @@ SENTENCES: dict[str, Wording] = {
         "force or of the sensor does the same, so that none of that size can be told from it: "
         "calibrate both statically, or repeat a level with a known added mass."
     ),
-    "frequency_off": lambda *, share: (
-        f"the model's natural frequency is off by {100 * share:.0f} %: are these measurements of "
-        "another mode?"
+    "frequency_off": lambda *, fraction: (
+        f"the model's natural frequency is off by {100 * fraction:.0f} %: are these "
+        "measurements of another mode?"
     ),
     "not_physical": (
         "there is no completed model: {reason} The parameters that fit best are none that a "

@@ -39,8 +39,8 @@ _ADVICE_ON_RESPONSES = {
 }
 
 
-def _percent(share: float) -> str:
-    return f"{100 * share:.2g} %" if share < 0.995 else "100 % or more"
+def _percent(fraction: float) -> str:
+    return f"{100 * fraction:.2g} %" if fraction < 0.995 else "100 % or more"
 
 
 def _rows(rows: Sequence[int]) -> str:
@@ -211,7 +211,7 @@ SENTENCES: dict[str, Wording] = {
         "drive harder at resonance, average longer or use a more sensitive cell."
     ),
     "states_unsettled": _read_so(
-        lambda *, share: f"about {_percent(share)} of a change is left at the end of a step"
+        lambda *, fraction: f"about {_percent(fraction)} of a change is left at the end of a step"
     ),
     "advice_unsettled": (
         "dwell longer, 5/(ζω) a step; or import the time record, whose unsettled steps are left "
@@ -243,9 +243,9 @@ SENTENCES: dict[str, Wording] = {
         "the force's spectrum."
     ),
     # What a record shows.
-    "channel_full_scale": lambda *, share, n_samples, low, high: (
+    "channel_full_scale": lambda *, fraction, n_samples, low, high: (
         (
-            f"{_percent(share)} of the samples stand in a row"
+            f"{_percent(fraction)} of the samples stand in a row"
             if n_samples is None
             else f"{n_samples} samples, more than at any other value, stand"
         )

@@ -261,8 +261,8 @@ def _not_located(points: Sequence[tuple[str, float]], force: float) -> str:
     )
 
 
-def _coupled(mode: int, other: int, ratio: int, probability: float, share: float) -> str:
-    moved = "" if np.isnan(share) else f", which has up to {100 * share:.2g} % of the energy"
+def _coupled(mode: int, other: int, ratio: int, probability: float, fraction: float) -> str:
+    moved = "" if np.isnan(fraction) else f", which has up to {100 * fraction:.2g} % of the energy"
     return (
         f"mode {mode} exchanges energy with mode {other} (1:{ratio}, probability "
         f"{_probable(probability)}){moved}: a backbone of one mode holds where this is little."

@@ -45,8 +45,8 @@ SENTENCES: dict[str, Wording] = {
         "the mode, {share:%.3g} of the decay's energy, was isolated by a filter that moves with "
         "it within {low_hz:.4g} to {high_hz:.4g} Hz, from {begin:.3g} s on"
     ),
-    "company_of_decay": (
-        "{share:%.2g} of the decay's energy is other motion, {line_share:%.2g} of it near "
+    "interfering_modes_of_decay": (
+        "{share:%.2g} of the decay's energy is other motion, {line_fraction:%.2g} of it near "
         "{frequency_hz:.4g} Hz"
     ),
     "bias_of_mode_filter": (

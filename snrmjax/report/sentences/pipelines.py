@@ -56,13 +56,13 @@ def _no_stable_response(
     )
 
 
-def _element_idle(force: float, unit: str, element: str, slides: bool, share: float) -> str:
+def _element_idle(force: float, unit: str, element: str, slides: bool, fraction: float) -> str:
     state, more = ("sticks", "slip") if slides else ("is not reached", "reach it")
     whole = "slip displacement" if slides else "gap"
     makes = f"more force makes it {more}" if slides else f"more force would {more}"
     return (
         f"force {force:g} {unit}: {element} {state} throughout this range (the motion takes "
-        f"{100 * share:.3g} % of its {whole}): {makes}."
+        f"{100 * fraction:.3g} % of its {whole}): {makes}."
     )
 
 

@@ -57,10 +57,10 @@ def _harmonics_apart(
     *,
     models: Sequence[Sequence[str]],
     harmonic: int,
-    shares: Sequence[float],
+    fractions: Sequence[float],
     turned_deg: float | None,
 ) -> str:
-    one, other = (f"{round(100 * share, 6):.2g} %" for share in shares)
+    one, other = (f"{round(100 * fraction, 6):.2g} %" for fraction in fractions)
     turn = "" if turned_deg is None else f", turned by {turned_deg:.0f}°"
     return (
         f"harmonic {harmonic} is {one} of the fundamental with {effect_names(models[0])}, "
@@ -90,9 +90,9 @@ SENTENCES: dict[str, Wording] = {
         "there is none"
     ),
     "harmonics_apart": _harmonics_apart,
-    "velocities_apart": lambda *, models, share: (
+    "velocities_apart": lambda *, models, fraction: (
         f"with {effect_names(models[0])} and {effect_names(models[1])} velocities differ by up to "
-        f"{100 * share:.2g} %"
+        f"{100 * fraction:.2g} %"
     ),
     "resonances_apart": _resonances_apart,
     "widen_range": ("widen the range of levels and measure farther off resonance on both sides"),

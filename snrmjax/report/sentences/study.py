@@ -76,15 +76,15 @@ SENTENCES: dict[str, Wording] = {
         "the members are a {method} of chosen values: means, ranges and shares describe these "
         "members, not a probability"
     ),
-    "too_few_for_shares": lambda fewest, outputs: (
+    "too_few_for_fractions": lambda fewest, outputs: (
         f"fewer than {number_of(fewest, 'member')}: no shares of variance for {_outputs(outputs)}"
     ),
-    "shares_uncertain": lambda limit, outputs: (
+    "fractions_uncertain": lambda limit, outputs: (
         f"shares of variance are uncertain by more than {100 * limit:.0f} % of the variance for "
         f"{_outputs(outputs)}: take more members"
     ),
     "varied_together": _together,
-    "shares_above_one": "shares of variance add up to more than one by their errors",
+    "fractions_above_one": "shares of variance add up to more than one by their errors",
     "values_missing": _missing,
     "events_not_located": (
         "in some responses a fold, peak or resonance is there but was not located: see "

@@ -25,7 +25,7 @@ from snrmjax.report.style import (
 )
 from snrmjax.study.analysis.bands import Band, CurveBands
 from snrmjax.study.analysis.digest import OutputEffects
-from snrmjax.study.analysis.failures import Failures, failure_share
+from snrmjax.study.analysis.failures import Failures, failure_fraction
 from snrmjax.study.analysis.outputs import Scalar, summarized
 from snrmjax.study.uncertainty.sensitivity import FEWEST
 
@@ -122,7 +122,7 @@ def main_effects_figure(
             below = plain(x.labelled(broken)) if k == len(shown) - 1 else ""
             beside = plain(y.labelled(readable(one.outputs[0].name))) if j == 0 else ""
             name_axes(axes, "", below, beside)
-            _share(axes, one, name)
+            _fraction(axes, one, name)
             if j:
                 axes.sharey(line[0])
                 axes.tick_params(labelleft=False)
@@ -166,13 +166,13 @@ def _scatter(
     axes.plot([], [], ".", color="0.4", markersize=4.0, label="members")
 
 
-def _share(axes: Axes, shown: OutputEffects, name: str) -> None:
+def _fraction(axes: Axes, shown: OutputEffects, name: str) -> None:
     """The share of variance above a panel, of the smallest and the largest force; and of whom."""
     known = [effects[name] for effects in shown.effects]
-    shares = [100 * max(one.share, 0.0) for one in known if one is not None]
+    fractions = [100 * max(one.fraction, 0.0) for one in known if one is not None]
     words = []
-    if shares:
-        low, high = (f"{value:.0f}" for value in (min(shares), max(shares)))
+    if fractions:
+        low, high = (f"{value:.0f}" for value in (min(fractions), max(fractions)))
         words.append(f"{low} %" if low == high else f"{low} to {high} %")
     least, members = min(one.n_known for one in shown.outputs), len(shown.outputs[0].values)
     if least < members:
@@ -223,13 +223,13 @@ def failures_figure(
     second = plain(_named(names[1], units)) if len(names) > 1 else "Number of the member"
     name_axes(grid[0], "Failed members", plain(_named(names[0], units)), second)
     for axes, name in zip(grid[1:], names, strict=True):
-        along = failure_share(quantities[name], failures.failed)
+        along = failure_fraction(quantities[name], failures.failed)
         middle = 0.5 * (along.edges[1:] + along.edges[:-1])
         shown: Style = {"color": IDENTIFIED, "alpha": 0.35}
-        axes.bar(middle, 100 * along.share, np.diff(along.edges), **shown, label="share failed")
-        bars = 100 * np.abs(np.array([along.share - along.low, along.high - along.share]))
+        axes.bar(middle, 100 * along.fraction, np.diff(along.edges), **shown, label="share failed")
+        bars = 100 * np.abs(np.array([along.fraction - along.low, along.high - along.fraction]))
         style: Style = {"fmt": "none", "ecolor": "0.3", "elinewidth": 0.8}
-        axes.errorbar(middle, 100 * along.share, bars, **style, label="95 % interval")
+        axes.errorbar(middle, 100 * along.fraction, bars, **style, label="95 % interval")
         name_axes(axes, "", plain(_named(name, units)), "Failed (%)")
     legend(figure)
     return figure

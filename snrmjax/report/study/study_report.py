@@ -129,7 +129,7 @@ def study_sentence(study: StudyDigest) -> str:
     order = ranked_effects(effects)
     if order:
         name, one = order[0]
-        text += f"; {name} alone makes {100 * max(one.share, 0.0):.0f} % of its variance"
+        text += f"; {name} alone makes {100 * max(one.fraction, 0.0):.0f} % of its variance"
         if last.n_known < row.members:
             text += f" over the {last.n_known} members with a value"
     return f"{members_ended(study)} {text}."
@@ -173,13 +173,13 @@ def _effects_table(study: StudyDigest) -> ReportTable:
     """The strongest quantities of every output, and what none of them explains alone."""
 
     def cell(name: str, one: MainEffect) -> str:
-        return f"{name}: {100 * max(one.share, 0.0):.0f} ± {100 * one.half_width:.0f} %"
+        return f"{name}: {100 * max(one.fraction, 0.0):.0f} ± {100 * one.half_width:.0f} %"
 
     rows = []
     for output, effects in study.each_effect:
         order = ranked_effects(effects)
         if order:
-            rest = 1.0 - sum(max(one.share, 0.0) for _, one in order)
+            rest = 1.0 - sum(max(one.fraction, 0.0) for _, one in order)
             cells = [cell(*pair) for pair in order[:_RANKS]]
             cells += [""] * (_RANKS - len(cells))
             title = readable(output.name, output.force)
@@ -203,10 +203,10 @@ def _effects_table(study: StudyDigest) -> ReportTable:
 def _status_table(study: StudyDigest, data: "xarray.Dataset") -> ReportTable:
     """How many members ended in which way."""
     counts = study.failures.counts
-    share = 100 / sum(counts.values())
+    fraction = 100 / sum(counts.values())
     rows = [
         (
-            *(short_name(name, _LONGEST), str(count), f"{share * count:.3g} %"),
+            *(short_name(name, _LONGEST), str(count), f"{fraction * count:.3g} %"),
             "yes" if name in COMPLETE else "no",
         )
         for name, count in counts.items()
@@ -260,7 +260,7 @@ def _effects(folder: Path, study: StudyDigest) -> Section | None:
         strongest: dict[str, float] = dict.fromkeys(study.quantities, 0.0)
         for one in (effects for panel in shown for effects in panel.effects):
             for name, effect in ranked_effects(one):
-                strongest[name] = max(strongest[name], effect.share)
+                strongest[name] = max(strongest[name], effect.fraction)
         names = sorted(strongest, key=lambda name: -strongest[name])[:_COLUMNS]
         several = len(study.effects) > _ROWS
         name = f"main_effects_{k // _ROWS + 1}" if several else "main_effects"

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from snrmjax.model.averaging import AveragedForce
-from snrmjax.model.effect_base import AbstractHysteresis, AbstractKinked
+from snrmjax.model.effect_base import AbstractHysteresis, AbstractNonsmooth
 from snrmjax.model.elements import AlikeForces, elements_of
 from snrmjax.model.modes import phasor_of_load
 from snrmjax.model.moving_base import newtons
@@ -27,7 +27,7 @@ from snrmjax.simulate.balance.harmonics import (
     tangent_blocks,
 )
 
-BY_CYCLE = (AbstractHysteresis, AbstractKinked)  # whose force needs the whole cycle
+BY_CYCLE = (AbstractHysteresis, AbstractNonsmooth)  # whose force needs the whole cycle
 
 
 class HarmonicBalance(eqx.Module):

@@ -126,10 +126,10 @@ class PrescribedMotion(eqx.Module):
         velocity = velocity * phase.conj() ** order
         if modes.rigid_body_shape.shape[1]:
             spectrum = self.model.load_orders()[1 : velocity.shape[0]]
-            share = spectrum / np.arange(1, 1 + spectrum.shape[0])
-            share = jnp.pad(share, (1, velocity.shape[0] - 1 - spectrum.shape[0]))
+            fraction = spectrum / np.arange(1, 1 + spectrum.shape[0])
+            fraction = jnp.pad(fraction, (1, velocity.shape[0] - 1 - spectrum.shape[0]))
             per_force = modes.rigid_body_shape @ modes.rigid_body_participation
-            rigid = -1j * jnp.abs(force) / self.frequency * share[:, None] * per_force
+            rigid = -1j * jnp.abs(force) / self.frequency * fraction[:, None] * per_force
             velocity = velocity + rigid
         size, seen = jnp.abs(force)[None], velocity[None]
         modal = displacement_phasors(coefficients)[1, modes.mode_of_interest]
@@ -149,7 +149,7 @@ class PrescribedMotion(eqx.Module):
         inverse: Float[Array, "unknown unknown"],
         near: Secants,
         close: Float[Array, ""],
-        share: Float[Array, ""],
+        fraction: Float[Array, ""],
     ) -> Secants:
         """The solution near a point, from an inverse Jacobian and what is known of it there.
 
@@ -169,7 +169,7 @@ class PrescribedMotion(eqx.Module):
             move = move * jnp.where(sure, size**2 / jnp.where(sure, length, 1.0), 1.0)
             moves = jnp.where((place == now.taken)[:, None], move, now.moves)
             far = jnp.max(jnp.abs(move))
-            enough = jnp.where(now.taken == 0, jnp.clip(share * far, close, _CLOSE), enough)
+            enough = jnp.where(now.taken == 0, jnp.clip(fraction * far, close, _CLOSE), enough)
             return Secants(now.point + move, moves, now.taken + 1), far, enough
 
         def going(state: tuple[Secants, Array, Array]) -> Array:
@@ -194,23 +194,23 @@ class PrescribedMotion(eqx.Module):
         first = jnp.zeros(self.balance.size + 2).at[-2].set(_SMALL)
 
         def larger(state: tuple) -> tuple:
-            before, share, step = state
-            aim = jnp.minimum(share + step, 1.0)
+            before, fraction, step = state
+            aim = jnp.minimum(fraction + step, 1.0)
             smaller = eqx.tree_at(lambda h: h.velocity, fixed, fixed.velocity * aim)
-            after = newton_solved(smaller, before[0] * (aim / share))
+            after = newton_solved(smaller, before[0] * (aim / fraction))
             good = jnp.all(jnp.isfinite(after[0]))
-            now, share = jax.tree.map(
-                lambda a, b: jnp.where(good, a, b), (after, aim), (before, share)
+            now, fraction = jax.tree.map(
+                lambda a, b: jnp.where(good, a, b), (after, aim), (before, fraction)
             )
-            return now, share, jnp.where(good, 1.5 * step, 0.5 * step)
+            return now, fraction, jnp.where(good, 1.5 * step, 0.5 * step)
 
         def going(state: tuple) -> Array:
-            _, share, step = state
-            return (share < 1.0) & (step > _SHORTEST)
+            _, fraction, step = state
+            return (fraction < 1.0) & (step > _SHORTEST)
 
         small = ((first, jnp.eye(first.shape[0])), jnp.array(_SMALL), jnp.array(_FIRST))
-        (point, jacobian), share, _ = jax.lax.while_loop(going, larger, small)
-        return jnp.where(share >= 1.0, point, jnp.nan), jacobian
+        (point, jacobian), fraction, _ = jax.lax.while_loop(going, larger, small)
+        return jnp.where(fraction >= 1.0, point, jnp.nan), jacobian
 
     def _balance_point(self, point: Array) -> Array:
         return jnp.append(point[:-2], self.frequency / self.balance.frequency_scale)

@@ -19,7 +19,7 @@ from snrmjax.simulate.continuation.stability import MARGIN, many_multipliers
 _FOLDS_OWN = 12  # points from a fold at which its multiplier may cross
 _CROSSING = 5e-7  # of a step, to which the crossing of the circle is located
 _JUMP = 1e-4  # of a modulus over such a share of a step: more than any smooth motion's
-_SHARES = 4  # of the way through an interval that are looked at side by side
+_FRACTIONS = 4  # of the way through an interval that are looked at side by side
 _ROUNDS = 24  # of looking closer, at most; three or four do
 
 
@@ -121,7 +121,7 @@ def _located_bifurcations(
     sense = np.sign(known[:, 1] - known[:, 0])[:, None]
     low, high = np.zeros(count), np.ones(count)
     value_low, value_high = (sense * known).T
-    share = np.tile(np.arange(1, _SHARES + 1) / (_SHARES + 1), (count, 1))
+    fraction = np.tile(np.arange(1, _FRACTIONS + 1) / (_FRACTIONS + 1), (count, 1))
     # Where the crossing is known to be passed: at first the neighbours behind it.
     neighbours = neighbours_of(curves, owner.tolist(), before.tolist())
     point, tangent = (rows.copy() for rows in neighbours[2:])
@@ -130,30 +130,30 @@ def _located_bifurcations(
         still = np.flatnonzero(high - low > _CROSSING)
         if not still.size:
             break
-        which = np.repeat(still, _SHARES)
+        which = np.repeat(still, _FRACTIONS)
         owners, ways = owner[which], tuple(rows[which] for rows in neighbours)
         points, tangents, found = points_between(
-            balances, owners, ways, share[still].ravel(), steps
+            balances, owners, ways, fraction[still].ravel(), steps
         )
         rows = many_multipliers(balances, owners, points)
-        found = (found & np.all(np.isfinite(rows), axis=1)).reshape(-1, _SHARES)
+        found = (found & np.all(np.isfinite(rows), axis=1)).reshape(-1, _FRACTIONS)
         points, tangents, rows = (
-            part.reshape(len(still), _SHARES, -1) for part in (points, tangents, rows)
+            part.reshape(len(still), _FRACTIONS, -1) for part in (points, tangents, rows)
         )
         missed[still] |= ~np.all(found, axis=1)
         # A point that is not found counts as one before the crossing.
         values = np.where(found, sense[still] * heights(rows, still), value_low[still, None])
-        whole = np.concatenate([low[still, None], share[still], high[still, None]], axis=1)
+        whole = np.concatenate([low[still, None], fraction[still], high[still, None]], axis=1)
         height = np.concatenate([value_low[still, None], values, value_high[still, None]], axis=1)
         behind = np.argmax(height[:, 1:] > 0, axis=1) + 1
-        new = behind <= _SHARES
+        new = behind <= _FRACTIONS
         inside[still] |= new
         for kept, fresh in ((point, points), (tangent, tangents), (passed, rows)):
             kept[still[new]] = fresh[new, behind[new] - 1]
         at = np.arange(len(still))
         low[still], high[still] = whole[at, behind - 1], whole[at, behind]
         value_low[still], value_high[still] = height[at, behind - 1], height[at, behind]
-        share[still] = _closer(whole, height, behind)
+        fraction[still] = _closer(whole, height, behind)
     located = (high - low <= _CROSSING) & (inside | ~missed)
     # A contact or slip that sets in turns the curve and lets multipliers jump over the circle at
     # one place; and what is within the location's accuracy of a fold is no event of its own.
@@ -180,18 +180,18 @@ def _at_folds(
     return (before & (low <= _CROSSING)) | (behind & (high >= 1.0 - _CROSSING))
 
 
-def _closer(share: np.ndarray, height: np.ndarray, behind: np.ndarray) -> np.ndarray:
+def _closer(fraction: np.ndarray, height: np.ndarray, behind: np.ndarray) -> np.ndarray:
     """Four shares for a closer look between the neighbours of a root, the second at `behind`.
 
     Two divide the way into thirds. The others are on either side of where the share, as a cubic
     of the height, has the root, as far away as the parabola's is.
     """
-    rows = np.arange(len(share))
-    low, high = share[rows, behind - 1], share[rows, behind]
+    rows = np.arange(len(fraction))
+    low, high = fraction[rows, behind - 1], fraction[rows, behind]
     nodes = behind[:, None] + np.array([-1, 0, -2, 1])
     x, y = (
-        np.take_along_axis(part, np.clip(nodes, 0, share.shape[1] - 1), axis=1)
-        for part in (share, height)
+        np.take_along_axis(part, np.clip(nodes, 0, fraction.shape[1] - 1), axis=1)
+        for part in (fraction, height)
     )
 
     def root(count: int) -> np.ndarray:
@@ -204,12 +204,12 @@ def _closer(share: np.ndarray, height: np.ndarray, behind: np.ndarray) -> np.nda
 
     with np.errstate(divide="ignore", invalid="ignore"):
         cubic = root(4)
-        doubt = np.maximum(np.abs(cubic - root(3)), 0.45 * _CROSSING)
-    good = (cubic > low) & (cubic < high) & np.isfinite(doubt)
+        uncertainty = np.maximum(np.abs(cubic - root(3)), 0.45 * _CROSSING)
+    good = (cubic > low) & (cubic < high) & np.isfinite(uncertainty)
     guess = np.where(good, cubic, 0.5 * (low + high))
-    doubt = np.where(good, doubt, 0.45 * _CROSSING)
+    uncertainty = np.where(good, uncertainty, 0.45 * _CROSSING)
     third = (high - low) / 3
-    beside = [low + third, high - third, guess - doubt, guess + doubt]
+    beside = [low + third, high - third, guess - uncertainty, guess + uncertainty]
     return np.sort(np.clip(beside, low, high), axis=0).T
 
 

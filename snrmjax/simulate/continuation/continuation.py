@@ -57,11 +57,15 @@ class StepControl(eqx.Module):
     largest: Number = 0.05
     angle: Number = 0.1  # rad, aimed at between neighbouring tangents
     tolerance: Number = 1e-9  # on the error that is left after the last Newton step
-    kink: Number = 2e-4  # steps below it may turn sharply: a kinked force bends the curve
+    nonsmooth_point: Number = (
+        2e-4  # steps below it may turn sharply: a kinked force bends the curve
+    )
     # Guesses are cubic, so a solution farther from one than a third of the step is on another
     # part of the curve, or on another curve.
     largest_miss: Number = 0.3  # distance of the solution from the guess, over the step
-    kink_miss: Number = 2.0  # the same for steps below `kink`, where the cubic says nothing
+    nonsmooth_miss: Number = (
+        2.0  # the same for steps below `nonsmooth_point`, where the cubic says nothing
+    )
     largest_turn: Number = 3.0  # between neighbouring tangents, over `angle`
     # A harmonic that turns its sign within a step has jumped from one flank of a light damped
     # resonance to the other: it changes by twice its norm, on a smooth curve by less than one.
@@ -78,8 +82,12 @@ class StepControl(eqx.Module):
     def is_near(self, step: Array, miss: Array, turn: Array) -> Bool[Array, ""]:
         """Whether a point is so near its guess that it is the next of the curve."""
         smooth = (miss < self.largest_miss * step) & (turn < self.largest_turn * self.angle)
-        kinked = (step < self.kink) & (turn < 0.5 * jnp.pi) & (miss < self.kink_miss * step)
-        return smooth | kinked
+        nonsmooth = (
+            (step < self.nonsmooth_point)
+            & (turn < 0.5 * jnp.pi)
+            & (miss < self.nonsmooth_miss * step)
+        )
+        return smooth | nonsmooth
 
     def growth(self, turn: Array, n_solves: Array, good: Array) -> Float[Array, ""]:
         """The next step over the last one, after a turn of the tangent (rad)."""
@@ -168,8 +176,8 @@ class CurveTracer(eqx.Module):
     `linearised` gives R and its Jacobian, `within` says where the curve ends. The next point is
     guessed by the cubic through the last two points and their tangents. A step is halved when
     Newton's method fails, when it ends far from the guess, or when the tangent turns by too much
-    (but for a kink, which steps below `control.kink` may pass); otherwise it is chosen so that the
-    next turn comes near `control.angle`.
+    (but at a nonsmooth event, which steps below `control.nonsmooth_point` may pass); otherwise it
+    is chosen so that the next turn comes near `control.angle`.
     With `groups` = (rows, columns), into which the first unknowns unfold, no column may change by
     more than `control.largest_change` of its norm in a step: across a light damped resonance the
     response turns its sign, and on the scale of the peak the two flanks far below it are
@@ -233,8 +241,8 @@ class CurveTracer(eqx.Module):
         outside = (new[-1] > upper) | (new[-1] < lower)
         leaving = good & outside & ~is_first & ~is_end
         end = jnp.where(new[-1] > upper, upper, lower)
-        share = (end - here[-1]) / (new[-1] - here[-1])
-        to_end = (here + share * (new - here)).at[-1].set(end)
+        fraction = (end - here[-1]) / (new[-1] - here[-1])
+        to_end = (here + fraction * (new - here)).at[-1].set(end)
 
         closed = jnp.array(False)
         if self.may_close:
@@ -375,11 +383,11 @@ def _extrapolated(walk: Tracing) -> Point:
     here, tangent, step = walk.here, walk.tangent, walk.step
     known = walk.n_points >= 2
     gap = jnp.where(known, jnp.linalg.norm(here - walk.back), 1.0)
-    share = jnp.where(known, step / gap, 0.0)
+    fraction = jnp.where(known, step / gap, 0.0)
     chord = (here - walk.back) / gap
     # here + step·t + (step²)·a + (step² · (step + gap))·b, from Hermite's divided differences.
     second = (tangent - chord) / gap
     third = (tangent - 2 * chord + walk.back_tangent) / gap**2
     bend = step**2 * (second + (step + gap) * third)
-    trusted = known & (share < _FARTHEST)
+    trusted = known & (fraction < _FARTHEST)
     return here + step * tangent + jnp.where(trusted, bend, 0.0)

@@ -87,9 +87,9 @@ class EventEquations(eqx.Module):
         # Without the second frequency the imaginary part would vanish of itself: over it, it has
         # a sense there.
         second = jnp.sqrt(point[-2])
-        share = jnp.array([1.0, 1.0 / second])
-        values = jnp.stack([found.g.real, found.g.imag]) * share
-        slopes = (slopes * share[:, None]).at[1, -2].add(-0.5 * values[1] / point[-2])
+        fraction = jnp.array([1.0, 1.0 / second])
+        values = jnp.stack([found.g.real, found.g.imag]) * fraction
+        slopes = (slopes * fraction[:, None]).at[1, -2].add(-0.5 * values[1] / point[-2])
         return values, slopes
 
     @property

@@ -41,7 +41,7 @@ class EventSearch(eqx.Module):
             low=nothing,
             high=nothing,
             side=jnp.array(0),
-            share=zero,
+            fraction=zero,
             last=nothing,
             converged=~no,
             doubtful=no,
@@ -67,18 +67,24 @@ class EventSearch(eqx.Module):
     def _length(self) -> Float[Array, ""]:
         return self.tangent @ (self.there - self.here)
 
-    def _trial(self, share: Array, guess: Point) -> Trial:
+    def _trial(self, fraction: Array, guess: Point) -> Trial:
         """The correction at a share of the way, from a guess beside it."""
-        beside = share * self._length() - self.tangent @ (guess - self.here)
+        beside = fraction * self._length() - self.tangent @ (guess - self.here)
         return Trial.at(guess + beside * self.tangent, self.tangent)
 
     def _judged(self, state: "Bracket") -> "Bracket":
         """After a correction that has ended, with the next one begun."""
-        low, high, side, share, trial = state.low, state.high, state.side, state.share, state.trial
+        low, high, side, fraction, trial = (
+            state.low,
+            state.high,
+            state.side,
+            state.fraction,
+            state.trial,
+        )
         # With the slope against the share of the way the curve between two trials is a cubic.
         slope = trial.tangent * (self._length() / (self.tangent @ trial.tangent))
         value = self.test(trial.point, trial.tangent)
-        found = _Known(share, value, trial.point, trial.tangent, slope)
+        found = _Known(fraction, value, trial.point, trial.tangent, slope)
         is_low, is_high = state.trials == 0, state.trials == 1
         inner = ~is_low & ~is_high
         in_upper = inner & (jnp.sign(found.value) == jnp.sign(low.value))
@@ -92,30 +98,30 @@ class EventSearch(eqx.Module):
         low = chosen(in_upper | is_low, found, low)
         high = chosen(in_lower | is_high, found, high)
         differ = low.value * high.value <= 0
-        secant = (low.share * high.value - high.share * low.value) / (high.value - low.value)
-        secant = jnp.where(jnp.isfinite(secant), secant, 0.5 * (low.share + high.share))
-        next_share = jnp.where(is_low, 1.0, secant)
-        settled = inner & ((jnp.abs(next_share - share) < _CLOSE) | (found.value == 0))
-        next_share = jnp.where(settled, share, next_share)
-        guess = jnp.where(is_low, self.there, _cubic(low, high, next_share))
+        secant = (low.fraction * high.value - high.fraction * low.value) / (high.value - low.value)
+        secant = jnp.where(jnp.isfinite(secant), secant, 0.5 * (low.fraction + high.fraction))
+        next_fraction = jnp.where(is_low, 1.0, secant)
+        settled = inner & ((jnp.abs(next_fraction - fraction) < _CLOSE) | (found.value == 0))
+        next_fraction = jnp.where(settled, fraction, next_fraction)
+        guess = jnp.where(is_low, self.there, _cubic(low, high, next_fraction))
         return Bracket(
             trials=state.trials + 1,
             low=low,
             high=high,
             side=jnp.where(in_upper, 1, jnp.where(in_lower, -1, 0)),
-            share=next_share,
+            fraction=next_fraction,
             last=found,
             converged=trial.converged,
             doubtful=state.doubtful | (~inner & ~trial.converged) | (is_high & differ),
             ended=settled | (state.trials + 1 >= _TRIALS),
-            trial=self._trial(next_share, guess),
+            trial=self._trial(next_fraction, guess),
         )
 
 
 class _Known(NamedTuple):
     """What a trial between two neighbours found."""
 
-    share: Array  # of the way
+    fraction: Array  # of the way
     value: Array  # of the test function, less where the other end keeps moving
     point: Array
     tangent: Array  # of unit length
@@ -129,7 +135,7 @@ class Bracket(NamedTuple):
     low: _Known
     high: _Known
     side: Array  # which end moved last
-    share: Array  # of the way, for the next trial
+    fraction: Array  # of the way, for the next trial
     last: _Known
     converged: Array  # the last trial
     doubtful: Array  # an end is not known, or the sign differs at the ends
@@ -139,7 +145,7 @@ class Bracket(NamedTuple):
     @property
     def resolved(self) -> Bool[Array, ""]:
         """Whether the event is at the last point, once the search has ended."""
-        inside = abs(self.share - 0.5) < 0.51
+        inside = abs(self.fraction - 0.5) < 0.51
         return self.converged & inside & (self.low.value * self.high.value <= 0)
 
     @property
@@ -149,10 +155,10 @@ class Bracket(NamedTuple):
         return self.doubtful & ~self.resolved
 
 
-def _cubic(low: _Known, high: _Known, share: Array) -> Point:
+def _cubic(low: _Known, high: _Known, fraction: Array) -> Point:
     """Where the cubic through two trials and their tangents is."""
-    width = high.share - low.share
-    s = (share - low.share) / width
+    width = high.fraction - low.fraction
+    s = (fraction - low.fraction) / width
     chord = high.point - low.point
     bend_low, bend_high = low.slope * width - chord, high.slope * width - chord
     return low.point + s * chord + s * (1 - s) * ((1 - s) * bend_low - s * bend_high)

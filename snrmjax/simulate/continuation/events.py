@@ -110,7 +110,7 @@ def _between(
     tangent: Array,
     there: Array,
     arriving: Array,
-    share: Array,
+    fraction: Array,
     steps: StepControl,
 ) -> tuple:
     """Points of the curve at shares of the way between neighbours, with their tangents.
@@ -119,17 +119,17 @@ def _between(
     """
 
     def corrected(balance: HarmonicBalance, *row: Array) -> tuple:
-        here, tangent, there, arriving, share = row
+        here, tangent, there, arriving, fraction = row
         length = tangent @ (there - here)
         chord = there - here
         early, late = (jnp.linalg.norm(chord) * t - chord for t in (tangent, arriving))
-        bend = share * (1 - share) * ((1 - share) * early - share * late)
-        guess = here + share * chord + bend
-        guess = guess + (share * length - tangent @ (guess - here)) * tangent
+        bend = fraction * (1 - fraction) * ((1 - fraction) * early - fraction * late)
+        guess = here + fraction * chord + bend
+        guess = guess + (fraction * length - tangent @ (guess - here)) * tangent
         found = correct(balance.linearised, guess, tangent, steps.tolerance, 2 * steps.iterations)
         return found.point, found.tangent, found.converged
 
-    return jax.vmap(corrected)(balances, here, tangent, there, arriving, share)
+    return jax.vmap(corrected)(balances, here, tangent, there, arriving, fraction)
 
 
 def with_events(
@@ -185,7 +185,7 @@ def _divided(
     balances: HarmonicBalance, curves: list[TracedCurve], known: list[tuple], steps: StepControl
 ) -> list[TracedCurve]:
     """The curves with points added where two events may lie between neighbours."""
-    owner, position, share = [], [], []
+    owner, position, fraction = [], [], []
     for number, curve in enumerate(curves):
         if len(curve.points) < 2:
             continue
@@ -198,11 +198,13 @@ def _divided(
         for k in np.flatnonzero(doubtful):
             owner += [number] * _INSIDE
             position += [int(k)] * _INSIDE
-            share += [(i + 1) / (_INSIDE + 1) for i in range(_INSIDE)]
+            fraction += [(i + 1) / (_INSIDE + 1) for i in range(_INSIDE)]
     if not owner:
         return list(curves)
     between = neighbours_of(curves, owner, position)
-    found, tangents, ok = points_between(balances, np.array(owner), between, np.array(share), steps)
+    found, tangents, ok = points_between(
+        balances, np.array(owner), between, np.array(fraction), steps
+    )
     keep = np.flatnonzero(ok).tolist()
     return inserted(
         curves,
@@ -214,14 +216,14 @@ def points_between(
     balances: HarmonicBalance,
     owner: Int[np.ndarray, " point"],
     neighbours: tuple[np.ndarray, ...],
-    share: Float[np.ndarray, " point"],
+    fraction: Float[np.ndarray, " point"],
     steps: StepControl,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points at shares of the way between neighbours, their tangents, and whether they were found.
 
     Arguments: `owner` says of which of the `balances` a point is, `neighbours` are its own.
     """
-    n, ahead, rows = len(owner), neighbours[1], (*neighbours, share)
+    n, ahead, rows = len(owner), neighbours[1], (*neighbours, fraction)
     lanes = lanes_for(balances.size + 1)
     lanes *= _MANY if n >= _MANY * lanes else 1
 

@@ -22,7 +22,7 @@ class Friction(NamedTuple):
     begin: Float[Array, " point"]  # phase at which the period begins
     stuck: Float[Array, "point mode mode"]  # stiffness of springs that the modes do not hold, 1/s²
     viscous: tuple[tuple[AbstractHysteresis, Elements], ...]  # without memory, one of every point
-    memories: tuple["Memory", ...]  # laws with states that follow rates
+    memories: tuple["InternalVariables", ...]  # laws with states that follow rates
     places: Elements  # of the sliders, one force each
     owner: np.ndarray  # (slider,) the place of each
     stiffness: Float[Array, "point slider"]  # 1/s²
@@ -52,7 +52,7 @@ class Slip(NamedTuple):
         return self.at_first | jnp.isfinite(self.onsets[0])
 
 
-class Memory(NamedTuple):
+class InternalVariables(NamedTuple):
     """A law with states of its own, linearised at equally spaced phases of motions."""
 
     there: Elements  # its place
@@ -69,10 +69,10 @@ class Memory(NamedTuple):
         """The derivatives at phases, between samples along straight lines."""
         place = phase / (2 * jnp.pi) * SAMPLES
         before = jnp.floor(place).astype(int)
-        share = (place - before)[..., None, None]
+        fraction = (place - before)[..., None, None]
         point = jnp.arange(phase.shape[1])
         one, two = (self.slopes[(before + k) % SAMPLES, point] for k in (0, 1))
-        return (1 - share) * one + share * two
+        return (1 - fraction) * one + fraction * two
 
     def stiffness(self) -> Float[Array, "point mode mode"]:
         """What its states add to the stiffness where they follow the motion, at most."""
@@ -80,7 +80,9 @@ class Memory(NamedTuple):
         return self.there.matrix(jnp.max(jnp.abs(jnp.sum(held, axis=-1)), axis=0)[:, None])
 
 
-def _memory_of(effects: AbstractHysteresis, there: Elements, x: Array, v: Array) -> Memory:
+def _internal_variables_of(
+    effects: AbstractHysteresis, there: Elements, x: Array, v: Array
+) -> InternalVariables:
     """A law along motions (sample, point), one effect for every point."""
 
     def of_point(effect: AbstractHysteresis, x: Array, v: Array) -> Array:
@@ -94,7 +96,7 @@ def _memory_of(effects: AbstractHysteresis, there: Elements, x: Array, v: Array)
 
     slopes = jax.vmap(of_point, (0, 1, 1), 1)(effects, x, v)
     unit = jnp.max(jnp.abs(slopes[:, :, 1:, 1]), axis=0)
-    return Memory(there, slopes, jnp.where(unit > 0, unit, 1.0), v)
+    return InternalVariables(there, slopes, jnp.where(unit > 0, unit, 1.0), v)
 
 
 def friction_along(model: Structure, coefficients: Array, frequency: Array) -> Friction:
@@ -129,7 +131,9 @@ def friction_along(model: Structure, coefficients: Array, frequency: Array) -> F
     with_states = [len(jax.eval_shape(effect.initial_states)) > 0 for effect in others]
     viscous = tuple(scaled(e)[:2] for e, has in zip(others, with_states, strict=True) if not has)
     memories = tuple(
-        _memory_of(*scaled(e)) for e, has in zip(others, with_states, strict=True) if has
+        _internal_variables_of(*scaled(e))
+        for e, has in zip(others, with_states, strict=True)
+        if has
     )
     if not sliders:
         none_sliding = places, np.zeros(0, int), *no_sliders
@@ -173,10 +177,10 @@ def _slip_of(x: Array, position: Array, size: Array) -> tuple[Array, Array, Arra
     width = 2 * jnp.pi / n
     moves = position != jnp.roll(position, -1)
 
-    def phases(starts: Array, share: Array) -> Array:
+    def phases(starts: Array, fraction: Array) -> Array:
         (index,) = jnp.nonzero(starts, size=_MOST_SLIPS, fill_value=n)
         known = index < n
-        there = (index + share[jnp.minimum(index, n - 1)]) * width
+        there = (index + fraction[jnp.minimum(index, n - 1)]) * width
         return jnp.where(known, there, jnp.inf)
 
     rise = jnp.roll(x, -1) - x

@@ -9,13 +9,13 @@ from jaxtyping import Array, Float
 
 from snrmjax.model.effect_base import (
     AbstractForce,
-    AbstractKinked,
     AbstractMemoryless,
+    AbstractNonsmooth,
 )
 from snrmjax.model.effect_metadata import Argument
 from snrmjax.model.elements import elements_of
-from snrmjax.model.kinks import crossings
 from snrmjax.model.library.friction import AbstractSliders
+from snrmjax.model.nonsmooth_points import crossings
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.compiled import compiled
 from snrmjax.simulate.continuation.friction_along import (
@@ -59,7 +59,7 @@ def monodromy(
 
 def _is_spring(force: AbstractForce) -> bool:
     """Whether a force is a smooth function of the displacement, as a potential's is."""
-    smooth = isinstance(force, AbstractMemoryless) and not isinstance(force, AbstractKinked)
+    smooth = isinstance(force, AbstractMemoryless) and not isinstance(force, AbstractNonsmooth)
     shape = type(force).shape
     return smooth and shape is not None and shape.argument is Argument.DISPLACEMENT
 
@@ -309,7 +309,7 @@ def _by_magnus(
 
 def _is_piecewise_linear(model: Structure) -> bool:
     """Whether a structure is linear from one contact or slip to the next."""
-    straight = all(isinstance(e, AbstractKinked) and e.is_straight for e in model.memoryless)
+    straight = all(isinstance(e, AbstractNonsmooth) and e.is_straight for e in model.memoryless)
     sliders = all(isinstance(e, AbstractSliders) for e in model.hysteretic)
     return straight and sliders and not model.potential.monomials
 
@@ -328,13 +328,13 @@ def _contacts(
 
     def add(x: Array, place: Array, start: Array | float = 0.0) -> None:
         there = jax.vmap(crossings, (1, None), 1)(x, place)
-        phase = jnp.mod((there.interval + there.share) * tau[1] - start, 2 * jnp.pi)
+        phase = jnp.mod((there.interval + there.fraction) * tau[1] - start, 2 * jnp.pi)
         found.append(jnp.where(there.passes, phase, jnp.inf))
 
     for effect in model.memoryless:
-        if isinstance(effect, AbstractKinked):
+        if isinstance(effect, AbstractNonsmooth):
             x = elements_of([effect], model.modes).displacement(q)[..., 0]
-            for place in effect.kinks().displacement:
+            for place in effect.nonsmooth_points().displacement:
                 add(x, place)
     for memory in friction.memories:
         add(memory.rate, jnp.zeros(()), friction.begin)

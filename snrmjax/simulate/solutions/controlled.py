@@ -103,11 +103,13 @@ def damped_normal_mode(
     )
 
 
-def _quasi_linear_motion(balance: HarmonicBalance, share: float) -> Float[np.ndarray, " unknown"]:
+def _quasi_linear_motion(
+    balance: HarmonicBalance, fraction: float
+) -> Float[np.ndarray, " unknown"]:
     """The mode of the structure with what averaging makes of its forces in a small motion.
 
-    Arguments: `share` of the balance's scale that the mode of interest moves. Returns the unknowns
-    of `_trace_damped`: friction sticks in a small motion and changes shape, frequency and damping.
+    Arguments: `fraction` of the balance's scale that the mode of interest moves. Returns the
+    unknowns of `_trace_damped`: friction sticks in a small motion and changes shape, frequency and damping.
     """
     model, j = balance.model, balance.model.modes.mode_of_interest
     terms, n = linear_terms_of(model), model.n_modes
@@ -115,7 +117,7 @@ def _quasi_linear_motion(balance: HarmonicBalance, share: float) -> Float[np.nda
     damping = np.diag(np.asarray(terms.damping)) + (0 if coupled is None else np.asarray(coupled))
     stiffness = np.diag(np.asarray(terms.stiffness))
     elements = elements_of(model.forces, model.modes)
-    rows, amplitude = np.asarray(elements.rows), share * float(balance.displacement_scale)
+    rows, amplitude = np.asarray(elements.rows), fraction * float(balance.displacement_scale)
     shape, value = np.eye(n)[j].astype(complex), 1j * float(balance.frequency_scale)
     for _ in range(_PASSES if model.forces else 1):
         there = amplitude * np.abs(rows @ shape)
@@ -133,7 +135,7 @@ def _quasi_linear_motion(balance: HarmonicBalance, share: float) -> Float[np.nda
         value, shape = values[place], shapes[:n, place] / shapes[j, place]
     frequency, unit = abs(value), float(balance.frequency_scale)
     x = np.zeros((balance.n_coefficients, n))
-    x[1], x[2] = share * shape.real, -share * shape.imag
+    x[1], x[2] = fraction * shape.real, -fraction * shape.imag
     return np.concatenate([x.ravel(), [-2 * value.real / unit, frequency / unit]])
 
 
@@ -297,19 +299,19 @@ def _trace_response(
     begin = jnp.where(downward, ends[1], ends[0])
     per_unit = linear_coefficients(model, balance.force, begin, balance.harmonic_order)
     linear = jnp.abs(velocity_phasors(per_unit, begin, model.modes.mode_shape)[1, 0])
-    share = velocity / linear
-    start = balance.point(share * per_unit, begin)
-    start = jnp.concatenate([start[:-1], jnp.stack([share, start[-1]])])
+    fraction = velocity / linear
+    start = balance.point(fraction * per_unit, begin)
+    start = jnp.concatenate([start[:-1], jnp.stack([fraction, start[-1]])])
     onward = jnp.zeros_like(start).at[-1].set(jnp.where(downward, -1.0, 1.0))
     lower, upper = ends / balance.frequency_scale
     return trace_curve(linearised, start, onward, CurveRange(lower, upper), steps)
 
 
 def _with_force(
-    balance: HarmonicBalance, point: Array, share: Array
+    balance: HarmonicBalance, point: Array, fraction: Array
 ) -> tuple[Float[Array, " equation"], Float[Array, "equation unknown"]]:
     """Residual and Jacobian under a share of the force, the last column for the share."""
-    now = eqx.tree_at(lambda b: b.force, balance, balance.force * share)
+    now = eqx.tree_at(lambda b: b.force, balance, balance.force * fraction)
     residual, jacobian = now.linearised(point)
     column = -balance.newtons(point[-1]) * balance.load()
     return residual, jnp.concatenate([jacobian, column[:, None]], axis=1)

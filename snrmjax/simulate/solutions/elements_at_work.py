@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from snrmjax.model.effect_base import AbstractForce, AbstractKinked
+from snrmjax.model.effect_base import AbstractForce, AbstractNonsmooth
 from snrmjax.model.elements import elements_of
 from snrmjax.model.library.friction import CoulombFriction, JenkinsSlider
 from snrmjax.model.moving_base import newtons
@@ -23,7 +23,7 @@ class IdleElement(NamedTuple):
 
     element: str
     slides: bool  # friction that sticks; else a contact that stays as it is
-    share: float  # of the threshold that the largest motion reaches
+    fraction: float  # of the threshold that the largest motion reaches
 
 
 class Hold(NamedTuple):
@@ -42,17 +42,19 @@ def idle_elements(model: Structure, curves: Sequence[ResponseCurve]) -> Iterator
     for slider, row in _forces(model, JenkinsSlider):
         x = np.concatenate([_over_a_period(motion @ row) for motion in motions])
         reach = float(np.max(0.5 * np.ptp(x, axis=1)))
-        share = reach / float(slider.slip_displacement)
-        if share < 1:
-            yield IdleElement(_name(slider), True, share)
-    for contact, row in _forces(model, AbstractKinked):
+        fraction = reach / float(slider.slip_displacement)
+        if fraction < 1:
+            yield IdleElement(_name(slider), True, fraction)
+    for contact, row in _forces(model, AbstractNonsmooth):
         x = np.concatenate([_over_a_period(motion @ row) for motion in motions])
-        kinks = np.atleast_1d(np.asarray(contact.kinks().displacement))
-        if np.any(kinks == 0):  # passed by every motion
+        nonsmooth_points = np.atleast_1d(np.asarray(contact.nonsmooth_points().displacement))
+        if np.any(nonsmooth_points == 0):  # passed by every motion
             continue
-        share = float(np.max(np.where(kinks > 0, x.max(), x.min()) / kinks))
-        if share < 1:
-            yield IdleElement(_name(contact), False, share)
+        fraction = float(
+            np.max(np.where(nonsmooth_points > 0, x.max(), x.min()) / nonsmooth_points)
+        )
+        if fraction < 1:
+            yield IdleElement(_name(contact), False, fraction)
 
 
 def friction_hold(model: Structure, from_frequency: float, to_frequency: float) -> Hold | None:

@@ -129,9 +129,9 @@ class EventCurve(MotionCurve):
         x, omega = self.coefficients, self.frequency
         found = [(int(k), x[k], float(omega[k])) for k in at]
         for k in between.tolist():
-            share = off[k] / (off[k] - off[k + 1])
-            motion = x[k] + share * (x[k + 1] - x[k])
-            found.append((k, motion, float(omega[k] + share * (omega[k + 1] - omega[k]))))
+            fraction = off[k] / (off[k] - off[k + 1])
+            motion = x[k] + fraction * (x[k + 1] - x[k])
+            found.append((k, motion, float(omega[k] + fraction * (omega[k + 1] - omega[k]))))
         return [
             (motion, frequency) for _, motion, frequency in sorted(found, key=lambda row: row[0])
         ]

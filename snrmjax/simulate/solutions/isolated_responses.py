@@ -222,10 +222,10 @@ def _phase_resonances(balance: HarmonicBalance) -> tuple[list[Start], CurveStatu
     )
     beyond = backbone.force > force
     where = np.flatnonzero(beyond[1:] != beyond[:-1])
-    share = (force - backbone.force[where]) / np.diff(backbone.force)[where]
+    fraction = (force - backbone.force[where]) / np.diff(backbone.force)[where]
     x, omega = backbone.coefficients, backbone.frequency
-    between = x[where] + share[:, None, None] * np.diff(x, axis=0)[where]
-    frequency = omega[where] + share * np.diff(omega)[where]
+    between = x[where] + fraction[:, None, None] * np.diff(x, axis=0)[where]
+    frequency = omega[where] + fraction * np.diff(omega)[where]
     return list(zip(between, frequency.tolist(), strict=True)), backbone.status
 
 

@@ -115,8 +115,8 @@ def _followed(
     n, j = model.n_modes, model.modes.mode_of_interest
     shape = jnp.abs(model.modes.mode_shape[0, j])
     before = jnp.concatenate([jnp.zeros(1), velocities[:-1]])
-    share = jnp.arange(1, steps + 1) / steps
-    levels = (before[:, None] + (velocities - before)[:, None] * share).reshape(-1)
+    fraction = jnp.arange(1, steps + 1) / steps
+    levels = (before[:, None] + (velocities - before)[:, None] * fraction).reshape(-1)
     rest = jnp.zeros(balance.size + 1).at[-1].set(1.0)
     unit = balance.displacement_scale * balance.frequency_scale * shape
     slope = jnp.zeros(balance.size + 1).at[n + j].set(1 / unit)

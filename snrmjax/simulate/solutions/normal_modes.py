@@ -32,7 +32,7 @@ from snrmjax.simulate.continuation.response_curve import MotionCurve, motions_of
 from snrmjax.simulate.continuation.stability import Stability, floquet_multipliers, stability_of
 
 DEFAULT_STEPS = StepControl(first=1e-3, largest=0.02, angle=0.06)
-_TONGUE_SHARE = 0.05  # of the energy, in a harmonic of another mode: an internal resonance
+_TONGUE_FRACTION = 0.05  # of the energy, in a harmonic of another mode: an internal resonance
 
 
 class Tongue(NamedTuple):
@@ -42,7 +42,7 @@ class Tongue(NamedTuple):
     harmonic: int
     from_frequency: float  # rad/s, lowest on the stretch
     to_frequency: float  # rad/s, highest
-    energy_share: float  # largest share of the kinetic energy in that harmonic of that mode
+    energy_fraction: float  # largest share of the kinetic energy in that harmonic of that mode
     first: int  # index of its first point on the branch; with "skip", of the first one behind it
     last: int  # index of its last point; with "skip", of the last one before it
 
@@ -59,7 +59,7 @@ class NormalModeBranch(MotionCurve):
     """
 
     energy: Float[np.ndarray, " point"] = quantity("point", "J", "energy of the motion")
-    mode_share: Float[np.ndarray, "point mode"] = quantity(
+    mode_fraction: Float[np.ndarray, "point mode"] = quantity(
         "point mode", "1", "share of the mean kinetic energy"
     )
     tongues: tuple[Tongue, ...] = ()
@@ -145,7 +145,7 @@ def nonlinear_normal_mode(
     cosines, frequency = balance.motions(curve.points)
     at_rest = np.sum(cosines, axis=1)  # q(0), where the velocity vanishes
     (energy,) = by_blocks(lambda rows: (_energy(model, rows),), 128, at_rest)
-    share = _kinetic_shares(balance, cosines)
+    fraction = _kinetic_fractions(balance, cosines)
     multipliers = None
     if stability:
         found = floquet_multipliers(model, with_sines(cosines), frequency)
@@ -155,8 +155,8 @@ def nonlinear_normal_mode(
         **motions_of(balance, curve.points),
         status=curve.status,
         energy=energy,
-        mode_share=share.sum(axis=1),
-        tongues=_tongues(model, frequency, share),
+        mode_fraction=fraction.sum(axis=1),
+        tongues=_tongues(model, frequency, fraction),
         multipliers=multipliers,
     )
     return _without_tongues(branch) if tongues == "skip" else branch
@@ -203,7 +203,7 @@ def _trace(balance: HarmonicBalance, ends: Array, steps: StepControl) -> Curve:
     )
 
 
-def _kinetic_shares(
+def _kinetic_fractions(
     balance: HarmonicBalance, coefficients: Float[np.ndarray, "point coefficient mode"]
 ) -> Float[np.ndarray, "point coefficient mode"]:
     """The share of every harmonic of every mode in the mean kinetic energy."""
@@ -216,19 +216,19 @@ def _kinetic_shares(
 def _tongues(
     model: Structure,
     frequency: np.ndarray,
-    energy_share: Float[np.ndarray, "point coefficient mode"],
+    energy_fraction: Float[np.ndarray, "point coefficient mode"],
 ) -> tuple[Tongue, ...]:
-    """Stretches with more than `_TONGUE_SHARE` of the kinetic energy in one other pair."""
-    j, share = model.modes.mode_of_interest, energy_share.copy()
+    """Stretches with more than `_TONGUE_FRACTION` of the kinetic energy in one other pair."""
+    j, fraction = model.modes.mode_of_interest, energy_fraction.copy()
     # The mode's own harmonics are its shape in time; others' fundamentals its shape in space.
-    share[:, :, j] = 0.0
-    share[:, :2] = 0.0
-    strongest = share.max(axis=(1, 2))
-    inside = np.concatenate([[False], strongest > _TONGUE_SHARE, [False]])
+    fraction[:, :, j] = 0.0
+    fraction[:, :2] = 0.0
+    strongest = fraction.max(axis=(1, 2))
+    inside = np.concatenate([[False], strongest > _TONGUE_FRACTION, [False]])
     edges = np.flatnonzero(np.diff(inside.astype(int)))
     found = []
     for first, stop in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
-        stretch = share[first:stop].max(axis=0)
+        stretch = fraction[first:stop].max(axis=0)
         harmonic, mode = np.unravel_index(np.argmax(stretch), stretch.shape)
         found.append(
             Tongue(
@@ -236,7 +236,7 @@ def _tongues(
                 harmonic=int(harmonic),
                 from_frequency=float(frequency[first:stop].min()),
                 to_frequency=float(frequency[first:stop].max()),
-                energy_share=float(stretch.max()),
+                energy_fraction=float(stretch.max()),
                 first=first,
                 last=stop - 1,
             )
@@ -256,7 +256,7 @@ def _without_tongues(branch: NormalModeBranch) -> NormalModeBranch:
         coefficients=branch.coefficients[keep],
         velocity=branch.velocity[keep],
         energy=branch.energy[keep],
-        mode_share=branch.mode_share[keep],
+        mode_fraction=branch.mode_fraction[keep],
         multipliers=None if branch.multipliers is None else branch.multipliers[keep],
         tongues=tuple(
             tongue._replace(first=int(place[tongue.first]), last=int(place[tongue.first]) - 1)

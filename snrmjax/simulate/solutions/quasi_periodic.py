@@ -259,8 +259,8 @@ def _followed(
         if len(points) > 2 and new[slow] @ last[slow] < 0:
             # The other half of the branch is the same motions, half a slow period later.
             sizes = [np.linalg.norm(part[slow]) for part in (last, new)]
-            share = sizes[0] / sum(sizes)
-            points.append(last + share * (new - last))
+            fraction = sizes[0] / sum(sizes)
+            points.append(last + fraction * (new - last))
             return np.stack(points), TorusEnd.PERIODIC
         points.append(new)
     return np.stack(points), TorusEnd(int(walk.status))
@@ -287,7 +287,7 @@ def _as_result(torus: TorusBalance, points: np.ndarray, status: TorusEnd) -> Qua
         amplitudes.append(_amplitudes(torus, rate))
     least, most = (np.stack(part) for part in zip(*amplitudes, strict=True))
     moving = (x[:, 1:] ** 2).sum(axis=2)
-    share = moving[:, basis.slow[1:] > 0].sum(axis=1) / moving.sum(axis=1)
+    fraction = moving[:, basis.slow[1:] > 0].sum(axis=1) / moving.sum(axis=1)
     return QuasiPeriodicBranch(
         frequency=fast,
         slow_frequency=slow,
@@ -295,7 +295,7 @@ def _as_result(torus: TorusBalance, points: np.ndarray, status: TorusEnd) -> Qua
         largest_velocity=np.stack(largest),
         least_amplitude=least,
         largest_amplitude=most,
-        modulation=np.sqrt(share),
+        modulation=np.sqrt(fraction),
         coefficients=x,
         force=force,
         slow_order=torus.slow_order,

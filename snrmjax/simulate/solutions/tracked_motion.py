@@ -121,7 +121,7 @@ def _shapes(model: Structure) -> list[tuple[int, ...]]:
 class _Way(NamedTuple):
     """How far along the line a motion was carried: its unknowns, and their derivatives by it."""
 
-    share: Float[Array, ""]  # of the line
+    fraction: Float[Array, ""]  # of the line
     motion: tuple[Array, Array]  # coefficients and frequency
     slope: tuple[Array, Array]
     step: Float[Array, ""]
@@ -137,23 +137,23 @@ def _carried(
     # By their leaves: what is no number, such as a name, is that of the new parameters.
     (begins, _), (ends, kind) = jax.tree.flatten(here), jax.tree.flatten(there)
 
-    def solved(share: Array, start: tuple[Array, Array]) -> tuple[tuple, tuple, Array]:
+    def solved(fraction: Array, start: tuple[Array, Array]) -> tuple[tuple, tuple, Array]:
         """The motion at a share of the line, its derivatives by that, and whether it was found."""
 
-        def at(share: Array) -> tuple[tuple[Array, Array], Array]:
-            moved = [a + share * (b - a) for a, b in zip(begins, ends, strict=True)]
+        def at(fraction: Array) -> tuple[tuple[Array, Array], Array]:
+            moved = [a + fraction * (b - a) for a, b in zip(begins, ends, strict=True)]
             model, force, value = jax.tree.unflatten(kind, moved)
             found = motion_near(model, force, start, condition, value, _ITERATIONS)
             return (found.coefficients, found.frequency), found.converged
 
-        point, slope, good = jax.jvp(at, (share,), (jnp.ones_like(share),), has_aux=True)
+        point, slope, good = jax.jvp(at, (fraction,), (jnp.ones_like(fraction),), has_aux=True)
         return point, slope, good
 
     def body(way: _Way) -> _Way:
-        share = jnp.minimum(way.share + way.step, 1.0)
-        ahead = share - way.share
+        fraction = jnp.minimum(way.fraction + way.step, 1.0)
+        ahead = fraction - way.fraction
         guess = jax.tree.map(lambda a, b: a + ahead * b, way.motion, way.slope)
-        point, slope, good = solved(share, guess)
+        point, slope, good = solved(fraction, guess)
         back = point[0] - ahead * slope[0] - way.motion[0]  # what the new slope does not explain
         moves = point[0] - way.motion[0], point[0] - guess[0], back
         far, *misses = (jnp.max(jnp.abs(move)) for move in moves)
@@ -163,20 +163,20 @@ def _carried(
         good &= near
         longer = jnp.where(off <= 0.3 * _LATE * far, 2.0, 1.0)
         onward = _Way(
-            share, point, slope, jnp.where(good, longer, 0.5) * way.step, way.trials + 1, good
+            fraction, point, slope, jnp.where(good, longer, 0.5) * way.step, way.trials + 1, good
         )
         kept = way._replace(step=0.5 * way.step, trials=way.trials + 1)
         return jax.tree.map(lambda a, b: jnp.where(good, a, b), onward, kept)
 
     def going(way: _Way) -> Array:
-        unfinished = way.known & (way.share < 1.0)
+        unfinished = way.known & (way.fraction < 1.0)
         return unfinished & (way.step >= _SHORTEST) & (way.trials < _TRIALS)
 
     zero = jnp.zeros(())
     start, slope, good = solved(zero, (begin.coefficients, begin.frequency))
     way = _Way(zero, start, slope, jnp.ones(()), jnp.zeros((), dtype=int), good)
     way = jax.lax.while_loop(going, body, way)
-    arrived = way.known & (way.share >= 1.0)
+    arrived = way.known & (way.fraction >= 1.0)
     end = jax.tree.map(lambda a: jnp.where(arrived, a, jnp.nan), way.motion)
     model, force, value = new
     return motion_near(model, force, end, condition, value, _ITERATIONS)

@@ -81,9 +81,9 @@ def spread_in_phase(
     return places
 
 
-def on_the_way(values: np.ndarray, point: int, share: float) -> np.ndarray:
+def on_the_way(values: np.ndarray, point: int, fraction: float) -> np.ndarray:
     """Linear interpolation between a point of a curve and the next."""
-    return values[point] + share * (values[point + 1] - values[point])
+    return values[point] + fraction * (values[point + 1] - values[point])
 
 
 def states_near(

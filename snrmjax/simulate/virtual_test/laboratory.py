@@ -26,8 +26,8 @@ from jaxtyping import Array, Float
 from snrmjax.model.effect_base import (
     AbstractForceSpectrum,
     AbstractHysteresis,
-    AbstractKinked,
     AbstractMeasurementEffect,
+    AbstractNonsmooth,
 )
 from snrmjax.model.elements import elements_of
 from snrmjax.model.modes import reference_sensor
@@ -40,11 +40,11 @@ from snrmjax.simulate.virtual_test.equipment import (
     check_shaker,
     filter_sections,
 )
-from snrmjax.simulate.virtual_test.friction_memory import (
+from snrmjax.simulate.virtual_test.friction_internal_variables import (
     friction_rows,
     inner_force,
-    memory_after_step,
-    memory_at_rest,
+    internal_variables_after_step,
+    internal_variables_at_rest,
     scaled_friction,
 )
 
@@ -175,7 +175,7 @@ class Laboratory(eqx.Module):
         """The state before anything moves."""
         model = simulated_structure(self.structure)
         n = model.n_modes
-        memory = memory_at_rest(model, self.friction(), jnp.zeros(n))
+        memory = internal_variables_at_rest(model, self.friction(), jnp.zeros(n))
         sections = len(filter_sections(self.instruments, self.sampling_rate * self.substeps))
         return LabState(
             LabMotion(jnp.zeros(n), jnp.zeros(n), memory),
@@ -340,19 +340,19 @@ def _integrator(
         mean = jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, one, two, three, four)
         moved = after(h, mean)
         begin, end = ((at.displacement, at.velocity) for at in (motion, moved))
-        memory = memory_after_step(structure, friction, moved.memory, begin, end, h)
+        memory = internal_variables_after_step(structure, friction, moved.memory, begin, end, h)
         return moved._replace(memory=memory)
 
     return step
 
 
-def _between_samples(share: Float[np.ndarray, " time"]) -> Float[np.ndarray, "time 4"]:
+def _between_samples(fraction: Float[np.ndarray, " time"]) -> Float[np.ndarray, "time 4"]:
     """Weights of the last four commands, by Lagrange, at shares of the way between the last two."""
     at = np.arange(-2.0, 2.0)
     others = [np.delete(at, k) for k in range(4)]
     return np.stack(
         [
-            np.prod((share[:, None] - other) / (node - other), axis=1)
+            np.prod((fraction[:, None] - other) / (node - other), axis=1)
             for node, other in zip(at, others, strict=True)
         ],
         axis=1,
@@ -383,7 +383,7 @@ def _fastest(structure: Structure, shaker: Shaker) -> float:
     x = jnp.asarray(np.concatenate([-grid, grid]))
     for effect in model.forces:
         rows = np.asarray(elements_of([effect], model.modes).rows)
-        if isinstance(effect, AbstractKinked):
+        if isinstance(effect, AbstractNonsmooth):
             slope = jax.vmap(jax.grad(effect.force))(x, jnp.zeros_like(x))
             stiffness = stiffness + float(jnp.max(slope)) * np.outer(rows[0], rows[0])
         elif isinstance(effect, AbstractHysteresis):

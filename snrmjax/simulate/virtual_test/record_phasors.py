@@ -50,18 +50,18 @@ def followed(
     seen: Float[Array, " channel"],
     angle: Float[Array, ""],
     orders: Int[np.ndarray, " order"],
-    share: Float[Array, ""],
+    fraction: Float[Array, ""],
 ) -> FourierState:
     """The state after one sample of each channel.
 
-    Arguments: `angle` of the fundamental in rad; `share` is the filter's rate times the sampling
+    Arguments: `angle` of the fundamental in rad; `fraction` is the filter's rate times the sampling
     period: what a coefficient forgets in a sample.
     """
     basis = jnp.exp(1j * orders * angle)
     error = seen - state.means - jnp.real(state.harmonics @ basis)
     return FourierState(
-        state.harmonics + 2 * share * error[:, None] * jnp.conj(basis),
-        state.means + share * error,
+        state.harmonics + 2 * fraction * error[:, None] * jnp.conj(basis),
+        state.means + fraction * error,
     )
 
 

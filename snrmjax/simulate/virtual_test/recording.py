@@ -150,8 +150,8 @@ def _rigid_body_velocity(
     per_force = modes.rigid_body_shape @ modes.rigid_body_participation
     spectrum = model.load_orders()[:n_harmonics]
     orders = np.arange(1, len(spectrum))
-    share = jnp.zeros(n_harmonics).at[orders].set(spectrum[1:] / orders)
-    return -1j * (force / frequency)[:, None, None] * share[:, None] * per_force
+    fraction = jnp.zeros(n_harmonics).at[orders].set(spectrum[1:] / orders)
+    return -1j * (force / frequency)[:, None, None] * fraction[:, None] * per_force
 
 
 def _with_errors(

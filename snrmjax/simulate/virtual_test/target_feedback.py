@@ -110,8 +110,8 @@ class FundamentalFeedback(AbstractController):
     ) -> tuple[tuple[Array, FourierState], Array, Array]:
         """The voltage that pulls the velocity's fundamental towards the target."""
         angle, filters = state
-        share = self.filter_rate * period
-        filters = followed(filters, sample.velocity[None], angle, _ORDERS, share)
+        fraction = self.filter_rate * period
+        filters = followed(filters, sample.velocity[None], angle, _ORDERS, fraction)
         missing = self.target - filters.harmonics[0, 0]
         voltage = self.gain * jnp.real(missing * jnp.exp(1j * angle))
         return (jnp.mod(angle + self.frequency * period, 2 * jnp.pi), filters), voltage, angle
@@ -179,9 +179,9 @@ class FeedbackBench:
         ]
         unsteady = float(abs(halves[1] - halves[0]) / abs(moved[0]))
         # Of noise alone: a Hann window keeps so much of the variance of a mean.
-        share = np.sqrt(2 * HANN / self.keep)
+        fraction = np.sqrt(2 * HANN / self.keep)
         noise = [
-            share * noise_of_sample(signal, angle) / abs(size)
+            fraction * noise_of_sample(signal, angle) / abs(size)
             for signal, size in ((force, pushed[0]), (velocity, moved[0]))
         ]
         scatter = np.sqrt(HANN) * scatter_of_ratio(force, velocity, angle)

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from snrmjax.study.computations.base import FORCE, MEMBER
 from snrmjax.study.computations.responses import GRID, bounds_over
-from snrmjax.study.computations.tests import SHARE
+from snrmjax.study.computations.tests import FRACTION
 
 if TYPE_CHECKING:
     import xarray
@@ -100,7 +100,7 @@ def curve_bands(data: "xarray.Dataset") -> list[CurveBands]:
             at, bounds = _along(data, x, parts)
             bands += _by_force(data, bounds, at, x.removeprefix("point_"), y)
     for name in ("natural_frequency_hz", "damping_ratio"):
-        if name in data and data[name].dims == (MEMBER, SHARE):
+        if name in data and data[name].dims == (MEMBER, FRACTION):
             # Over the median velocity at each share of the amplitude range.
             at = np.nanmedian(data["velocity_m_s"].values, axis=0)
             values = data[name].values

@@ -71,7 +71,7 @@ class StudyDigest(NamedTuple):
         if self.sampling in ("grid", "list"):
             facts.append(Fact("members_chosen", method=self.sampling))
         if self.quantities and self.effects:
-            facts += self._on_shares()
+            facts += self._on_fractions()
         missing = [s for s in self.summaries if s.missing]
         for s in (s for s in self.summaries if s.outside):
             sides = {"ends": s.scalar.ends, "below": s.below, "above": s.above}
@@ -84,20 +84,20 @@ class StudyDigest(NamedTuple):
             facts.append(Fact("events_not_located"))
         return (*facts, *self.failures.facts)
 
-    def _on_shares(self) -> list[Fact]:
+    def _on_fractions(self) -> list[Fact]:
         pairs = [(out, effect) for out, effects in self.each_effect for effect in effects.values()]
         few = {_named(out) for out, one in pairs if one is None and out.varies}
         unsure = {_named(out) for out, one in pairs if one and one.half_width > _UNSURE}
         facts = []
         if few:
-            facts.append(Fact("too_few_for_shares", fewest=FEWEST, outputs=tuple(sorted(few))))
+            facts.append(Fact("too_few_for_fractions", fewest=FEWEST, outputs=tuple(sorted(few))))
         if unsure:
-            facts.append(Fact("shares_uncertain", limit=_UNSURE, outputs=tuple(sorted(unsure))))
+            facts.append(Fact("fractions_uncertain", limit=_UNSURE, outputs=tuple(sorted(unsure))))
         together = correlated_pairs(self.quantities)
         if together:
             facts.append(Fact("varied_together", pairs=tuple(together)))
         elif any(_certain(effects) > 1 + _OVERLAP for _, effects in self.each_effect):
-            facts.append(Fact("shares_above_one"))
+            facts.append(Fact("fractions_above_one"))
         return facts
 
 
@@ -129,7 +129,7 @@ def digest(data: "xarray.Dataset") -> StudyDigest:
 def ranked_effects(effects: Effects) -> list[tuple[str, MainEffect]]:
     """The quantities by their share of the variance, the largest first."""
     known = [(name, one) for name, one in effects.items() if one is not None]
-    return sorted(known, key=lambda pair: -pair[1].share)
+    return sorted(known, key=lambda pair: -pair[1].fraction)
 
 
 def effects_frame(study: StudyDigest) -> pd.DataFrame:
@@ -140,7 +140,7 @@ def effects_frame(study: StudyDigest) -> pd.DataFrame:
             **({} if output.force is None else {"force_n": output.force}),
             "members": output.n_known,
             "varied": name,
-            "first_order_share": one.share,
+            "first_order_fraction": one.fraction,
             "half_width_95": one.half_width,
         }
         for output, effects in study.each_effect
@@ -155,5 +155,5 @@ def _named(scalar: Scalar) -> tuple[str, float | None]:
 def _certain(effects: Effects) -> float:
     """What the shares add up to at least."""
     return sum(
-        effect.share - effect.half_width for effect in effects.values() if effect is not None
+        effect.fraction - effect.half_width for effect in effects.values() if effect is not None
     )

@@ -57,11 +57,11 @@ class Failures(NamedTuple):
         return tuple(facts)
 
 
-class FailureShare(NamedTuple):
+class FailureFraction(NamedTuple):
     """Share of members that failed over equally populated parts of one varied quantity."""
 
     edges: Float[np.ndarray, " edge"]
-    share: Float[np.ndarray, " part"]
+    fraction: Float[np.ndarray, " part"]
     low: Float[np.ndarray, " part"]  # of the 95 % interval (Wilson)
     high: Float[np.ndarray, " part"]
 
@@ -78,9 +78,9 @@ def failures_of(data: "xarray.Dataset") -> Failures:
     return Failures(dict(counts.most_common()), np.any(bad, axis=1), worst, below, above)
 
 
-def failure_share(
+def failure_fraction(
     quantity: Float[np.ndarray, " member"], failed: Bool[np.ndarray, " member"]
-) -> FailureShare:
+) -> FailureFraction:
     """Share of failed members along one quantity, with 95 % intervals (Wilson)."""
     from scipy.stats import binomtest
 
@@ -92,7 +92,7 @@ def failure_share(
         for a, b in zip(k, n, strict=True)
     ]
     low, high = np.array(ends).T
-    return FailureShare(edges, np.where(n > 0, k / np.maximum(n, 1), np.nan), low, high)
+    return FailureFraction(edges, np.where(n > 0, k / np.maximum(n, 1), np.nan), low, high)
 
 
 def most_telling(

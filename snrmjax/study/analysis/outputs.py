@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from snrmjax.numerics.units import HERTZ
 from snrmjax.study.computations.base import FORCE, MEMBER, PEAK_SIDE
-from snrmjax.study.computations.tests import SHARE
+from snrmjax.study.computations.tests import FRACTION
 
 if TYPE_CHECKING:
     import xarray
@@ -169,7 +169,7 @@ def scalars(data: "xarray.Dataset") -> Iterator[Scalar]:
             yield from _by_force(data, name, unit, meaning, values, range_of(data))
         elif variable.dims in ((MEMBER,), (MEMBER, FORCE)):
             yield from _by_force(data, name, unit, meaning, variable.values)
-        elif variable.dims == (MEMBER, SHARE):
+        elif variable.dims == (MEMBER, FRACTION):
             for k, which in _ENDS:
                 words = f"{meaning}, at the {which} amplitude"
                 values = variable[:, k].values

@@ -26,9 +26,9 @@ from snrmjax.study.computations.base import (
 )
 from snrmjax.study.computations.responses import ResponseRange
 
-SHARE = "relative_amplitude"
+FRACTION = "relative_amplitude"
 _POINTS = 11  # of a curve over the measured range
-_CURVE = (MEMBER, SHARE)
+_CURVE = (MEMBER, FRACTION)
 _FOUND = {
     "status": Output((MEMBER,), TEXT, "", "solved, or why not"),
     "n_states": Output((MEMBER,), "i4", "1", "steady states of the test"),
@@ -51,7 +51,7 @@ class AbstractIdentified(AbstractSingly):
     def axes(self) -> dict[str, Axis]:
         """See `AbstractComputation.axes`."""
         text = "place between the smallest (0) and the largest (1) measured amplitude"
-        return {SHARE: Axis(np.linspace(0.0, 1.0, _POINTS), "1", text)}
+        return {FRACTION: Axis(np.linspace(0.0, 1.0, _POINTS), "1", text)}
 
     def sensor(self, modes: LinearModes) -> str:
         """That where the mode of interest moves most, whatever the order of the sensors."""

@@ -204,5 +204,5 @@ def _members(about: Quantities) -> tuple[np.ndarray, np.ndarray]:
     (seed,) = np.random.SeedSequence([0, 1]).spawn(1)
     sequence = stats.qmc.Sobol(n, rng=np.random.default_rng(seed))
     z = stats.qmc.MultivariateNormalQMC(np.zeros(n), engine=sequence).random(_MEMBERS)
-    bends = [0.5 * np.einsum("mi,ij,mj->m", z, h, z, optimize=True) for h in about.hessian]
-    return z @ about.gradient.T, np.stack(bends, axis=1)
+    roughness = [0.5 * np.einsum("mi,ij,mj->m", z, h, z, optimize=True) for h in about.hessian]
+    return z @ about.gradient.T, np.stack(roughness, axis=1)

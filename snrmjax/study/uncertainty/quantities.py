@@ -177,8 +177,8 @@ class _Series(NamedTuple):
 
     def model(self, z: Float[Array, " input"]) -> Structure:
         """The model at z."""
-        bends = jnp.einsum("nij,i,j->n", self.curvature, z, z)
-        numbers = self.numbers + self.slopes @ z + 0.5 * bends
+        roughness = jnp.einsum("nij,i,j->n", self.curvature, z, z)
+        numbers = self.numbers + self.slopes @ z + 0.5 * roughness
         arrays, others = eqx.partition(self.template, _is_number)
         return eqx.combine(ravel_pytree(arrays)[1](numbers), others)
 

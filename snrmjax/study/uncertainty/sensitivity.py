@@ -33,7 +33,7 @@ _NORMAL_95 = 1.959964  # half width of the 95 % interval, in 1σ
 class MainEffect(NamedTuple):
     """What one varied quantity alone does to an output."""
 
-    share: float  # first-order index
+    fraction: float  # first-order index
     half_width: float  # of its 95 % interval
     at: Float[np.ndarray, " place"]  # values of the quantity
     mean: Float[np.ndarray, " place"]  # conditional mean of the output
@@ -110,13 +110,13 @@ def main_effect(
     table = np.column_stack([basis(x, knots), centred, np.ones(len(y))])
     groups = [table[k::_GROUPS].T @ table[k::_GROUPS] for k in range(_GROUPS)]
     total = np.sum(groups, axis=0)
-    coefficients, covariance, share = _fit(total)
+    coefficients, covariance, fraction = _fit(total)
     without = np.array([_fit(total - group)[2] for group in groups])
     std = np.sqrt((_GROUPS - 1) / _GROUPS * np.sum((without - without.mean()) ** 2))
     rows = basis(at, knots)
     error = np.sqrt(np.maximum(np.sum((rows @ covariance) * rows, axis=1), 0.0))
     mean = y.mean() + scale * (rows @ coefficients)
-    return MainEffect(share, _NORMAL_95 * float(std), at, mean, _NORMAL_95 * scale * error)
+    return MainEffect(fraction, _NORMAL_95 * float(std), at, mean, _NORMAL_95 * scale * error)
 
 
 def correlated_pairs(quantities: dict[str, Float[np.ndarray, " member"]]) -> list[tuple[str, str]]:
@@ -178,9 +178,9 @@ def sobol_indices(data: "xarray.Dataset", *, seed: int = 0) -> SobolIndices:
         input_names=tuple(inputs),
         units=units,
         notes=tuple(
-            Fact("rows_without_value", output=name, share=share)
-            for name, share in zip(columns, missing.tolist(), strict=True)
-            if share > 0
+            Fact("rows_without_value", output=name, fraction=fraction)
+            for name, fraction in zip(columns, missing.tolist(), strict=True)
+            if fraction > 0
         ),
     )
 

@@ -10,7 +10,7 @@ from truths.chain_states import steady_states, structure
 
 import snrmjax as sj
 from snrmjax.diagnose.verdict import Verdict
-from snrmjax.io.diagnosis_results import placed_answer, summarise_whereabouts
+from snrmjax.io.diagnosis_results import placed_answer, summarise_localisation
 from snrmjax.pipelines.diagnose import DiagnosedTest
 from snrmjax.report.pages.diagnosis import answer_in_words
 
@@ -52,7 +52,7 @@ def test_one_sensor_tells_it_by_the_law():
     assert std < 0.05 * CUBIC
     assert found.explains
     assert found.model.effects[0].at == (("x3", 1.0), ("x2", -1.0))
-    told = summarise_whereabouts(found)
+    told = summarise_localisation(found)
     assert sum(told["where"].values()) == pytest.approx(1.0)
     answer = placed_answer(found)
     assert answer["effects"] == ["cubic_stiffness"]
@@ -137,4 +137,4 @@ def test_where_no_candidate_fits_the_words_say_so():
     found = sj.diagnose.locate_force(data, model, ("x1", "x2-x1"), laws=LAWS)
     assert not found.fits
     assert "a force at none of these places reproduces the measured response" in str(found.words)
-    assert not summarise_whereabouts(found)["where_fits"]
+    assert not summarise_localisation(found)["where_fits"]

@@ -26,10 +26,10 @@ def recorded(second=nothing, third=nothing, exciter=(0.0, 0.0), seed=1):
         size, turn = np.abs(motion), motion / np.abs(motion)
         x = states.amplitude / states.amplitude.max()
         velocity, forced = [], []
-        for order, share, own in zip(ORDERS, (second, third), exciter, strict=True):
+        for order, fraction, own in zip(ORDERS, (second, third), exciter, strict=True):
             answer = 1j * order * omega * SHAPE / dynamic(order * omega)
             forced.append(answer * SHAPE * states.force)
-            internal = OMEGA**2 * share(x) * size * turn**order
+            internal = OMEGA**2 * fraction(x) * size * turn**order
             noise = NOISE * (rng.normal(size=(2, len(x))).T @ [1.0, 1j])
             velocity.append(-answer * internal + own * forced[-1] + noise)
         std = np.full((len(x), 2), NOISE)

@@ -188,7 +188,7 @@ def test_advice_narrows_the_band_and_avoids_what_cannot_be_measured(fit):
         assert curve.stable[near]
         assert not curve.continued[near]
         assert all(abs(one.frequency / f.frequency - 1) > 0.002 for f in curve.folds)
-        assert one.reason["share"] > 0
+        assert one.reason["fraction"] > 0
 
 
 @pytest.mark.long

@@ -18,16 +18,16 @@ def fit():
 
 def test_contributions_sum_to_one_and_name_the_level_errors(fit):
     rows = contributions(fit)
-    assert sum(row.frequency_share for row in rows) == pytest.approx(1, abs=1e-6)
-    assert sum(row.damping_share for row in rows) == pytest.approx(1, abs=1e-6)
+    assert sum(row.frequency_fraction for row in rows) == pytest.approx(1, abs=1e-6)
+    assert sum(row.damping_fraction for row in rows) == pytest.approx(1, abs=1e-6)
     # Levels are named as the data name them: here from 0 to 4.
     assert {row.source for row in rows} >= {"random error of phase", "gain of level 4"}
     # At resonance a level's gain counts as the velocities of its nine states do together; states
     # off resonance tell it, since stiffness against frequency has the same factor.
     near = contributions(sj.fit_jointly(noisy(1, widest=4), modes(), level_gain_std=0.01, **TRUE))
     at_resonance, off_it = (
-        sum(row.damping_share for row in found if row.source.startswith("gain"))
-        / sum(row.damping_share for row in found if row.source == "random error of velocity")
+        sum(row.damping_fraction for row in found if row.source.startswith("gain"))
+        / sum(row.damping_fraction for row in found if row.source == "random error of velocity")
         for found in (near, rows)
     )
     assert at_resonance == pytest.approx(9, rel=0.1)
@@ -49,7 +49,7 @@ def test_contributions_near_resonance_of_a_linear_mode_are_known(levels):
     data = stated(level, omega, force, velocity * np.exp(own))
     structure = sj.model.structure(modes(), **levels)
     fit = sj.fit_jointly(data, structure, backbone="polynomial:0", damping="constant")
-    shares = {row.source.removeprefix("random error of "): row for row in contributions(fit)}
+    fractions = {row.source.removeprefix("random error of "): row for row in contributions(fit)}
     values = sj.identify.fitted_values(fit, np.array([1.0]))
     lost = float((values.modal_damping_std / values.modal_damping)[0]) ** 2
     moved = float((values.natural_frequency_std / values.natural_frequency)[0]) ** 2
@@ -61,22 +61,22 @@ def test_contributions_near_resonance_of_a_linear_mode_are_known(levels):
     # itself, whatever levels add to it.
     for kind in ("velocity", "force"):
         wanted = noise[kind] ** 2 / n
-        assert shares[kind].damping_share * lost == pytest.approx(wanted, rel=0.1)
+        assert fractions[kind].damping_fraction * lost == pytest.approx(wanted, rel=0.1)
     # tan φ = (ω² − Ω²)/(Ω 2ζω): the natural frequency hinges on the phase, by half a bandwidth.
     by_phase = (noise["phase"] * 0.5 * constant / OMEGA) ** 2 / n
-    assert shares["phase"].frequency_share * moved == pytest.approx(by_phase, rel=0.1)
+    assert fractions["phase"].frequency_fraction * moved == pytest.approx(by_phase, rel=0.1)
     if levels:
         # Of weighted means, to first order in tan φ: across, errors count as its mean square. How
         # curves go with the forcing frequency, which is not known, takes a little of it.
         across, along = noise["phase"] ** 2, noise["velocity"] ** 2 + noise["force"] ** 2
         tilt = np.mean(tangent**2) * along**2 / (across * noise["velocity"] ** 2)
-        ratio = shares["phase"].damping_share / shares["velocity"].damping_share
+        ratio = fractions["phase"].damping_fraction / fractions["velocity"].damping_fraction
         assert ratio == pytest.approx(tilt, rel=0.08)
         tilt = np.mean(tangent**2) * across * noise["velocity"] ** 2 / along**2
-        ratio = shares["velocity"].frequency_share / shares["phase"].frequency_share
+        ratio = fractions["velocity"].frequency_fraction / fractions["phase"].frequency_fraction
         assert ratio == pytest.approx(tilt, rel=0.08)
     else:
-        assert shares["velocity"].damping_share + shares["force"].damping_share < 0.5
+        assert fractions["velocity"].damping_fraction + fractions["force"].damping_fraction < 0.5
 
 
 def test_the_bootstrap_knows_the_states_but_not_what_levels_share():

@@ -16,10 +16,10 @@ KNOTS = np.array([0.0, 0.02, 0.05, 0.2, 0.3, 0.7, 1.0])
 AT = np.linspace(3.2e-4, 1.95e-3, 40)  # m
 
 
-def curve(values, bend_std=1.0):
+def curve(values, roughness_std=1.0):
     """A smoothing spline through values at `KNOTS`."""
     drawn = SmoothingSpline.through(KNOTS, values, jnp.asarray(2.0), "displacement")
-    return SmoothingSpline(**(vars(drawn) | {"bend_std": jnp.asarray(bend_std)}))
+    return SmoothingSpline(**(vars(drawn) | {"roughness_std": jnp.asarray(roughness_std)}))
 
 
 def test_a_straight_line_has_no_bends_and_a_corner_has_one():

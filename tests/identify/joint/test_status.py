@@ -60,18 +60,20 @@ def test_resonances_and_folds_that_are_not_located_are_counted_and_said(monkeypa
 
 def test_results_say_themselves_and_become_data_sets():
     fit = noisy_fit()
-    response, shares = sj.identify.fitted_response(fit, 2.2)[0], sj.identify.contributions(fit)
+    response, fractions = sj.identify.fitted_response(fit, 2.2)[0], sj.identify.contributions(fit)
     for result, name, unit in (
         (fit, "frequency_hz", "Hz"),
         (response, "velocity_std_m_s", "m/s"),
         (response.resonances[0], "frequency_std_hz", "Hz"),
-        (shares, "damping_share", "1"),
+        (fractions, "damping_fraction", "1"),
     ):
         assert len(repr(result).splitlines()) < 25
         assert result.to_xarray()[name].attrs["units"] == unit
     assert "converged" in repr(fit)
-    assert list(shares.to_pandas()["frequency_share"]) == [one.frequency_share for one in shares]
-    for result in (fit, response, shares):
+    assert list(fractions.to_pandas()["frequency_fraction"]) == [
+        one.frequency_fraction for one in fractions
+    ]
+    for result in (fit, response, fractions):
         assert result.plot().axes
 
 

@@ -116,8 +116,8 @@ def assert_equations(natural, damping, constant, frequency, amplitude, residual,
     c = natural**2 - frequency**2 + 2j * damping * natural * frequency
     # ω̃ has 53 bits: ω̃² − Ω², and with it V_nl, is known to ε Ω²/|c| only, however good it is.
     # Four roundings of it, beside the 1e-10 asked for.
-    share = np.abs(constant * frequency / c) / amplitude
-    rounding = 4 * EPS * np.maximum(natural, frequency) ** 2 / np.abs(c) * share
+    fraction = np.abs(constant * frequency / c) / amplitude
+    rounding = 4 * EPS * np.maximum(natural, frequency) ** 2 / np.abs(c) * fraction
     error = eq_12(natural, damping, constant, frequency, amplitude, residual)
     assert (np.abs(error) <= 1e-10 + rounding).all()
     assert (np.abs(eq_17(natural, damping, frequency, cotangent)) <= 1e-10).all()
@@ -679,19 +679,19 @@ invert_compiled = eqx.filter_jit(invert_phasor)
     octave=st.floats(-1, 1),
     log_constant=st.floats(-6, 6),
     sign=st.sampled_from([-1.0, 1.0]),
-    share=st.floats(0, 0.9),
+    fraction=st.floats(0, 0.9),
     angle=st.floats(-3.2, 3.2),
     time=st.floats(-3, 3),
     length=st.floats(-3, 3),
 )
 def test_round_trip_and_units(
-    log_natural, log_damping, octave, log_constant, sign, share, angle, time, length
+    log_natural, log_damping, octave, log_constant, sign, fraction, angle, time, length
 ):
     natural, damping = 10.0**log_natural, 10.0**log_damping
     frequency, constant = natural * 2.0**octave, sign * 10.0**log_constant
     c = natural**2 - frequency**2 + 2j * damping * natural * frequency
     own = 1j * constant * frequency / c
-    residual = share * abs(own) * np.exp(1j * angle)
+    residual = fraction * abs(own) * np.exp(1j * angle)
     point = invert_compiled(
         *(jnp.array([x]) for x in (constant, frequency, own + residual, residual))
     )

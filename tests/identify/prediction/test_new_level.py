@@ -160,9 +160,9 @@ def test_left_out_levels_lie_inside_their_bands():
         one = sj.identify.predicted_resonance(fit, levels[out].force)
         pair = zip((one.frequency, one.velocity), levels[out].resonance(), strict=True)
         inside.append([each[0] < value < each[-1] for each, value in pair])
-    share = np.mean(inside, axis=0)
+    fraction = np.mean(inside, axis=0)
     # Binomial: 2 % of 100. Student's factor for five levels widens beyond 95 %.
-    assert np.all((share >= 0.90) & (share <= 0.99))
+    assert np.all((fraction >= 0.90) & (fraction <= 0.99))
 
 
 @pytest.mark.long

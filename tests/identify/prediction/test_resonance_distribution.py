@@ -113,14 +113,14 @@ def test_damping_that_extrapolates_through_zero_is_no_absence():
     late = np.where(root <= 1, root, load / (1 - s))
     late_has = (late <= 2.0) & (late > 0)
     late_passive = late_has | (s < 1)
-    share = 0.95 * np.mean(passive) + 0.05 * np.mean(late_passive)
-    expected = (0.95 * np.mean(has) + 0.05 * np.mean(late_has)) / share
+    fraction = 0.95 * np.mean(passive) + 0.05 * np.mean(late_passive)
+    expected = (0.95 * np.mean(has) + 0.05 * np.mean(late_has)) / fraction
     assert one.probability == pytest.approx(expected, abs=0.02)  # 3·sqrt(p(1−p)/n) of 4000
-    assert one.negative_damping == pytest.approx(1 - share, abs=0.025)
+    assert one.negative_damping == pytest.approx(1 - fraction, abs=0.025)
     assert one.negative_damping > 0.2
     low, high = np.quantile(root[has], [0.1, 0.9]) * OMEGA
     assert low < one.velocity[2] < high
-    assert notes_on_resonance(one, "2 N")[0]["share"] == one.negative_damping
+    assert notes_on_resonance(one, "2 N")[0]["fraction"] == one.negative_damping
 
 
 def test_a_law_that_has_no_damping_left_gives_way_to_one_that_stops():

@@ -5,7 +5,7 @@ import pytest
 
 from snrmjax.identify.test_model import posterior
 from snrmjax.identify.test_model import states as measured
-from snrmjax.identify.test_model.hyper import averaged, sizes_of_bends
+from snrmjax.identify.test_model.hyper import averaged, roughness_stds
 from snrmjax.identify.test_model.posterior import fit_test
 from snrmjax.numerics.blocks import on_one_core
 
@@ -46,11 +46,11 @@ def test_bands_know_that_levels_may_differ_for_what_curves_may_bend():
     inside = {True: [], False: []}
     for seed in range(10):
         states = response_controlled(seed, 5e-4)
-        for over_sizes, shares in inside.items():
+        for over_sizes, fractions in inside.items():
             found = fit_test(states, over_sizes=over_sizes, compare_levels=False)
             curves = found.curves(at)
             std = np.sqrt(curves.covariance[:, 0, 0])
-            shares.append(np.abs(curves.squared_frequency - stiffness(at)) < 1.96 * std)
+            fractions.append(np.abs(curves.squared_frequency - stiffness(at)) < 1.96 * std)
     # 95 % are meant. Ten tests of eight levels know it to some 5 %.
     assert np.mean(inside[True]) > 0.9
     # The likeliest sizes alone mostly miss the lowest level, which is far from its neighbours.
@@ -89,13 +89,13 @@ def test_bands_are_those_of_sampled_hyperparameters(monkeypatch, seed, scatter):
 
     def sizes(objective, point, bounds):
         given["problem"] = objective, point, bounds
-        return sizes_of_bends(objective, point, bounds)
+        return roughness_stds(objective, point, bounds)
 
     def average(points, gaussian):
         given["gaussian"] = gaussian
         return averaged(points, gaussian)
 
-    monkeypatch.setattr(posterior, "sizes_of_bends", sizes)
+    monkeypatch.setattr(posterior, "roughness_stds", sizes)
     monkeypatch.setattr(posterior, "averaged", average)
     states = response_controlled(seed, scatter)
     found = fit_test(states, over_sizes=True, compare_levels=False)

@@ -48,8 +48,8 @@ def test_a_bend_is_the_distance_from_the_chord_between_its_neighbours(basis):
     values = own.values(0.8 * np.sqrt(own.knots))[0]
     for k in range(1, len(own.knots) - 1):
         left, here, right = own.knots[k - 1 : k + 2]
-        share = (here - left) / (right - left)
-        off = values[k] - (1 - share) * values[k - 1] - share * values[k + 1]
+        fraction = (here - left) / (right - left)
+        off = values[k] - (1 - fraction) * values[k - 1] - fraction * values[k + 1]
         # One bend moves its own knot off the chord, and no other one does.
         assert np.count_nonzero(np.abs(off[N_POWERS:]) > 1e-9) == 1
         assert np.allclose(off[:N_POWERS], 0.0, atol=1e-12)

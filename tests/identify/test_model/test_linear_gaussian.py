@@ -108,7 +108,7 @@ def test_rows_that_are_repeated_count_once_with_their_share():
     rng = np.random.default_rng(5)
     design, rows = rng.normal(size=(30, 4)), rng.normal(size=30)
     once = LinearRows.of(design, rows)
-    twice = LinearRows.of(np.vstack([design, design]), np.append(rows, rows))._replace(share=0.5)
+    twice = LinearRows.of(np.vstack([design, design]), np.append(rows, rows))._replace(fraction=0.5)
     variance = np.array([1.0, 0.3, 2.0, 0.1])
     for scale in (0.7, 1.3):
         one, other = (each.log_likelihood(scale, variance) for each in (once, twice))

@@ -223,11 +223,11 @@ def test_states_that_err_alike_count_as_fewer(known, found):
     slow = 0.03 * np.sin(np.tile(np.linspace(-4, 4, PER_LEVEL), LEVELS))
     states = known.states._replace(velocity=known.states.velocity * np.exp(slow), stated=False)
     states = states._replace(errors=np.tile([0.1, 1.0, 1.0], (len(slow), 1)))
-    plain, tempered = (unasked(states, tempered=one) for one in (False, True))
-    wide, narrow = (np.median(off(one)[2], axis=0) for one in (tempered, plain))
+    plain, power_likelihood = (unasked(states, power_likelihood=one) for one in (False, True))
+    wide, narrow = (np.median(off(one)[2], axis=0) for one in (power_likelihood, plain))
     assert wide[1] > 1.15 * narrow[1]
     assert wide[0] > narrow[0]
-    white = unasked(known.states, tempered=True)
+    white = unasked(known.states, power_likelihood=True)
     same = np.median(off(white)[2], axis=0) / np.median(off(found)[2], axis=0)
     assert same == pytest.approx(1.0, abs=0.15)
 

@@ -45,7 +45,7 @@ def tone(hertz, size, ratio=0.0):
     return size * np.exp(-ratio * HERTZ * hertz * TIME) * np.cos(HERTZ * hertz * TIME + 0.4)
 
 
-def company(mode, seed=0):
+def interfering(mode, seed=0):
     """30 % of the velocity at 2.7 times the frequency, 20 % at half of it, hum, offset, noise."""
     largest = np.abs(mode).max()
     noise = 0.01 * np.random.default_rng(seed).standard_normal(len(TIME))
@@ -54,7 +54,7 @@ def company(mode, seed=0):
 
 
 def test_the_frequency_of_a_mode_with_company_is_its_own(mode, backbone):
-    found = sj.measure.isolate_decay(TIME, company(mode), 1.01 * REST)
+    found = sj.measure.isolate_decay(TIME, interfering(mode), 1.01 * REST)
     true = np.interp(np.exp(found.level.real), *backbone)
     # The amplitude at which the truth is taken has its own error, along the backbone.
     slope = found.smooth_bend.imag / found.smooth_rate.real
@@ -67,14 +67,14 @@ def test_the_frequency_of_a_mode_with_company_is_its_own(mode, backbone):
 
 
 def test_what_lies_beside_the_mode_is_measured(mode):
-    record = company(mode)
+    record = interfering(mode)
     found = sj.measure.isolate_decay(TIME, record, REST)
     centred = record - record.mean()
     np.testing.assert_allclose(
-        found.company.mode_share, np.sum(mode**2) / np.sum(centred**2), atol=0.02
+        found.interfering.mode_fraction, np.sum(mode**2) / np.sum(centred**2), atol=0.02
     )
-    assert found.company.frequency / HERTZ == pytest.approx(108, abs=1)
-    ((hertz, size),) = found.company.hum
+    assert found.interfering.frequency / HERTZ == pytest.approx(108, abs=1)
+    ((hertz, size),) = found.interfering.hum
     assert hertz == pytest.approx(60, abs=0.1)
     assert size == pytest.approx(0.01 * np.abs(mode).max(), rel=0.3)
 

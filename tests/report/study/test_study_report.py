@@ -19,7 +19,7 @@ from snrmjax.report.study.study_report import (
 )
 from snrmjax.report.study.words import display_on_axis
 from snrmjax.study.analysis.digest import digest
-from snrmjax.study.analysis.failures import failure_share, failures_of, most_telling
+from snrmjax.study.analysis.failures import failure_fraction, failures_of, most_telling
 from snrmjax.study.analysis.outputs import Scalar, scalars, summarized
 
 NASTY = "<script>alert(1)</script>$x^2$"
@@ -119,9 +119,9 @@ def test_the_effect_is_that_of_the_only_quantity_that_acts(written):
     table = pd.read_csv(folder / "main_effects.csv")
     peaks = table[table.variable == "peak_velocity_m_s"]
     assert peaks.groupby("force_n").varied.first().tolist() == ["a.b", "a.b"]
-    own = peaks[peaks.varied == "a.b"].first_order_share
+    own = peaks[peaks.varied == "a.b"].first_order_fraction
     np.testing.assert_allclose(own, 1.0, atol=1e-9)  # linear: the curve is exact
-    assert (peaks[peaks.varied == NASTY].first_order_share.abs() < 0.1).all()
+    assert (peaks[peaks.varied == NASTY].first_order_fraction.abs() < 0.1).all()
     assert set(table.varied) == {"a.b", NASTY}
 
 
@@ -134,12 +134,12 @@ def test_failures_are_placed(written):
     assert found.failures.failed_counts == {"step_too_small": n_failed}
     both = {"a": data_set()["a.b"].values, "b": b}
     assert most_telling(both, found.failures.failed) == ["b", "a"]
-    share = failure_share(b, found.failures.failed)
-    assert share.edges[8] == pytest.approx(0.8, abs=0.05)
-    np.testing.assert_array_equal(share.share[[0, 3, 6, 9]], [0.0, 0.0, 0.0, 1.0])
-    assert np.all((share.low <= share.share) & (share.share <= share.high))
+    fraction = failure_fraction(b, found.failures.failed)
+    assert fraction.edges[8] == pytest.approx(0.8, abs=0.05)
+    np.testing.assert_array_equal(fraction.fraction[[0, 3, 6, 9]], [0.0, 0.0, 0.0, 1.0])
+    assert np.all((fraction.low <= fraction.fraction) & (fraction.fraction <= fraction.high))
     # Wilson's interval of 0 of 40: 1 - 1/(1 + z²/n) = 0.088.
-    assert share.high[0] == pytest.approx(1.96**2 / (40 + 1.96**2), abs=1e-4)
+    assert fraction.high[0] == pytest.approx(1.96**2 / (40 + 1.96**2), abs=1e-4)
 
 
 def test_a_status_of_success_is_no_failure():
@@ -174,7 +174,7 @@ def test_notes_tell_what_the_numbers_are_not():
     together = together.set_coords("also")
     first, second, *_ = digest(few).facts
     assert first == Fact("members_chosen", method="grid")
-    assert (second.kind, second["fewest"]) == ("too_few_for_shares", 50)
+    assert (second.kind, second["fewest"]) == ("too_few_for_fractions", 50)
     facts = {fact.kind: fact for fact in digest(together).facts}
     assert facts["varied_together"]["pairs"] == (("a.b", "also"),)
     assert "members_chosen" not in facts

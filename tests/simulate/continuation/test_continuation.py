@@ -57,14 +57,14 @@ def isola(point):
     return jnp.array([value]), jnp.array([[2 * x / 0.09, 2 * (lam - 1) / 0.25]])
 
 
-def kink(point):
+def nonsmooth_point(point):
     """x = ½|λ − 0.3|: the tangent turns by 2 atan ½ at once."""
     x, lam = point
     side = jnp.where(lam > 0.3, 0.5, -0.5)
     return jnp.array([x - side * (lam - 0.3)]), jnp.stack([jnp.ones(()), -side])[None]
 
 
-PROBLEMS = (s_curve, circle, pole, broken, nothing, isola, kink)
+PROBLEMS = (s_curve, circle, pole, broken, nothing, isola, nonsmooth_point)
 
 
 @jax.jit
@@ -216,13 +216,13 @@ def test_a_loop_is_followed_once(problem, start, direction, largest):
 
 
 def test_a_kink_is_passed():
-    points, tangents, status = followed(kink, [0.65, -1.0], ends=(-1.0, 1.5))
+    points, tangents, status = followed(nonsmooth_point, [0.65, -1.0], ends=(-1.0, 1.5))
     assert status == CurveStatus.UPPER_END
     np.testing.assert_allclose(points[:, 0], 0.5 * np.abs(points[:, 1] - 0.3), atol=1e-9)
     assert np.all(np.diff(points[:, 1]) > 0)  # never back
     # Only near the kink are the steps small, and they grow again behind it.
     near = np.abs(points[:, 1] - 0.3) < 0.02
-    assert np.min(np.abs(points[near, 1] - 0.3)) < STEPS.kink
+    assert np.min(np.abs(points[near, 1] - 0.3)) < STEPS.nonsmooth_point
     assert np.linalg.norm(np.diff(points[-5:-1], axis=0), axis=1).max() > 0.9 * STEPS.largest
     np.testing.assert_allclose(tangents[-1], np.array([0.5, 1.0]) / np.hypot(0.5, 1.0), atol=1e-9)
 

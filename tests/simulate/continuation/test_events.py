@@ -248,12 +248,12 @@ def test_bifurcations_lie_where_multipliers_cross(kind, numpy_balance, time_doma
             multipliers = time_domain(model, force, omega).multipliers(state_of(x, omega))
             values.append(crossing(kind, multipliers))
             frequencies.append(omega)
-        share = values[0] / (values[0] - values[1])
+        fraction = values[0] / (values[0] - values[1])
         # The multiplier is 1e-6 beyond the circle; the map's slope by differences is good to
         # 1e-7; the motions by their truncation to 5e-7 at the lowest, to 1e-10 elsewhere.
-        error = share * (frequencies[1] - frequencies[0]) / curve.frequency[k]
+        error = fraction * (frequencies[1] - frequencies[0]) / curve.frequency[k]
         assert abs(error) < 1e-6, (kind, k)
-        assert abs(share) < 1  # and it is this crossing, not another one far away
+        assert abs(fraction) < 1  # and it is this crossing, not another one far away
     # The stability changes there and at folds, and nowhere else.
     change = np.flatnonzero(curve.stability[1:] != curve.stability[:-1])
     labelled = np.concatenate([where, curve.at_events("fold")])
@@ -299,8 +299,8 @@ def line_with_a_crossing(monkeypatch, between):
         crossed = 0.5 + 1.0 * (frequency >= 3.0)
         return (-crossed - 1e-3 * frequency)[:, None].astype(complex)
 
-    def points_between(_, __, neighbours, share, ___):
-        here = neighbours[0][:, -1] + share
+    def points_between(_, __, neighbours, fraction, ___):
+        here = neighbours[0][:, -1] + fraction
         found, ok = between(here)
         along = np.outer(np.ones(len(here)), [0, 0, 0, 1.0])
         return np.outer(found, [0, 0, 0, 1.0]), along, ok
@@ -355,8 +355,8 @@ def test_a_fold_with_a_crossing_at_one_place_is_one_event(place, height, number,
         fold = 1.0 + 0.01 * (points[:, -1] - 2.0)
         return np.stack([modulus * turn, modulus / turn, fold, 0.1 * fold], axis=1)
 
-    def points_between(_, __, neighbours, share, ___):
-        found = np.outer(neighbours[0][:, -1] + share, along)
+    def points_between(_, __, neighbours, fraction, ___):
+        found = np.outer(neighbours[0][:, -1] + fraction, along)
         return found, np.outer(np.ones(len(found)), along), np.ones(len(found), dtype=bool)
 
     monkeypatch.setattr(bifurcations, "many_multipliers", multipliers_of)

@@ -29,8 +29,8 @@ def one_mode(quartic=0.3, ratio=0.02):
 
 def members(count):
     """Models and forces, no two of them alike."""
-    share = np.linspace(0.0, 1.0, count)
-    return [one_mode(0.1 + 0.3 * s, 0.02 + 0.01 * s) for s in share], 0.05 + 0.1 * share[::-1]
+    fraction = np.linspace(0.0, 1.0, count)
+    return [one_mode(0.1 + 0.3 * s, 0.02 + 0.01 * s) for s in fraction], 0.05 + 0.1 * fraction[::-1]
 
 
 @pytest.fixture(scope="module")

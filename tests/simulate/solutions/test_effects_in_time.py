@@ -189,7 +189,7 @@ SMOOTH = {
     "added_mass": {"mass": 0.05},
     "force_harmonics": {"second": 0.8, "third": 0.5},
 }
-KINKED = {
+NONSMOOTH = {
     "bilinear_stiffness": {"stiffness": 0.3 * SQUARED},
     "gap_stiffness": {"stiffness": 0.15 * SQUARED, "gap": GAP},
     "one_sided_stop": {"stiffness": 0.2 * SQUARED, "gap": GAP},
@@ -211,7 +211,7 @@ COUPLED = {
         "damping_ratio": 0.02,
     },
 }
-GROUPS = {"smooth": SMOOTH, "kinked": KINKED, "friction": FRICTION, "coupled": COUPLED}
+GROUPS = {"smooth": SMOOTH, "kinked": NONSMOOTH, "friction": FRICTION, "coupled": COUPLED}
 # Effects that show at the fundamental only beside another one.
 BESIDE = {
     "static_preload": {"cubic_stiffness": {"coefficient": 0.05 * CUBIC}},
@@ -290,7 +290,7 @@ def truth(kind):
         orders=orders,
         linear=linear_terms_of(kind, parameters),
         # A kink in a step costs many: less is asked of it, as the tolerance allows.
-        **({"cycles": 104, "rtol": 1e-6} if kind in KINKED else {}),
+        **({"cycles": 104, "rtol": 1e-6} if kind in NONSMOOTH else {}),
     )
     return phasors(found[:, :, 0])
 

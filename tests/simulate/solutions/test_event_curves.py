@@ -392,8 +392,8 @@ def test_neimark_sacker_points_feel_damping_that_depends_on_the_velocity():
     settings = {"kind": "neimark_sacker", "parameter": name}
     curve = follow_event(model, 0.4, start, to=(1e-3, 1.0), **settings)
     ((k, _),) = [(k, e) for k, e in enumerate(curve.event) if e]  # the strongest with tori
-    for share, number in ((0.9, 2), (1.01, 0)):
-        value = 1e-3 + share * (curve.value[k] - 1e-3)
+    for fraction, number in ((0.9, 2), (1.01, 0)):
+        value = 1e-3 + fraction * (curve.value[k] - 1e-3)
         changed = sj.model.with_parameters(model, [name], np.array([value]))
         (response,) = sj.forced_response(changed, [0.4], *ends, harmonic_order=5)
         located = response.frequency[response.at_events("neimark_sacker")]

@@ -121,7 +121,7 @@ def test_a_simulation_says_which_elements_do_nothing(slides):
         assert len(notes) == idle
         if idle:
             assert notes[0]["slides"] == slides
-            assert notes[0]["share"] == pytest.approx(0.8, rel=2e-3)
+            assert notes[0]["fraction"] == pytest.approx(0.8, rel=2e-3)
             assert "more force" in str(notes[0])
 
 

@@ -38,8 +38,8 @@ def damped_oddly():
 
 # s(1 − αs + βs²) has a maximum of 0.298 and a minimum of 0.192: in between three motions meet
 # the force at resonance, and the upper two belong to a loop.
-SHARE = 0.25
-FORCE = SHARE * 2 * RATIO * OMEGA * UNIT * OMEGA / PARTICIPATION
+FRACTION = 0.25
+FORCE = FRACTION * 2 * RATIO * OMEGA * UNIT * OMEGA / PARTICIPATION
 
 
 @pytest.fixture(scope="module")
@@ -62,13 +62,13 @@ def test_an_isolated_loop_is_found_once_and_followed_around(loops):
     np.testing.assert_array_equal(loop.coefficients[0], loop.coefficients[-1])
     assert loop.frequency[0] == loop.frequency[-1]
     # Where it crosses the linear frequency, the roots of s(1 − αs + βs²) = 0.25.
-    roots = np.sort(np.roots([BETA, -ALPHA, 1.0, -SHARE]).real)
+    roots = np.sort(np.roots([BETA, -ALPHA, 1.0, -FRACTION]).real)
     amplitude = np.hypot(loop.coefficients[:, 1, 0], loop.coefficients[:, 2, 0]) / UNIT
     side = np.sign(loop.frequency - OMEGA)
     crossing = np.flatnonzero(side[1:] * side[:-1] < 0)
     assert crossing.size == 2
-    share = (OMEGA - loop.frequency[crossing]) / np.diff(loop.frequency)[crossing]
-    at_resonance = amplitude[crossing] + share * np.diff(amplitude)[crossing]
+    fraction = (OMEGA - loop.frequency[crossing]) / np.diff(loop.frequency)[crossing]
+    at_resonance = amplitude[crossing] + fraction * np.diff(amplitude)[crossing]
     # Averaging leaves out the third harmonic, of the order of the damping (2 %) squared; chords
     # of the loop's 0.05 steps sag by a thousandth.
     np.testing.assert_allclose(np.sort(at_resonance), roots[1:], rtol=4e-3)

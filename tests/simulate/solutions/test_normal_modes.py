@@ -296,11 +296,11 @@ def test_the_tongue_is_reported_and_can_be_skipped(flat_branch):
     # DESIGN: between about 87.5 and 90.2 Hz, and at its tip the fifth harmonic has it all.
     assert tongue.from_frequency / HZ == pytest.approx(87.5, abs=0.1)
     assert tongue.to_frequency / HZ == pytest.approx(90.2, abs=0.1)
-    assert tongue.energy_share > 0.99
+    assert tongue.energy_fraction > 0.99
     assert tongue.name == "1:5 with mode 2"
     assert branch.resonance[tongue.first] == tongue.name
     assert branch.resonance[tongue.first - 1] == ""
-    np.testing.assert_allclose(branch.mode_share.sum(axis=1), 1.0, rtol=1e-13)
+    np.testing.assert_allclose(branch.mode_fraction.sum(axis=1), 1.0, rtol=1e-13)
     # Where five times the frequency is about that of the second mode, stiffened as it is.
     assert 5 * tongue.from_frequency > float(model.modes.natural_frequency[1])
     skipped = nonlinear_normal_mode(

@@ -156,10 +156,10 @@ def test_gradients_of_the_flat_beam(flat_curve):
     compiled = jax.jit(quantities)
     gradient = np.asarray(jax.jit(jax.jacrev(quantities))(jnp.zeros(63)))
     slope = by_differences(compiled, np.zeros(63), 3e-3)
-    share = np.abs(gradient) / np.abs(gradient).max(axis=1, keepdims=True)
+    fraction = np.abs(gradient) / np.abs(gradient).max(axis=1, keepdims=True)
     # Fourth order in 3e-3 for logarithmic derivatives of order one: 1e-7; Newton's rounding
     # 1e-13/3e-3 is 3e-5 of the smallest that are looked at by their own size.
-    seen = share > 1e-6
+    seen = fraction > 1e-6
     assert np.sum(seen, axis=1).tolist() == [20, 22, 11]
     assert np.max(np.abs(slope / gradient - 1)[seen]) < 1e-6
     size = np.abs(gradient).max(axis=1, keepdims=True)

@@ -22,9 +22,9 @@ VARIANCE = A**2 / 8 + B * np.pi**4 / 5 + B**2 * np.pi**8 / 18 + 0.5
 def test_the_shares_of_ishigamis_function():
     x = np.random.default_rng(1).uniform(-np.pi, np.pi, (3, 20_000))
     found = [main_effect(one, ishigami(x)) for one in x]
-    shares = np.array([one.share for one in found])
+    fractions = np.array([one.fraction for one in found])
     # Three standard errors of a sample of 20000 are below 0.02 (the intervals say so too).
-    np.testing.assert_allclose(shares, PARTS / VARIANCE, atol=0.02)
+    np.testing.assert_allclose(fractions, PARTS / VARIANCE, atol=0.02)
     assert all(one.half_width < 0.015 for one in found)
     # E[y | x₁] = sin x₁ (1 + b π⁴/5) + a/2, within the curve's own 95 % band, nearly everywhere.
     truth = np.sin(found[0].at) * (1 + B * np.pi**4 / 5) + A / 2
@@ -38,18 +38,18 @@ def test_intervals_hold_the_true_share_about_as_often_as_they_say():
     for _ in range(n_trials):
         x = random.standard_normal((3, 300))
         found = main_effect(x[1], coefficients @ x)
-        inside += abs(found.share - truth[1]) < found.half_width
+        inside += abs(found.fraction - truth[1]) < found.half_width
     # 95 of 100 with three standard deviations of a binomial; a jackknife is a little short.
     assert 87 <= inside <= 99
 
 
 def test_a_needless_quantity_has_no_share_on_average():
     random = np.random.default_rng(3)
-    shares = [
-        main_effect(random.random(200), random.standard_normal(200)).share for _ in range(100)
+    fractions = [
+        main_effect(random.random(200), random.standard_normal(200)).fraction for _ in range(100)
     ]
     # Without the correction for its freedom the curve would explain 6/200 = 3 % of pure noise.
-    assert abs(np.mean(shares)) < 3 * np.std(shares) / np.sqrt(100) < 0.012
+    assert abs(np.mean(fractions)) < 3 * np.std(fractions) / np.sqrt(100) < 0.012
 
 
 def test_few_values_have_a_mean_each():
@@ -59,7 +59,7 @@ def test_few_values_have_a_mean_each():
     np.testing.assert_array_equal(found.at, [1.0, 2.0, 4.0])
     np.testing.assert_allclose(found.mean, [1.5, 4.5, 16.5], rtol=1e-12)
     between, within = np.var([1.0, 4.0, 16.0]), np.var(np.linspace(0, 1, 30))
-    assert found.share == pytest.approx(between / (between + within), abs=0.001)
+    assert found.fraction == pytest.approx(between / (between + within), abs=0.001)
 
 
 def test_units_do_not_matter():
@@ -67,14 +67,14 @@ def test_units_do_not_matter():
     x, y = random.standard_normal(300), random.standard_normal(300)
     one = main_effect(x, x**2 + y)
     other = main_effect(4.7e12 * (1 + 0.01 * x), 1e-6 * (x**2 + y) + 3e-4)
-    assert other.share == pytest.approx(one.share, abs=1e-9)
+    assert other.fraction == pytest.approx(one.fraction, abs=1e-9)
     np.testing.assert_allclose(other.mean, 1e-6 * one.mean + 3e-4, rtol=1e-9)
 
 
 def test_members_without_a_value_are_left_out():
     x = np.linspace(0, 1, 2 * FEWEST)
     y = np.where(x > 0.5, x, np.nan)
-    assert main_effect(x, y).share == pytest.approx(1.0, abs=1e-9)
+    assert main_effect(x, y).fraction == pytest.approx(1.0, abs=1e-9)
     assert main_effect(x[1:], y[1:]) is not None
     assert main_effect(x[:-1], y[:-1]) is None  # one member too few
     assert main_effect(x, np.ones_like(x)) is None

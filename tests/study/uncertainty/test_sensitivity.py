@@ -79,7 +79,7 @@ def test_rows_without_a_value_are_left_out_whole():
     assert found.rows[0] / 256 == pytest.approx(0.708, abs=0.02)
     (note,) = found.notes
     assert (note.kind, note["output"]) == ("rows_without_value", "y0")
-    assert note["share"] == pytest.approx(1 - found.rows[0] / 256)
+    assert note["fraction"] == pytest.approx(1 - found.rows[0] / 256)
 
 
 def test_other_members_are_refused():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from snrmjax.model.effects import make_effect
-from snrmjax.model.kinks import Kinks, crossings, with_kinks
+from snrmjax.model.nonsmooth_points import NonsmoothPoints, crossings, with_nonsmooth_points
 
 N = 256
 TAU = 2 * np.pi * np.arange(N) / N
@@ -24,8 +24,8 @@ def contact(x, place=0.4):
 def coefficients(shift, order, place=0.4):
     """Fourier coefficients of a sampled contact, and by 2¹⁹ samples."""
     x = jnp.asarray(motion(TAU, shift))
-    kinks = Kinks(jnp.array([place]), jnp.array([1.0]))
-    sampled = np.asarray(with_kinks(contact(x, place), x, kinks))
+    nonsmooth_points = NonsmoothPoints(jnp.array([place]), jnp.array([1.0]))
+    sampled = np.asarray(with_nonsmooth_points(contact(x, place), x, nonsmooth_points))
     fine = 2 * np.pi * np.arange(2**19) / 2**19
     exact = np.maximum(motion(fine, shift) - place, 0.0)
     return np.mean(sampled * np.exp(1j * order * TAU)), np.mean(exact * np.exp(1j * order * fine))
@@ -45,8 +45,13 @@ def test_a_contact_shorter_than_a_sample_counts():
         wanted = 2 * ((1 + depth) * np.sin(end) - end)
         for shift in (0.0, 0.003, 0.012, 0.02):
             x = jnp.asarray((1 + depth) * np.cos(TAU + shift))
-            kinks = Kinks(jnp.array([1.0]), jnp.array([1.0]))
-            found = float(jnp.sum(with_kinks(contact(x, 1.0), x, kinks))) * 2 * np.pi / N
+            nonsmooth_points = NonsmoothPoints(jnp.array([1.0]), jnp.array([1.0]))
+            found = (
+                float(jnp.sum(with_nonsmooth_points(contact(x, 1.0), x, nonsmooth_points)))
+                * 2
+                * np.pi
+                / N
+            )
             assert found == pytest.approx(wanted, rel=miss)
 
 
@@ -55,8 +60,10 @@ def test_the_derivative_is_that_of_the_integral():
 
     def whole(place):
         x = jnp.asarray(motion(TAU))
-        kinks = Kinks(place[None], jnp.ones(1))
-        return jnp.sum(with_kinks(contact(x, place), x, kinks)) * 2 * jnp.pi / N
+        nonsmooth_points = NonsmoothPoints(place[None], jnp.ones(1))
+        return (
+            jnp.sum(with_nonsmooth_points(contact(x, place), x, nonsmooth_points)) * 2 * jnp.pi / N
+        )
 
     fine = 2 * np.pi * np.arange(2**19) / 2**19
     above = np.mean(motion(fine) > 0.4) * 2 * np.pi
@@ -69,15 +76,15 @@ def test_passings_are_found_with_their_rates():
     fine = 2 * np.pi * np.arange(2**19) / 2**19
     signs = np.diff((motion(fine) > 0.4).astype(int))
     wanted = np.flatnonzero(signs) * fine[1]
-    phases = np.asarray(found.interval + found.share)[used] * TAU[1]
+    phases = np.asarray(found.interval + found.fraction)[used] * TAU[1]
     np.testing.assert_allclose(phases, wanted, atol=2 * fine[1])
     assert np.all(np.sign(found.rate[used]) == np.sign(signs[signs != 0]))
 
 
 def test_what_touches_nowhere_is_left_alone():
     x = jnp.asarray(motion(TAU))
-    kinks = Kinks(jnp.array([5.0]), jnp.array([1.0]))
-    np.testing.assert_array_equal(with_kinks(x**3, x, kinks), x**3)
+    nonsmooth_points = NonsmoothPoints(jnp.array([5.0]), jnp.array([1.0]))
+    np.testing.assert_array_equal(with_nonsmooth_points(x**3, x, nonsmooth_points), x**3)
 
 
 @pytest.mark.parametrize("amplitude", [1.3, 3.0])

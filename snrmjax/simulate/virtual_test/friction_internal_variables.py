@@ -7,7 +7,7 @@ from snrmjax.model.effect_base import AbstractHysteresis, StateAt
 from snrmjax.model.elements import elements_of
 from snrmjax.model.structures import Structure
 
-Memory = tuple[Float[Array, " state"], ...]
+InternalVariables = tuple[Float[Array, " state"], ...]
 
 
 def friction_rows(model: Structure) -> Float[Array, "friction mode"]:
@@ -25,9 +25,9 @@ def scaled_friction(
     )
 
 
-def memory_at_rest(
+def internal_variables_at_rest(
     model: Structure, effects: tuple[AbstractHysteresis, ...], q: Float[Array, " mode"]
-) -> Memory:
+) -> InternalVariables:
     """Memory of a structure that was brought to a displacement and held there."""
     return tuple(effect.states_at_rest(_acts_on(model, effect, q)) for effect in effects)
 
@@ -39,11 +39,15 @@ def _acts_on(model: Structure, effect: AbstractHysteresis, q: Float[Array, " mod
 
 
 def inner_force(
-    model: Structure, effects: tuple[AbstractHysteresis, ...], q: Array, v: Array, memory: Memory
-) -> tuple[Float[Array, " mode"], Memory]:
+    model: Structure,
+    effects: tuple[AbstractHysteresis, ...],
+    q: Array,
+    v: Array,
+    memory: InternalVariables,
+) -> tuple[Float[Array, " mode"], InternalVariables]:
     """What stiffness, damping and effects pull with, and the rates of friction's memory in a step.
 
-    Sliders are held through a step: see `memory_after_step`.
+    Sliders are held through a step: see `internal_variables_after_step`.
     """
     terms = model.linear_terms()
     inner = terms.stiffness * q + terms.damped(v) + model.memoryless_force(q[None], v[None])[0]
@@ -57,14 +61,14 @@ def inner_force(
     return inner, tuple(rates)
 
 
-def memory_after_step(
+def internal_variables_after_step(
     model: Structure,
     effects: tuple[AbstractHysteresis, ...],
-    memory: Memory,
+    memory: InternalVariables,
     begin: tuple[Float[Array, " mode"], Float[Array, " mode"]],
     end: tuple[Float[Array, " mode"], Float[Array, " mode"]],
     time: Array,
-) -> Memory:
+) -> InternalVariables:
     """Memory after a step of an integrator through which sliders were held.
 
     Arguments: `memory` as the integrator leaves it; q and q̇ at the `begin` and at the `end` of the

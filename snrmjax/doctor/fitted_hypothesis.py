@@ -13,10 +13,10 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
 from snrmjax.doctor.priors import ANY_MASS, CLEARLY, FITS_WELL, MODAL_MASS, NO_MODE, SCATTER
-from snrmjax.identify.checks.residual_autocorrelation import share_told_by
+from snrmjax.identify.checks.residual_autocorrelation import fraction_told_by
 from snrmjax.identify.pointwise.snrm import participation_of, sensed_mode
 from snrmjax.identify.test_model.posterior import TestPosterior, fit_test
-from snrmjax.identify.test_model.priors import LEAST_SHARE
+from snrmjax.identify.test_model.priors import LEAST_FRACTION
 from snrmjax.identify.test_model.states import RECORDED, TestStates, state_errors
 from snrmjax.identify.test_model.walk import Rounds
 from snrmjax.measure.states import SteadyStates, relative_errors
@@ -26,7 +26,7 @@ from snrmjax.model.structures import Structure
 _GUESSED = 1e3  # 1σ of a modal mass of which a first fit knows nothing
 
 
-class Judged(NamedTuple):
+class FittedHypothesis(NamedTuple):
     """A hypothesis and how it fits."""
 
     states: TestStates  # as it reads them
@@ -67,25 +67,25 @@ class Judged(NamedTuple):
         """Whether the mode loses energy, but for a tenth of the states and their noise."""
         return bool(np.quantile(self.damping, 0.1) > 0)
 
-    def gain(self, recorded: "Judged") -> float:
+    def gain(self, recorded: "FittedHypothesis") -> float:
         """ln of the odds against the table as recorded; an undamped mode has no odds."""
         if not self.damped:
             return -np.inf
         return self.evidence - recorded.evidence if recorded.damped else np.inf
 
-    def leaves_less(self, recorded: "Judged") -> bool:
+    def leaves_less(self, recorded: "FittedHypothesis") -> bool:
         """Whether one mode misses states by less, once they are read so.
 
         Where an error is steep in what was recorded, stretched errors alone may be likelier.
         """
         return self.misfit < recorded.misfit or not recorded.damped
 
-    def is_likelier(self, other: "Judged") -> bool:
+    def is_likelier(self, other: "FittedHypothesis") -> bool:
         """Whether it is the likelier of two that explain a table, and fits in itself."""
         here, there = (one._from(one) for one in (self, other))
         return self.fits and here.leaves_less(there) and here.gain(there) > 0
 
-    def beats(self, recorded: "Judged", *, beside: bool = True) -> bool:
+    def beats(self, recorded: "FittedHypothesis", *, beside: bool = True) -> bool:
         """Whether it fits in itself, and the table as recorded clearly less.
 
         What states say counts by the share of them that tell something of their own: where
@@ -94,7 +94,7 @@ class Judged(NamedTuple):
         """
         return self.fits and self.explains(recorded, beside=beside)
 
-    def explains(self, recorded: "Judged", *, beside: bool = True) -> bool:
+    def explains(self, recorded: "FittedHypothesis", *, beside: bool = True) -> bool:
         """Whether the table as recorded is clearly less likely, and misses its states by more.
 
         Also with what one mode leaves off resonance `beside` it: then nothing else need be wrong.
@@ -102,10 +102,10 @@ class Judged(NamedTuple):
         there none is less likely for having stopped on the way.
         """
 
-        def clearly(here: "Judged", there: "Judged") -> bool:
+        def clearly(here: "FittedHypothesis", there: "FittedHypothesis") -> bool:
             gain, of_states = here.gain(there), max(here.told - there.told, 0.0)
             # Where levels and curves are no gain but a cost, fewer states pay less of it.
-            odds = max(here.share * gain, gain - (1 - here.share) * of_states)
+            odds = max(here.fraction * gain, gain - (1 - here.fraction) * of_states)
             return here.leaves_less(there) and odds > CLEARLY
 
         if not clearly(self, recorded):
@@ -123,12 +123,14 @@ class Judged(NamedTuple):
         return self.evidence - self.posterior.log_evidence + self.posterior.log_likelihood
 
     @property
-    def share(self) -> float:
+    def fraction(self) -> float:
         """Of independent states."""
         left = self.posterior.residuals
-        return max(share_told_by(left, self.states.level, self.states.frequency), LEAST_SHARE)
+        return max(fraction_told_by(left, self.states.level, self.states.frequency), LEAST_FRACTION)
 
-    def _from(self, start: "Judged | None", *, discrepancy: bool = False) -> "Judged":
+    def _from(
+        self, start: "FittedHypothesis | None", *, discrepancy: bool = False
+    ) -> "FittedHypothesis":
         """The likelier of this fit and one with as many rounds as the steepest curves need, from
         another of nearly these amplitudes on.
         """
@@ -137,11 +139,11 @@ class Judged(NamedTuple):
             if not (start.damped and np.allclose(amplitude, other, rtol=1.0)):
                 return self
         jacobian = self.evidence - self.posterior.log_evidence
-        fit = judge(self.states, jacobian, 16, start, discrepancy=discrepancy)
+        fit = fit_hypothesis(self.states, jacobian, 16, start, discrepancy=discrepancy)
         return likelier((self, fit))
 
 
-def likelier(fits: Iterable[Judged]) -> Judged:
+def likelier(fits: Iterable[FittedHypothesis]) -> FittedHypothesis:
     """The likeliest of fits, those before all that lose energy."""
     return max(fits, key=lambda one: (one.damped, one.evidence))
 
@@ -149,19 +151,19 @@ def likelier(fits: Iterable[Judged]) -> Judged:
 class Scale(NamedTuple):
     """The most likely modal mass over the model's."""
 
-    judged: Judged  # with forces divided by it
+    judged: FittedHypothesis  # with forces divided by it
     mass: float
     std: float  # of its logarithm
 
 
-def judge(
+def fit_hypothesis(
     states: TestStates,
     log_jacobian: float = 0.0,
     rounds: int = 6,
-    start: Judged | None = None,
+    start: FittedHypothesis | None = None,
     *,
     discrepancy: bool = False,
-) -> Judged:
+) -> FittedHypothesis:
     """Fit states by the model of a test.
 
     Arguments: `log_jacobian` of the recorded to these phasors, both as logarithms;
@@ -179,7 +181,7 @@ def judge(
         except np.linalg.LinAlgError:  # of phasors that are no mode's
             if fewer == 1:
                 raise
-    return Judged(states, posterior, posterior.log_evidence + log_jacobian)
+    return FittedHypothesis(states, posterior, posterior.log_evidence + log_jacobian)
 
 
 def any_mass(states: TestStates, log_jacobian: float = 0.0, *, far: bool = False) -> Scale:
@@ -188,7 +190,7 @@ def any_mass(states: TestStates, log_jacobian: float = 0.0, *, far: bool = False
     From where a first fit that knows nothing of it puts it; or where its best fit leaves more than
     instruments do, and so was no good guide, from other orders of magnitude (`far`).
     """
-    first = judge(states._replace(mass_std=_GUESSED), log_jacobian)
+    first = fit_hypothesis(states._replace(mass_std=_GUESSED), log_jacobian)
     mass, std = first.posterior.modal_mass
     found = _about(states, max(abs(mass), 1e-3 * std, 1e-12), log_jacobian)
     if not (far and SCATTER < found.judged.misfit < NO_MODE):
@@ -203,7 +205,7 @@ def _about(states: TestStates, start: float, log_jacobian: float, steps: int = 3
     mass, std, reach = start, np.inf, 0.3  # of ln κ, within which it is linear
     for _ in range(steps):
         scale = mass
-        judged = judge(with_mass(states, scale)._replace(mass_std=ANY_MASS), log_jacobian)
+        judged = fit_hypothesis(with_mass(states, scale)._replace(mass_std=ANY_MASS), log_jacobian)
         step, std = judged.posterior.modal_mass
         mass = scale * max(step, 1 / _GUESSED)
         if abs(np.log(mass / scale)) < reach:
@@ -322,7 +324,7 @@ def _with_scattering_frequency(test: TestStates) -> TestStates:
     if not test.near_one_phase:
         return test
     found = fit_test(
-        test, tempered=True, compare_levels=False, parts_of_noise=True, rounds=Rounds(6, 24)
+        test, power_likelihood=True, compare_levels=False, parts_of_noise=True, rounds=Rounds(6, 24)
     )
     errors = found.states.errors[:, RECORDED:]
     return test._replace(errors=np.column_stack([test.errors, errors]))

@@ -1,42 +1,42 @@
 """Effects of the library that measured states may not tell apart, and what separates them."""
 
-from snrmjax.model.effect_metadata import Confusion
+from snrmjax.model.effect_metadata import Confounder
 
-TOLD_BY_MEAN_OR_SECOND_HARMONIC = Confusion(
+TOLD_BY_MEAN_OR_SECOND_HARMONIC = Confounder(
     "record harmonic 2 or the mean displacement at the largest level"
 )
-ONE_SIDED_OR_TWO_SIDED = Confusion(
+ONE_SIDED_OR_TWO_SIDED = Confounder(
     "record harmonic 2 at the largest level: only a one-sided contact makes it"
 )
-TOLD_BY_THIRD_HARMONIC = Confusion(
+TOLD_BY_THIRD_HARMONIC = Confounder(
     "record harmonic 3 at the largest level, whose sign and size differ, and widen the range of "
     "levels"
 )
-STRUCTURE_OR_FORCE_SPECTRUM = Confusion(
+STRUCTURE_OR_FORCE_SPECTRUM = Confounder(
     "record harmonic 2 against level and the force's own spectrum"
 )
-SIZE_OF_RESPONSE = Confusion(
+SIZE_OF_RESPONSE = Confounder(
     "calibrate force and velocity statically, or repeat a level with a known added mass"
 )
-FORCE_OR_SENSOR_GAIN = Confusion(SIZE_OF_RESPONSE.separated_by, by_calibration=True)
-STIFFNESS_OR_MASS = Confusion("add a known mass, or measure a second mode", by_calibration=True)
-FRICTION_OR_FORCE_OFFSET = Confusion(
+FORCE_OR_SENSOR_GAIN = Confounder(SIZE_OF_RESPONSE.separated_by, by_calibration=True)
+STIFFNESS_OR_MASS = Confounder("add a known mass, or measure a second mode", by_calibration=True)
+FRICTION_OR_FORCE_OFFSET = Confounder(
     "measure at the smallest level 30° and more off resonance, on both sides"
 )
-DRIFT = Confusion("repeat the first level last", by_itself=True)
-FAR_MODE_OR_PHASE_ERROR = Confusion(
+DRIFT = Confounder("repeat the first level last", by_itself=True)
+FAR_MODE_OR_PHASE_ERROR = Confounder(
     "measure 60° and more off resonance on both sides, or with a second sensor"
 )
-FURTHER_MODE = Confusion(
+FURTHER_MODE = Confounder(
     "measure with a second sensor, where a further mode has another shape, or sweep wider",
     by_itself=True,
 )
-WHICH_RESONANCE = Confusion(
+WHICH_RESONANCE = Confounder(
     "step through the frequency of the disturbance and record the second and third harmonics of "
     "the velocity (with their noise floor)"
 )
 
-CONFUSIONS = (
+CONFOUNDERS = (
     *(TOLD_BY_MEAN_OR_SECOND_HARMONIC, ONE_SIDED_OR_TWO_SIDED, TOLD_BY_THIRD_HARMONIC),
     *(STRUCTURE_OR_FORCE_SPECTRUM, SIZE_OF_RESPONSE, FORCE_OR_SENSOR_GAIN, STIFFNESS_OR_MASS),
     *(FRICTION_OR_FORCE_OFFSET, DRIFT, FAR_MODE_OR_PHASE_ERROR, FURTHER_MODE, WHICH_RESONANCE),

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 Samples = Float[Array, " time"]
 
 
-class Kinks(NamedTuple):
+class NonsmoothPoints(NamedTuple):
     """Displacements at which the slope of a force jumps, and by how much from below to above."""
 
     displacement: Float[Array, " kink"]
@@ -22,7 +22,7 @@ class Crossings(NamedTuple):
 
     passes: Bool[Array, " crossing"]  # false of entries without use
     interval: Int[Array, " crossing"]  # the sample before
-    share: Float[Array, " crossing"]  # of the interval between two samples
+    fraction: Float[Array, " crossing"]  # of the interval between two samples
     rate: Float[Array, " crossing"]  # derivatives there, over samples
     curvature: Float[Array, " crossing"]
 
@@ -36,20 +36,20 @@ def crossings(displacement: Samples, place: Float[Array, ""]) -> Crossings:
     There may be two within one interval, where a contact just closes; no more than 16 in a period.
     """
     n = displacement.shape[0]
-    passes, shares = _passings(jax.lax.stop_gradient(displacement - place))
+    passes, fractions = _passings(jax.lax.stop_gradient(displacement - place))
     (slot,) = jnp.nonzero(passes.reshape(-1), size=_MOST, fill_value=0)
-    interval, share = slot // 2, shares.reshape(-1)[slot]
+    interval, fraction = slot // 2, fractions.reshape(-1)[slot]
     known = jnp.arange(_MOST) < jnp.sum(passes)
     around = displacement[(interval + np.arange(-1, 3)[:, None]) % n] - place
     first, c1, c2, c3 = _cubic(around)
-    slope = jax.lax.stop_gradient(c1 + share * (2 * c2 + share * 3 * c3))
+    slope = jax.lax.stop_gradient(c1 + fraction * (2 * c2 + fraction * 3 * c3))
     good = known & (slope != 0)
     # Each further step of Newton's method with this slope carries one more order of derivatives.
     for _ in range(2):
-        value = first + share * (c1 + share * (c2 + share * c3))
-        share = share - jnp.where(good, value / jnp.where(good, slope, 1.0), 0.0)
-    rate = c1 + share * (2 * c2 + share * 3 * c3)
-    return Crossings(known, interval, share, rate, 2 * c2 + 6 * share * c3)
+        value = first + fraction * (c1 + fraction * (c2 + fraction * c3))
+        fraction = fraction - jnp.where(good, value / jnp.where(good, slope, 1.0), 0.0)
+    rate = c1 + fraction * (2 * c2 + fraction * 3 * c3)
+    return Crossings(known, interval, fraction, rate, 2 * c2 + 6 * fraction * c3)
 
 
 def _passings(x: Samples) -> tuple[Bool[Array, "time 2"], Float[Array, "time 2"]]:
@@ -71,13 +71,13 @@ def _passings(x: Samples) -> tuple[Bool[Array, "time 2"], Float[Array, "time 2"]
     root = jnp.sqrt(jnp.maximum(c1**2 - 4 * (second - first - c1) * first, 0.0))
     below = jnp.where(once, -c1 - jnp.sign(second - first) * root, 1.0)
     single = 2 * first / jnp.where(below != 0, below, 1.0)
-    share = jnp.stack([jnp.where(once, single, turn - aside), turn + aside])
+    fraction = jnp.stack([jnp.where(once, single, turn - aside), turn + aside])
     for _ in range(3):
-        rate = c1 + share * (2 * c2 + share * 3 * c3)
-        value = first + share * (c1 + share * (c2 + share * c3))
+        rate = c1 + fraction * (2 * c2 + fraction * 3 * c3)
+        value = first + fraction * (c1 + fraction * (c2 + fraction * c3))
         step = jnp.where(rate != 0, value / jnp.where(rate != 0, rate, 1.0), 0.0)
-        share = jnp.clip(share - step, 0.0, 1.0)
-    return jnp.stack([once | twice, twice], axis=1), share.T
+        fraction = jnp.clip(fraction - step, 0.0, 1.0)
+    return jnp.stack([once | twice, twice], axis=1), fraction.T
 
 
 def _cubic(x: Float[Array, "4 crossing"]) -> tuple[Array, Array, Array, Array]:
@@ -88,7 +88,9 @@ def _cubic(x: Float[Array, "4 crossing"]) -> tuple[Array, Array, Array, Array]:
     return first, linear, square, (behind - before) / 6 + 0.5 * (first - second)
 
 
-def with_kinks(force: Samples, displacement: Samples, kinks: Kinks) -> Samples:
+def with_nonsmooth_points(
+    force: Samples, displacement: Samples, nonsmooth_points: NonsmoothPoints
+) -> Samples:
     """Samples of a force over a period, changed so that sums over them are integrals.
 
     The trapezoidal rule errs at a kink between two samples, at θ of their interval, by
@@ -99,7 +101,7 @@ def with_kinks(force: Samples, displacement: Samples, kinks: Kinks) -> Samples:
     Reference: Abramowitz & Stegun, Handbook of Mathematical Functions (1964), 23.1.30.
     """
     n = force.shape[0]
-    for place, slope in zip(kinks.displacement, kinks.slope, strict=True):
+    for place, slope in zip(nonsmooth_points.displacement, nonsmooth_points.slope, strict=True):
         passes, interval, theta, rate, curvature = crossings(displacement, place)
         first_jump = jnp.where(passes, slope * jnp.abs(rate), 0.0)
         second_jump = jnp.where(passes, slope * jnp.sign(rate) * curvature, 0.0)
