@@ -208,8 +208,9 @@ def fit_test(
     Arguments: with `discrepancy` what one mode leaves off resonance is unknown too: smooth in phase
     and amplitude, zero at phase resonance; with `robust` noise has outliers (Student's t); with
     `power_likelihood` states whose neighbours miss the curves alike count as fewer; with
-    `over_sizes` curves are averaged over the sizes that their bends may have; without `compare_levels` nothing
-    is said on which errors levels differ by (`differing`), which takes half the time; with
+    `over_sizes` curves are averaged over the roughness that they may have; without
+    `compare_levels` nothing is reported on which errors levels differ by (`differing`), which
+    takes half the time; with
     `parts_of_noise` scatter of the natural frequency from state to state is estimated, and a noise
     floor where no noise is stated (`StateNoise`): the posterior's `states` have them as errors.
     Raises `ValueError` for fewer than two states.

@@ -109,7 +109,8 @@ def _quasi_linear_motion(
     """The mode of the structure with what averaging makes of its forces in a small motion.
 
     Arguments: `fraction` of the balance's scale that the mode of interest moves. Returns the
-    unknowns of `_trace_damped`: friction sticks in a small motion and changes shape, frequency and damping.
+    unknowns of `_trace_damped`: friction sticks in a small motion and changes shape, frequency
+    and damping.
     """
     model, j = balance.model, balance.model.modes.mode_of_interest
     terms, n = linear_terms_of(model), model.n_modes
